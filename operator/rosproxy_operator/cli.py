@@ -60,10 +60,10 @@ def _read_image(text: str) -> str:
 
 def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
     """``host:port`` to listen on; ``none`` is None where ``optional``. Raises ValueError."""
-    where = parse_host_port(text)
-    if where is None and not (optional and text == "none"):
+    listener = parse_host_port(text)
+    if listener is None and not (optional and text == "none"):
         raise ValueError(f"{text!r} is not of the form {example}")
-    return where
+    return listener
 
 
 IMAGE = Parsed("image", _read_image)
@@ -208,7 +208,7 @@ def docker(
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
-    for library in ("docker", "urllib3"):  # they tell of each request otherwise
+    for library in ("docker", "urllib3"):  # they log each request otherwise
         logging.getLogger(library).setLevel(logging.INFO)
     unknown_variables(main, proxy_main)
     with setting_errors():

@@ -10,7 +10,7 @@ RETRY_FOR = 20.0
 TAKEN_FOR = 300.0
 """Seconds for which a port is avoided that the engine has refused."""
 MOVED_FOR = 600.0
-"""Seconds for which it is told that a proxy had to leave its range."""
+"""Seconds for which it is reported that a proxy had to leave its range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,19 +22,19 @@ class Move:
 
 
 def after_move(ros1: bool, ros2: bool) -> str:
-    """What becomes of those behind a proxy that had to leave its range, and what to do.
+    """What happens to nodes behind a proxy that had to leave its range, and what to do.
 
     ROS 1's nodes have to register anew. Participants of ROS 2 meet anew by themselves, if the
     operator has seen what ports they had.
     """
-    lost = []
+    effects = []
     if ros1:
         text = "nodes that had registered under the old ones can't be reached: restart them"
-        lost.append(text)
+        effects.append(text)
     if ros2:
         text = "participants of ROS 2 meet outside anew; restart those that do not in a minute"
-        lost.append(text)
-    return "; ".join(lost)
+        effects.append(text)
+    return "; ".join(effects)
 
 
 class PortsExhausted(Exception):
@@ -54,9 +54,9 @@ class PortsExhausted(Exception):
 def negotiate(
     count: int, window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()
 ) -> PortRange:
-    """The first ``count`` ports in a row of a window that can be had.
+    """The first ``count`` consecutive free ports of a window.
 
-    ``blocked`` are single ports that can't be had, ``ranges`` whole ranges. Raises PortsExhausted.
+    ``blocked`` are single ports that are not free, ``ranges`` whole ranges. Raises PortsExhausted.
     """
     gaps = list(_gaps(window, blocked, ranges))
     for gap in gaps:
@@ -74,23 +74,23 @@ def extended(
 ) -> PortRange | None:
     """The range with ports added at its end up to ``count``, if those are free and in the window.
 
-    The range itself is taken for granted, and never made shorter.
+    The range itself is not checked, and never made shorter.
     """
     if len(ports) >= count:
         return ports
     wanted = PortRange(ports.first, ports.first + count - 1)
-    more = PortRange(ports.last + 1, wanted.last)
-    return wanted if wanted.last <= window.last and is_free(more, blocked, ranges) else None
+    added = PortRange(ports.last + 1, wanted.last)
+    return wanted if wanted.last <= window.last and is_free(added, blocked, ranges) else None
 
 
 def is_free(ports: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()) -> bool:
-    """Whether a range can be had."""
-    return not (any(overlap(ports, held) for held in ranges) or any(p in ports for p in blocked))
+    """Whether a range has no blocked port, and none of another range."""
+    return not (any(overlap(ports, r) for r in ranges) or any(p in ports for p in blocked))
 
 
-def overlap(one: PortRange, other: PortRange) -> bool:
+def overlap(ports: PortRange, other_ports: PortRange) -> bool:
     """Whether two ranges have a port in common."""
-    return one.first <= other.last and other.first <= one.last
+    return ports.first <= other_ports.last and other_ports.first <= ports.last
 
 
 def within(inner: PortRange, outer: PortRange) -> bool:
@@ -102,9 +102,9 @@ def _gaps(
     window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange]
 ) -> Iterator[PortRange]:
     """The free stretches of a window, in order."""
-    held = [(port, port) for port in blocked] + [(ports.first, ports.last) for ports in ranges]
+    intervals = [(port, port) for port in blocked] + [(ports.first, ports.last) for ports in ranges]
     first = window.first
-    for start, end in sorted(held):
+    for start, end in sorted(intervals):
         if start > window.last:
             break
         if start > first:

@@ -25,7 +25,7 @@ PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
 BEAT = 1.0
 """Seconds between two signs of life of the event loop."""
 LONGEST_BEAT = 20.0
-"""Seconds after which an event loop that shows none hangs."""
+"""Seconds without a sign of life after which the event loop counts as hanging."""
 
 UNSETTLED = 1.0
 """Seconds until the next look of `ControlLoop.run_until`, if nothing happens."""
@@ -71,7 +71,7 @@ class ControlLoop:
         self._looked_at = self._beat_at = 0.0
 
     async def run(self, look: Look) -> None:
-        """Look until cancelled, whatever becomes of it: a mistake of ours must not end it."""
+        """Look until cancelled, also after an unexpected error: a bug must not end the loop."""
         async with self._alive():
             while True:
                 try:
@@ -109,7 +109,7 @@ class ControlLoop:
                 self._loop.call_soon_threadsafe(self._woken.set)
 
     def wake_in(self, seconds: float) -> None:
-        """Look again in so many seconds, instead of what was said so before."""
+        """Look again in so many seconds; replaces the time of an earlier call."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(seconds, self._woken.set)
@@ -143,11 +143,11 @@ class ControlLoop:
             async with asyncio.timeout(self._pace.longest):
                 self._again_in = await look()
         except TimeoutError:
-            took = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
-            self._failed(LookFailed(took, away=True))
+            reason = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
+            self._failed(LookFailed(reason, away=True))
         except LookFailed as error:
             if error.away and not patient:
-                raise  # whoever asked tells it
+                raise  # the caller reports it
             self._failed(error)
         else:
             if self._failures:

@@ -27,13 +27,13 @@ class HealthServer:
         app.router.add_get("/metrics", partial(_show, metrics))
         self._runner = web.AppRunner(app, access_log=None)
 
-    async def start(self, where: HostPort) -> None:
+    async def start(self, listener: HostPort) -> None:
         """Listen. Raises SettingError if the address can't be bound."""
         await self._runner.setup()
         try:
-            await web.TCPSite(self._runner, where.host, where.port).start()
+            await web.TCPSite(self._runner, listener.host, listener.port).start()
         except OSError as error:
-            text = f"{where} can't be bound: {error.strerror}"
+            text = f"{listener} can't be bound: {error.strerror}"
             raise SettingError("--admin-bind", text) from None
 
     async def stop(self) -> None:

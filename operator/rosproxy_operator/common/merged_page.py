@@ -1,7 +1,7 @@
 """The live pages of several proxies as one document.
 
-Inside is each proxy's own. Outside is the same for all that have one master, so that its nodes
-stand there once. A proxy that can't be asked is a box that says why.
+Each proxy has its own nodes inside. Outside is the same for all proxies of one master, so its
+nodes appear once. A proxy that can't be asked is a node that says why.
 """
 
 from collections.abc import Mapping
@@ -35,32 +35,32 @@ def read_document(text: str) -> Document:
         raise ValueError(str(error)) from None
 
 
-def merged(found: Mapping[str, Document | str], version: str) -> Json:
-    """One document of those of proxies, by their names; a text is why one can't be asked."""
+def merged(documents: Mapping[str, Document | str], version: str) -> Json:
+    """One document of those of all proxies, by name; a text says why one can't be asked."""
     nodes: dict[str, PageNode] = {}
     links: list[tuple[str, PageLink]] = []
     findings: list[Told] = []
     left_out = 0
-    for name, one in found.items():
-        if isinstance(one, str):
-            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, f"it can't be asked: {one}")
+    for name, document in documents.items():
+        if isinstance(document, str):
+            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, f"it can't be asked: {document}")
             continue
-        names = {key: _key(name, one, key, node) for key, node in one.nodes.items()}
-        for key, node in one.nodes.items():
+        names = {key: _key(name, document, key, node) for key, node in document.nodes.items()}
+        for key, node in document.nodes.items():
             label = name if node.kind == PROXY else node.label or key
             owner = name if node.lane == CONTAINER else ""
             nodes[names[key]] = replace(node, label=label, proxy=owner)
-        for link in one.links.values():
+        for link in document.links.values():
             if link.source in names and (not link.target or link.target in names):
                 target = names.get(link.target, "")
                 links.append((name, replace(link, source=names[link.source], target=target)))
-        findings += (replace(told, subject=f"{name}: {told.subject}") for told in one.findings)
-        left_out += one.left_out
-    links.sort(key=lambda each: (each[1].state != BROKEN, each[1].quiet))
+        findings += (replace(f, subject=f"{name}: {f.subject}") for f in document.findings)
+        left_out += document.left_out
+    links.sort(key=lambda proxy_link: (proxy_link[1].state != BROKEN, proxy_link[1].quiet))
     shown = dict(list(nodes.items())[:MOST_NODES])
-    kept = [each for each in links if each[1].source in shown][:MOST_LINKS]
+    kept = [proxy_link for proxy_link in links if proxy_link[1].source in shown][:MOST_LINKS]
     return {
-        "proxy": {"host": f"{len(found)} proxies", "version": version},
+        "proxy": {"host": f"{len(documents)} proxies", "version": version},
         "nodes": msgspec.to_builtins(shown),
         "links": {f"{name} {link.key}": msgspec.to_builtins(link) for name, link in kept},
         "findings": msgspec.to_builtins(findings[:MOST_FINDINGS]),
@@ -69,7 +69,7 @@ def merged(found: Mapping[str, Document | str], version: str) -> Json:
 
 
 def _key(name: str, document: Document, key: str, node: PageNode) -> str:
-    """What tells a node from those of other proxies, unless it is the same one outside."""
+    """A node's key, different for each proxy, but the same for one node outside."""
     if node.lane == CONTAINER or node.kind == PROXY or not document.proxy.master:
         return f"{name} {key}"
     return f"{document.proxy.master} {key}"

@@ -17,7 +17,7 @@ from prometheus_client import (
 
 from rosproxy import __version__
 
-# A second series for each counter: when it began, which nobody asks for.
+# The second series of each counter, the time of its creation, is of no use.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 OUTCOMES = ("ok", "unavailable", "failed")
@@ -28,17 +28,17 @@ POD_STATES = ("ready", "starting", "stuck")
 """The states of a proxy's pod."""
 _PREFIX = "rosproxy_operator"
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 20)
-_WORD = re.compile(r"(?<!^)(?=[A-Z])")
+_BEFORE_CAPITAL = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 class CommonMetrics:
     """The metrics for any engine, in a registry of their own.
 
-    ``of`` is what is looked at, by the gauge ``up`` whether it answers; ``on`` what is acted on;
-    ``states`` those that a proxy can be in.
+    ``source`` is what is looked at, and the gauge named ``up`` says whether it answers; ``site`` is
+    what is acted on; ``states`` are those that a proxy can be in.
     """
 
-    def __init__(self, of: str, on: str, states: Sequence[str], up: str) -> None:
+    def __init__(self, source: str, site: str, states: Sequence[str], up: str) -> None:
         self.registry = registry = CollectorRegistry()
         self._counter = partial(Counter, namespace=_PREFIX, registry=registry)
         self._gauge = partial(Gauge, namespace=_PREFIX, registry=registry)
@@ -47,7 +47,7 @@ class CommonMetrics:
         Info("build", "The operator's version.", namespace=_PREFIX, registry=registry).info(
             {"version": __version__}
         )
-        text = f"Looks at the {of} by outcome (ok, unavailable, failed)."
+        text = f"Looks at the {source} by outcome (ok, unavailable, failed)."
         self.looks = self._counter("looks", text, ["outcome"])
         for outcome in OUTCOMES:  # one that begins with 1 has no increase, for an alert
             self.looks.labels(outcome)
@@ -55,9 +55,9 @@ class CommonMetrics:
         self.look_time = Histogram(
             "look_seconds", text, namespace=_PREFIX, registry=registry, buckets=_BUCKETS
         )
-        text = f"What was done to the {on} by action and outcome (ok, failed, taken: a port was)."
+        text = f"What was done to the {site} by action and outcome (ok, failed, taken: a port was)."
         self.actions = self._counter("actions", text, ["action", "outcome"])
-        self.up = self._gauge(up, f"Whether the {of} answers.")
+        self.up = self._gauge(up, f"Whether the {source} answers.")
         self.problems = self._gauge("problems", "Problems that are there now.")
         self.proxies = self._gauge("proxies", "Proxies by state.", ["state"])
         text = "What is to be done, by state (busy, failed: it is tried again)."
@@ -70,14 +70,14 @@ class CommonMetrics:
             self.proxies.labels(state).set(tally[state])
 
     def watch_jobs(self, busy: Callable[[], int], failed: Callable[[], int]) -> None:
-        """Ask for what is to be done whenever somebody reads the metrics."""
+        """Call these for the numbers of jobs whenever the metrics are read."""
         self._jobs.labels("busy").set_function(busy)
         self._jobs.labels("failed").set_function(failed)
 
     def count(self, action: object, outcome: str) -> None:
         """Count an action, named after its class."""
-        word = _WORD.sub("_", type(action).__name__).lower()
-        self.actions.labels(word, outcome).inc()
+        name = _BEFORE_CAPITAL.sub("_", type(action).__name__).lower()
+        self.actions.labels(name, outcome).inc()
 
 
 class DockerMetrics(CommonMetrics):

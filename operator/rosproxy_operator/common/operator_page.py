@@ -28,8 +28,8 @@ def operator_page(documents: Documents) -> Page:
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
         while True:
-            found = await documents()
-            yield await asyncio.to_thread(merged, found, __version__)
+            proxy_documents = await documents()
+            yield await asyncio.to_thread(merged, proxy_documents, __version__)
             await asyncio.sleep(EVERY)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

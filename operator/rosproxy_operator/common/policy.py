@@ -16,7 +16,7 @@ from rosproxy.settings import SettingError
 ADMINISTRATOR = "administrator"
 """Name of the layer that the operator's options make, which is for every proxy."""
 _LAYERS, _AWAIT = POLICY_VARIABLES = ("ROSPROXY_POLICY_LAYERS", "ROSPROXY_AWAIT_POLICY")
-"""What a proxy gets at its creation, and what is none of what it is made of (its fingerprint)."""
+"""The variables that a proxy gets at its creation; they are not part of its fingerprint."""
 AWAITED = 3.0
 """Seconds that a proxy waits for its operator: as long as it waits for news of a new caller."""
 MOST_AUTHORS_RULES = MOST_RULES // 2
@@ -29,8 +29,8 @@ LONGEST_POLICY = LONGEST_VARIABLE // 3
 
 def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple[PolicyLayer, ...]:
     """The layer of the operator's options, none if they give no rules. Raises SettingError."""
-    every = tuple(rule for some in rules for rule in some)
-    layers = (PolicyLayer(ADMINISTRATOR, every, PolicyMode(mode)),) if every else ()
+    all_rules = tuple(rule for group in rules for rule in group)
+    layers = (PolicyLayer(ADMINISTRATOR, all_rules, PolicyMode(mode)),) if all_rules else ()
     if problem := too_much(layers):
         raise SettingError("--policy", f"{problem}; join some by globs")
     return layers
@@ -56,5 +56,5 @@ def as_variable(layers: Sequence[PolicyLayer]) -> str:
     Where all are too long for a variable, only those that are for all of its nodes.
     """
     common = [layer for layer in layers if layer.addresses is None]
-    texts = (json.dumps(layers_as_json(some)) for some in (layers, common) if some)
+    texts = (json.dumps(layers_as_json(subset)) for subset in (layers, common) if subset)
     return next((text for text in texts if len(text) <= LONGEST_VARIABLE), "")

@@ -1,4 +1,4 @@
-"""What is wrong, told for every engine: texts for people, and each of them once in the log."""
+"""What is wrong, for every engine: texts for users, each logged once."""
 
 import logging
 from collections.abc import Iterable
@@ -32,19 +32,19 @@ def bounded(text: str, most: int) -> str:
 
 
 class ProblemLog:
-    """Remembers which problems were told."""
+    """Logs each problem once, and when it is solved."""
 
     def __init__(self) -> None:
-        self._told: dict[Problem, None] = {}
+        self._logged: dict[Problem, None] = {}
 
     def update(self, problems: Iterable[Problem]) -> None:
         """Take note of the problems that there are now."""
-        now = dict.fromkeys(problems)
-        for problem in now:
-            if problem not in self._told:
+        current = dict.fromkeys(problems)
+        for problem in current:
+            if problem not in self._logged:
                 level = logging.ERROR if problem.fatal else logging.WARNING
                 text = "%s: %s"
                 log.log(level, text, problem.subject, problem.text, extra=problem.log_fields)
-        for subject in sorted({p.subject for p in self._told} - {p.subject for p in now}):
+        for subject in sorted({p.subject for p in self._logged} - {p.subject for p in current}):
             log.info("%s: solved", subject)
-        self._told = now
+        self._logged = current

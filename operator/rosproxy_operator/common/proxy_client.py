@@ -1,4 +1,4 @@
-"""Asking and telling running proxies, over their admin endpoints."""
+"""The client of running proxies' admin endpoints."""
 
 import asyncio
 import errno
@@ -23,8 +23,8 @@ WITHIN = 3.0
 PAGES_AT_ONCE = 8
 """Proxies that are asked for their page at the same time."""
 LONGEST = 16 * 1024 * 1024
-"""Bytes of an answer at most. A proxy that somebody has taken over leads its operator nowhere: no
-redirect is followed, and nothing is inflated."""
+"""Bytes of an answer at most. A proxy in hostile hands can't mislead its operator: no redirect is
+followed, and nothing is decompressed."""
 WITHIN_PAGE = 12.0
 """The same where it makes the page's document first, for which it may take ten."""
 WITHIN_MASTER = 40.0
@@ -56,35 +56,35 @@ class ProxyClient:
     def __init__(self) -> None:
         self._session: aiohttp.ClientSession | None = None
 
-    async def status(self, where: HostPort) -> ProxyStatus:
+    async def status(self, admin: HostPort) -> ProxyStatus:
         """What a proxy's ``/status`` says."""
-        text = await self._ask("GET", where, "/status")
+        text = await self._ask("GET", admin, "/status")
         try:
             return parse_status(text)
         except NotAStatus:
-            raise _no_rosproxy(where) from None
+            raise _no_rosproxy(admin) from None
 
     async def changes(
-        self, where: HostPort, token: str, since: str, within: float
+        self, admin: HostPort, token: str, since: str, within: float
     ) -> tuple[str, ProxyStatus]:
-        """Its status and the version of that, once it is another version than ``since``.
+        """The version of its status, and the status, once the version is not ``since``.
 
         After ``within`` seconds in any case. A proxy of a former release does not know this (404).
         """
         path = f"/status/changes?since={quote(since)}&within={within:g}"
-        found = _read(await self._ask("GET", where, path, token, within=within + WITHIN), where)
-        version, status = found.get("version"), found.get("status")
+        answer = _read(await self._ask("GET", admin, path, token, within=within + WITHIN), admin)
+        version, status = answer.get("version"), answer.get("status")
         if not isinstance(version, str):
-            raise _no_rosproxy(where)
+            raise _no_rosproxy(admin)
         try:
             return version, read_status(status)
         except NotAStatus:
-            raise _no_rosproxy(where) from None
+            raise _no_rosproxy(admin) from None
 
-    async def document(self, where: HostPort, token: str) -> Document:
+    async def document(self, admin: HostPort, token: str) -> Document:
         """What a proxy's live page shows."""
         try:
-            text = await self._ask("GET", where, "/graph", token, within=WITHIN_PAGE)
+            text = await self._ask("GET", admin, "/graph", token, within=WITHIN_PAGE)
         except ProxyError as error:
             if error.status == 404:
                 text = "it has no live page: its image is that of a former release"
@@ -93,34 +93,34 @@ class ProxyClient:
         try:
             return read_document(text)
         except ValueError:
-            raise _no_rosproxy(where) from None
+            raise _no_rosproxy(admin) from None
 
     async def documents(
         self, proxies: Mapping[str, tuple[HostPort, str]]
     ) -> dict[str, Document | str]:
-        """The same of many, by their names; of one that can't be asked why."""
+        """The same of many, by name; for one that can't be asked, the reason."""
         room = asyncio.Semaphore(PAGES_AT_ONCE)
 
-        async def ask(where: HostPort, token: str) -> Document | str:
+        async def ask(admin: HostPort, token: str) -> Document | str:
             async with room:
                 try:
-                    return await self.document(where, token)
+                    return await self.document(admin, token)
                 except ProxyError as error:
                     return str(error)
 
-        found = await asyncio.gather(*(ask(*way) for way in proxies.values()))
-        return dict(zip(proxies, found, strict=True))
+        answers = await asyncio.gather(*(ask(*access) for access in proxies.values()))
+        return dict(zip(proxies, answers, strict=True))
 
-    async def master_address(self, where: HostPort, token: str, address: str) -> None:
+    async def master_address(self, admin: HostPort, token: str, address: str) -> None:
         """Tell where the master's host is now."""
-        await self._ask("POST", where, "/master-address", token, {"address": address})
+        await self._ask("POST", admin, "/master-address", token, {"address": address})
 
-    async def containers(self, where: HostPort, token: str, body: Mapping[str, Any]) -> Json:
+    async def containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Json:
         """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
-        text = await self._ask("POST", where, "/containers", token, body, WITHIN_MASTER)
-        return _read(text, where)
+        text = await self._ask("POST", admin, "/containers", token, body, WITHIN_MASTER)
+        return _read(text, admin)
 
-    async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         """Tell the layers of its policy, instead of those told before. Raises PolicyRefused, too.
 
         They are in force at once; where its master can't be asked (503) the proxy goes on trying to
@@ -128,7 +128,7 @@ class ProxyClient:
         """
         try:
             body = {"layers": layers_as_json(layers)}
-            await self._ask("POST", where, "/policy", token, body, WITHIN_MASTER)
+            await self._ask("POST", admin, "/policy", token, body, WITHIN_MASTER)
         except ProxyError as error:
             if error.status == 404 and layers:
                 text = (
@@ -144,7 +144,7 @@ class ProxyClient:
 
     async def selected(
         self,
-        where: HostPort,
+        admin: HostPort,
         token: str,
         addresses: Collection[str],
         peers: Collection[str] | None = None,
@@ -160,11 +160,11 @@ class ProxyClient:
             body["peers"] = sorted(peers)
         if former:
             body["former"] = {prefix: list(ports) for prefix, ports in former.items()}
-        await self._ask("POST", where, "/containers", token, body)
+        await self._ask("POST", admin, "/containers", token, body)
 
-    async def retire(self, where: HostPort, token: str) -> Json:
+    async def retire(self, admin: HostPort, token: str) -> Json:
         """Let it unregister everything it holds at the master."""
-        return _read(await self._ask("POST", where, "/retire", token, {}, WITHIN_MASTER), where)
+        return _read(await self._ask("POST", admin, "/retire", token, {}, WITHIN_MASTER), admin)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -174,7 +174,7 @@ class ProxyClient:
     async def _ask(
         self,
         method: str,
-        where: HostPort,
+        admin: HostPort,
         path: str,
         token: str = "",
         body: Mapping[str, Any] | None = None,
@@ -182,14 +182,14 @@ class ProxyClient:
     ) -> str:
         """The body of the answer, if that is HTTP 200."""
         if self._session is None:
-            # One connection for each proxy that is waited for; who asks bounds the others.
+            # No limit: each proxy that is waited for takes one; the callers bound the others.
             connector = aiohttp.TCPConnector(limit=0, socket_factory=_kept_alive)
             self._session = aiohttp.ClientSession(connector=connector, auto_decompress=False)
         limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
         headers = {"Accept-Encoding": "identity"}
         if token:
             headers["Authorization"] = f"Bearer {token}"
-        url = f"http://{where}{path}"
+        url = f"http://{admin}{path}"
         try:
             async with self._session.request(
                 method, url, json=body, headers=headers, timeout=limits, allow_redirects=False
@@ -200,36 +200,36 @@ class ProxyClient:
                 message = f"{method} {url} answers HTTP {reply.status}: {text.strip()[:200]}"
                 raise ProxyError(message, status=reply.status)
         except TimeoutError:
-            raise ProxyError(f"{where} does not answer", away=True) from None
+            raise ProxyError(f"{admin} does not answer", away=True) from None
         except TooLong:
-            raise _no_rosproxy(where) from None
+            raise _no_rosproxy(admin) from None
         except (OSError, aiohttp.ClientError) as error:
-            raise _no_answer(where, error) from None
+            raise _no_answer(admin, error) from None
 
 
 def _kept_alive(info: aiohttp.AddrInfoType) -> socket.socket:
     """A socket by which the kernel notices that a machine is gone while nothing is sent."""
-    found = socket.socket(family=info[0], type=info[1], proto=info[2])
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock = socket.socket(family=info[0], type=info[1], proto=info[2])
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in _KEEP_ALIVE.items():
-        found.setsockopt(socket.IPPROTO_TCP, option, value)
-    return found
+        sock.setsockopt(socket.IPPROTO_TCP, option, value)
+    return sock
 
 
-def _read(text: str, where: HostPort) -> Json:
+def _read(text: str, admin: HostPort) -> Json:
     try:
         return msgspec.json.decode(text, type=Json)
     except msgspec.DecodeError:
-        raise _no_rosproxy(where) from None
+        raise _no_rosproxy(admin) from None
 
 
-def _no_rosproxy(where: HostPort) -> ProxyError:
-    return ProxyError(f"{where} does not answer as a rosproxy does")
+def _no_rosproxy(admin: HostPort) -> ProxyError:
+    return ProxyError(f"{admin} does not answer as a rosproxy does")
 
 
-def _no_answer(where: HostPort, error: Exception) -> ProxyError:
+def _no_answer(admin: HostPort, error: Exception) -> ProxyError:
     number = error.errno if isinstance(error, OSError) else None
     if number == errno.ECONNREFUSED:
-        return ProxyError(f"{where} refuses connections")
+        return ProxyError(f"{admin} refuses connections")
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return ProxyError(f"{where} can't be reached ({reason})", away=number is not None)
+    return ProxyError(f"{admin} can't be reached ({reason})", away=number is not None)

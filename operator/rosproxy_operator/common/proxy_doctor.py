@@ -22,10 +22,10 @@ def command(names: Sequence[str]) -> tuple[str, ...]:
     return ("rosproxy", "doctor", "--json", "--", *names)
 
 
-def read_findings(proxy: str, said: bytes, cures: Mapping[str, str]) -> list[DoctorFinding]:
+def read_findings(proxy: str, output: bytes, cures: Mapping[str, str]) -> list[DoctorFinding]:
     """The findings in what a proxy's doctor has printed; ``cures`` by checks stand for its own."""
     try:
-        rows = json.loads(said)["findings"]
+        rows = json.loads(output)["findings"]
         return [_finding(proxy, row, cures) for row in rows[:MOST_FINDINGS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         text = "its own doctor says nothing that can be read: its image may be of another release"

@@ -1,4 +1,4 @@
-"""What the operator makes of a proxy's ``/status``, for any engine.
+"""What the operator reads from a proxy's ``/status``, for any engine.
 
 The document itself is `rosproxy.admin.status_document`; it holds what ROS nodes say of themselves,
 so no size in it is to be trusted.
@@ -14,30 +14,30 @@ Leases = Mapping[str, tuple[int, ...]]
 
 
 def nodes_by_address(status: ProxyStatus) -> Mapping[str, tuple[EndpointStatus, ...]]:
-    """A proxy's nodes by the address where they are; not those that it has given up already."""
-    found: dict[str, tuple[EndpointStatus, ...]] = {}
+    """A proxy's nodes by the address where they are; without those that it has given up."""
+    nodes: dict[str, tuple[EndpointStatus, ...]] = {}
     for node in status.nodes:
-        where = parse_host_port(node.address)
-        if where is not None and not node.given_up:
-            address = plain_address(where.host)
-            found[address] = (*found.get(address, ()), node)
-    return found
+        host_port = parse_host_port(node.address)
+        if host_port is not None and not node.given_up:
+            address = plain_address(host_port.host)
+            nodes[address] = (*nodes.get(address, ()), node)
+    return nodes
 
 
 def participants_by_address(status: ProxyStatus) -> Mapping[str, tuple[ParticipantStatus, ...]]:
     """A proxy's participants of ROS 2 that are inside, by the address where they are."""
-    found: dict[str, tuple[ParticipantStatus, ...]] = {}
+    participants: dict[str, tuple[ParticipantStatus, ...]] = {}
     for domain in status.domains:
-        for one in domain.inside:
-            address = plain_address(one.address)
-            found[address] = (*found.get(address, ()), one)
-    return found
+        for participant in domain.inside:
+            address = plain_address(participant.address)
+            participants[address] = (*participants.get(address, ()), participant)
+    return participants
 
 
 def leases(status: ProxyStatus) -> Leases:
     """The ports of a proxy's participants inside."""
-    every = (one for there in participants_by_address(status).values() for one in there)
-    return {one.guid_prefix: tuple(lease.port for lease in one.leases) for one in every}
+    participants = (p for group in participants_by_address(status).values() for p in group)
+    return {p.guid_prefix: tuple(lease.port for lease in p.leases) for p in participants}
 
 
 def inside_addresses(status: ProxyStatus) -> frozenset[str]:

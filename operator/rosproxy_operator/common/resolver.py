@@ -24,49 +24,49 @@ class MasterResolver:
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self._changed = changed
-        self._good: dict[str, str] = {}
-        self._asked: dict[str, float] = {}
-        self._known: Mapping[str, str] = {}
-        self._never: frozenset[str] = frozenset()
+        self._resolved: dict[str, str] = {}
+        self._asked_at: dict[str, float] = {}
+        self._fallback: Mapping[str, str] = {}
+        self._excluded: frozenset[str] = frozenset()
 
     def address(self, host: str) -> str:
         """The address of a host; empty if it could not be resolved yet."""
         if is_address(host):
             return plain_address(host)
-        return self._good.get(host) or self._known.get(host, "")
+        return self._resolved.get(host) or self._fallback.get(host, "")
 
     async def learn(
-        self, hosts: Iterable[str], known: Mapping[str, str], never: Iterable[str]
+        self, hosts: Iterable[str], fallback: Mapping[str, str], excluded: Iterable[str]
     ) -> None:
         """Resolve those hosts that are new and forget those that are not named any more.
 
-        ``known`` are addresses for hosts that can't be resolved, ``never`` those that can't be a
-        master's: the proxies' own, which answer to their masters' names.
+        ``fallback`` are addresses for hosts that can't be resolved. ``excluded`` are no master's:
+        they are the proxies' own, which answer to their masters' names.
         """
-        self._known, self._never = known, frozenset(never)
+        self._fallback, self._excluded = fallback, frozenset(excluded)
         wanted = {host for host in hosts if not is_address(host)}
-        self._asked = {host: self._asked.get(host, 0.0) for host in wanted}
-        self._good = {host: self._good[host] for host in wanted if host in self._good}
-        await self._ask([host for host, when in self._asked.items() if not when])
+        self._asked_at = {host: self._asked_at.get(host, 0.0) for host in wanted}
+        self._resolved = {host: self._resolved[host] for host in wanted if host in self._resolved}
+        await self._ask([host for host, when in self._asked_at.items() if not when])
 
     async def refresh(self) -> None:
         """Resolve anew what is due."""
-        now, before = time.monotonic(), dict(self._good)
+        now, previous = time.monotonic(), dict(self._resolved)
         await self._ask(
-            [host for host, when in self._asked.items() if now >= when + self._age(host)]
+            [host for host, when in self._asked_at.items() if now >= when + self._age(host)]
         )
-        if self._good != before:
+        if self._resolved != previous:
             self._changed()
 
     def _age(self, host: str) -> float:
-        return AGAIN if host in self._good else AGAIN_UNRESOLVED
+        return AGAIN if host in self._resolved else AGAIN_UNRESOLVED
 
     async def _ask(self, hosts: list[str]) -> None:
-        found = await asyncio.gather(*map(resolve, hosts))
-        for host, addresses in zip(hosts, found, strict=True):
-            if host not in self._asked:  # forgotten meanwhile
+        answers = await asyncio.gather(*map(resolve, hosts))
+        for host, addresses in zip(hosts, answers, strict=True):
+            if host not in self._asked_at:  # forgotten meanwhile
                 continue
-            self._asked[host] = time.monotonic()
-            usable = [a for a in addresses if not is_loopback(a) and a not in self._never]
-            if usable and self._good.get(host) not in usable:
-                self._good[host] = usable[0]
+            self._asked_at[host] = time.monotonic()
+            usable = [a for a in addresses if not is_loopback(a) and a not in self._excluded]
+            if usable and self._resolved.get(host) not in usable:
+                self._resolved[host] = usable[0]

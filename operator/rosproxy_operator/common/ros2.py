@@ -21,7 +21,7 @@ ALONE = {"ROS_LOCALHOST_ONLY": ("1",), "ROS_AUTOMATIC_DISCOVERY_RANGE": ("LOCALH
 
 
 def discovery_port(domain: int) -> int:
-    """The well-known port at which the first participant of a machine is told of others."""
+    """The well-known port at which the first participant of a machine gets announcements."""
     return SPDP_UNICAST + PORTS_PER_DOMAIN * domain
 
 
@@ -32,8 +32,8 @@ def well_known_ports(domain: int) -> frozenset[int]:
 
 def read_peer_name(text: str) -> str:
     """A peer, ``host`` or ``host:port``, in its one form. Raises ValueError."""
-    where = read_peer(text)
-    return str(where) if where.port else where.host.lower()
+    peer = read_peer(text)
+    return str(peer) if peer.port else peer.host.lower()
 
 
 def is_dds(rmw: str) -> bool:

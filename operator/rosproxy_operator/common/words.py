@@ -1,4 +1,4 @@
-"""Last words of a command that can't do what it is asked for: one line, and exit status 1."""
+"""How a command that fails ends: with one line that says why, and exit status 1."""
 
 import contextlib
 import sys
@@ -12,9 +12,9 @@ from rosproxy_operator.common.control_loop import LookFailed
 
 
 @contextlib.contextmanager
-def one_line(*more: type[Exception]) -> Iterator[None]:
-    """Tell in one line that the engine or the API server can't be asked."""
-    errors: tuple[type[Exception], ...] = (LookFailed, *more)
+def one_line(*expected: type[Exception]) -> Iterator[None]:
+    """Exit with one line if the engine or the API server can't be asked."""
+    errors: tuple[type[Exception], ...] = (LookFailed, *expected)
     try:
         yield
     except errors as error:

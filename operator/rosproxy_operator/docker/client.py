@@ -37,7 +37,7 @@ FILTERS = {
         *("tag", "untag", "pull", "load", "import", "delete"),
     ],
 }
-"""What may change a plan. Health checks and ``docker exec`` are told often and change nothing."""
+"""Events that may change a plan: not the frequent ones of health checks and ``docker exec``."""
 PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds between attempts to listen to events again; the last one is repeated."""
 
@@ -60,8 +60,8 @@ class DockerClient:
 
     def container(self, name: str) -> Json:
         """Everything about a container, by id or name."""
-        found: Json = self._call(READ_TIMEOUT, "inspect_container", name)
-        return found
+        inspected: Json = self._call(READ_TIMEOUT, "inspect_container", name)
+        return inspected
 
     def networks(self) -> list[Json]:
         """All networks."""
@@ -76,26 +76,26 @@ class DockerClient:
 
     def run(self, container: str, *command: str) -> bytes:
         """What a command prints in a running container, to its end."""
-        made = self._call(READ_TIMEOUT, "exec_create", container, list(command), stderr=False)
-        found: bytes = self._call(RUN_TIMEOUT, "exec_start", made["Id"])
-        return found
+        instance = self._call(READ_TIMEOUT, "exec_create", container, list(command), stderr=False)
+        output: bytes = self._call(RUN_TIMEOUT, "exec_start", instance["Id"])
+        return output
 
     def events(self) -> Iterator[Json]:
-        """What happens from now on that may change a plan; ends when the connection does.
+        """The events from now on that may change a plan; ends when the connection does.
 
-        The connection stands when this returns, so that whatever is listed after that has either
-        happened before or is going to be told.
+        The connection stands when this returns, so that what is listed later has either happened
+        before or is going to be an event.
         """
         with self._translated():
             stream = self._connect().events(filters=FILTERS, decode=True)
-        return self._each(stream)
+        return self._read_events(stream)
 
-    def do(self, method: str, *arguments: Any, **more: Any) -> None:
+    def do(self, method: str, *arguments: Any, **keywords: Any) -> None:
         """Let the engine do something, by a method of the SDK's APIClient."""
-        self._call(WRITE_TIMEOUT, method, *arguments, **more)
+        self._call(WRITE_TIMEOUT, method, *arguments, **keywords)
 
-    def _call(self, within: int, method: str, *arguments: Any, **more: Any) -> Any:
-        """Call the SDK by a client that nobody else uses now: they are not meant to be shared."""
+    def _call(self, within: int, method: str, *arguments: Any, **keywords: Any) -> Any:
+        """Call the SDK with a client that no other thread uses now: clients are not shareable."""
         with self._translated():
             try:
                 client = self._idle.pop()
@@ -103,7 +103,7 @@ class DockerClient:
                 client = self._connect()
             client.timeout = within
             try:
-                return getattr(client, method)(*arguments, **more)
+                return getattr(client, method)(*arguments, **keywords)
             finally:
                 self._idle.append(client)
 
@@ -118,7 +118,7 @@ class DockerClient:
         self._version = client.api_version
         return client
 
-    def _each(self, stream: Iterator[Json]) -> Iterator[Json]:
+    def _read_events(self, stream: Iterator[Json]) -> Iterator[Json]:
         with self._translated():
             yield from stream
 
@@ -129,8 +129,8 @@ class DockerClient:
             yield
         except APIError as error:
             request = getattr(error.response, "request", None)
-            what = f"{request.method} {request.path_url.partition('?')[0]}" if request else ""
-            raise refusal(error.status_code or 0, str(error.explanation or error), what) from error
+            line = f"{request.method} {request.path_url.partition('?')[0]}" if request else ""
+            raise refusal(error.status_code or 0, str(error.explanation or error), line) from error
         except (DockerException, TLSParameterError, requests.RequestException, OSError) as error:
             self._version = None  # the next engine behind this address may be another one
             self._idle.clear()
@@ -150,7 +150,7 @@ def listen(engine: DockerClient, tell: Callable[[Json | None], None]) -> None:
     def work() -> None:
         failures = 0
         while not loop.is_closed():
-            # The looks tell of errors of the engine; the loop may have been closed meanwhile.
+            # Looks report errors of the engine; the event loop may have been closed meanwhile.
             with contextlib.suppress(EngineError, RuntimeError):
                 events = engine.events()
                 failures = 0

@@ -75,5 +75,5 @@ def doctor(settings: PlanSettings, names: tuple[str, ...], as_json: bool) -> Non
     from rosproxy_operator.docker.errors import EngineError
 
     with one_line(EngineError):
-        found = examine(settings, names)
-    tell(found, as_json)
+        findings = examine(settings, names)
+    tell(findings, as_json)

@@ -1,7 +1,7 @@
-"""Reconciling a Docker host: look, plan, carry out, tell. The loop around that is `ControlLoop`.
+"""Reconciling a Docker host: look, plan, carry out, report. The loop is `ControlLoop`.
 
-The way of a label, in one direction: the engine's events (`client`) tell that something has changed
-and wake the loop. A look lists everything anew and reads the labels (`snapshot`), decides
+How a label takes effect: the engine's events (`client`) tell that something has changed and wake
+the loop. A look lists everything anew and reads the labels (`snapshot`), decides
 (`planner.plan`), begins to carry out what was decided (`executor`), and brings the running proxies
 up to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
 """
@@ -90,8 +90,8 @@ class DockerController:
         self._masters = MasterResolver(loop.wake)
         self._observer = DockerObserver(engine, settings, self._masters, loop.wake)
         self._applier = DockerApplier(engine, settings, self._proxies)
-        self._executor = doing = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
-        metrics.watch_jobs(lambda: len(doing.busy), lambda: len(doing.problems))
+        self._executor = jobs = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
+        metrics.watch_jobs(lambda: len(jobs.busy), lambda: len(jobs.problems))
         self._proxy_sync = DockerProxySync(self._tasks, self._proxies, settings, loop.wake)
         self._memory = DockerMemory()
         self._shown: list[Problem] = []
@@ -122,17 +122,19 @@ class DockerController:
     async def documents(self) -> dict[str, Document | str]:
         """What the live pages of all running proxies show, or why one can't be asked."""
         access = self._last[0].access if self._last else {}
-        where = {name: (one.admin, one.token) for name, one in access.items()}
-        return await self._proxies.documents(where)
+        endpoints = {name: (p.admin, p.token) for name, p in access.items()}
+        return await self._proxies.documents(endpoints)
 
     async def look(self) -> float | None:
         """One look and what follows from it; when to look again. Raises LookFailed."""
         started = time.monotonic()
         try:
-            look = await self._observer.look()
+            snapshot = await self._observer.look()
         except EngineError as error:
             raise LookFailed(str(error), away=isinstance(error, Unavailable)) from error
-        planned = plan(look.state, look.labels, self._settings, self._memory, time.monotonic())
+        planned = plan(
+            snapshot.state, snapshot.labels, self._settings, self._memory, time.monotonic()
+        )
         took = time.monotonic() - started
         log.debug(
             "looked in %.3f s: %d actions, again in %s s",
@@ -140,32 +142,32 @@ class DockerController:
             len(planned.actions),
             planned.again_in,
         )
-        self._memory, self._last = planned.memory, (look, planned)
-        if look.state.busy and not self._observer.waiting:
-            self._loop.wake_in(SETTLED)  # nobody is going to tell when the list is right
-        self._proxy_sync.update(look, planned.members)  # first: calls of new containers wait for it
+        self._memory, self._last = planned.memory, (snapshot, planned)
+        if snapshot.state.busy and not self._observer.waiting:
+            self._loop.wake_in(SETTLED)  # no event says when the list is right
+        self._proxy_sync.update(snapshot, planned.members)  # first, as new containers' calls wait
         self._executor.start(
-            planned.groups, lambda action: self._applier.carry_out(action, look), started
+            planned.groups, lambda action: self._applier.carry_out(action, snapshot), started
         )
-        problems = self._current(look, planned)
+        problems = self._current(snapshot, planned)
         self._log.update(problems)
         metrics = self._metrics
         metrics.look_time.observe(took)
         metrics.containers.set(sum(member.container.alive for member in planned.members))
         metrics.problems.set(len(problems))
-        metrics.show_proxies(proxy.container.state for proxy in look.state.proxies)
+        metrics.show_proxies(proxy.container.state for proxy in snapshot.state.proxies)
         times = (planned.again_in, self._executor.again_in)
-        return min((each for each in times if each is not None), default=None)
+        return min((t for t in times if t is not None), default=None)
 
-    def _current(self, look: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
+    def _current(self, snapshot: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
         """All problems; those of what is being worked on as they were before.
 
         What a look finds and plans in the midst of it is outdated a moment later.
         """
-        found = [*planned.problems, *self._executor.problems, *self._proxy_sync.problems(look)]
+        latest = [*planned.problems, *self._executor.problems, *self._proxy_sync.problems(snapshot)]
         busy = self._executor.busy
         self._shown = [
-            *(problem for problem in found if problem.subject not in busy),
+            *(problem for problem in latest if problem.subject not in busy),
             *(problem for problem in self._shown if problem.subject in busy),
         ]
         return self._shown
@@ -174,10 +176,10 @@ class DockerController:
         """Whether nothing is left to be done or waited for."""
         if self._last is None or self._executor.busy or self._loop.woken:
             return False
-        look, planned = self._last
-        if self._executor.problems or self._proxy_sync.problems(look):
+        snapshot, planned = self._last
+        if self._executor.problems or self._proxy_sync.problems(snapshot):
             return True
-        waiting = look.state.busy or self._observer.waiting
+        waiting = snapshot.state.busy or self._observer.waiting
         return not waiting and not planned.groups and not self._silent(planned)
 
     def _silent(self, planned: DockerPlan) -> list[str]:
@@ -188,16 +190,16 @@ class DockerController:
     def _unsolved(self) -> list[Problem]:
         if self._last is None:
             return [Problem("engine", self._loop.unready() or "was not looked at")]
-        look, planned = self._last
-        problems = [problem for problem in self._current(look, planned) if problem.fatal]
-        told = {problem.subject for problem in problems}
+        snapshot, planned = self._last
+        problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
+        subjects = {problem.subject for problem in problems}
         problems += [
             Problem(f"proxy {name}", "does not answer")
             for name in self._silent(planned)
-            if f"proxy {name}" not in told
+            if f"proxy {name}" not in subjects
         ]
-        left = planned.groups or planned.deferred or look.state.busy
-        if left and not problems:
+        unfinished = planned.groups or planned.deferred or snapshot.state.busy
+        if unfinished and not problems:
             problems.append(Problem("operator", "there was not enough time for all actions"))
         return problems
 

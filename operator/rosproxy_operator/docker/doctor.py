@@ -43,23 +43,23 @@ async def _examine(settings: PlanSettings, names: Sequence[str]) -> list[DoctorF
     async def ask(name: str) -> list[DoctorFinding]:
         async with limit:
             try:
-                said = await in_thread(engine.run, name, *command(names))
-            except EngineError as wrong:
-                text = f"its own doctor could not be asked: {wrong}"
+                output = await in_thread(engine.run, name, *command(names))
+            except EngineError as failure:
+                text = f"its own doctor could not be asked: {failure}"
                 return [warning("proxy", f"proxy {name}", text, f"docker logs {name}")]
-        return read_findings(f"proxy {name}", said, CURES)
+        return read_findings(f"proxy {name}", output, CURES)
 
     running = [proxy["name"] for proxy in status["proxies"] if proxy["state"] == "running"]
-    said = await asyncio.gather(*map(ask, running))
-    return [*host_findings(status), *(found for each in said for found in each)]
+    findings_by_proxy = await asyncio.gather(*map(ask, running))
+    return [*host_findings(status), *(f for findings in findings_by_proxy for f in findings)]
 
 
 def host_findings(status: Json) -> Iterator[DoctorFinding]:
     """What there is to say of a host, from its status, the first cause first."""
     problems = sorted(status["problems"], key=_order)
     for problem in problems:
-        say = error if problem["fatal"] else warning
-        yield say(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
+        report = error if problem["fatal"] else warning
+        yield report(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
     for proxy in status["proxies"]:
         if proxy["state"] != "running":
             text = f"its container is {proxy['state']}"
@@ -69,7 +69,7 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
         text = f"{plural(len(status['actions']), 'step')} yet to be done, the first: "
         fix = "start the operator if it does not run; rosproxy-operator docker plan shows them"
         yield warning("operator", "operator", text + status["actions"][0], fix)
-    members = {one["name"] for one in status["containers"] if one["proxy"]}
+    members = {c["name"] for c in status["containers"] if c["proxy"]}
     if members:
         text = f"{plural(len(members), 'container')} with a proxy"
         yield ok("host", "host", text)

@@ -1,4 +1,4 @@
-"""From the engine's JSON to what is planned with: plain functions, no questions asked.
+"""From the engine's JSON to the planner's data: plain functions that ask the engine nothing.
 
 The engine's list of containers has states, labels, addresses and networks; the rest only an
 inspection of a container tells. Whatever the engine has nothing to say of may be missing or null.
@@ -15,12 +15,12 @@ from rosproxy_operator.docker.planner.model import Attachment, Container, Networ
 from rosproxy_operator.docker.planner.own import Making
 from rosproxy_operator.docker.planner.specs import SECRET
 
-_NEVER = "0001-"
+_NEVER_STARTED = "0001-"
 _VARIABLES = frozenset(
     {"ROS_VERSION", "ROS_DISTRO", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY", "RMW_IMPLEMENTATION"}
     | {"ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_IP", "ROS_HOSTNAME"}
 )
-"""What says of a container which ROS it is, and how its nodes find each other."""
+"""Variables that tell the version of ROS in a container, and how its nodes find each other."""
 
 
 class _State(TypedDict, total=False):
@@ -80,16 +80,16 @@ class _Inspection(TypedDict, total=False):
     NetworkSettings: _NetworkSettings | None
 
 
-def check_inspection(found: object) -> Json:
-    """What is read of an inspection. Raises msgspec.ValidationError if it is not of that form."""
-    return dict(msgspec.convert(found, _Inspection))
+def check_inspection(inspection: object) -> Json:
+    """What is read of an inspection. Raises msgspec.ValidationError for wrong types."""
+    return dict(msgspec.convert(inspection, _Inspection))
 
 
-def dig(found: Any, *keys: str) -> Any:
-    """What is found under keys, each below the last; None if one is missing."""
+def dig(document: Any, *keys: str) -> Any:
+    """What is under these keys, each within the one before; None if one is missing."""
     for key in keys:
-        found = (found or {}).get(key)
-    return found
+        document = (document or {}).get(key)
+    return document
 
 
 def container_of(event: Json) -> str:
@@ -107,26 +107,26 @@ def environment(inspected: Json | None) -> dict[str, str]:
 
 def endpoints(row: Json | None) -> dict[str, Json]:
     """A container's connections by network, from its row in the list or its inspection."""
-    found = dig(row, "NetworkSettings", "Networks") or {}
-    return {name: endpoint or {} for name, endpoint in found.items()}
+    networks = dig(row, "NetworkSettings", "Networks") or {}
+    return {name: endpoint or {} for name, endpoint in networks.items()}
 
 
 def signature(row: Json) -> tuple[tuple[str, str], ...]:
-    """What of a container's row in the list changes whenever its aliases may have changed.
+    """What changes in a container's row of the list whenever its aliases may have changed.
 
-    Of one without a network of its own: its state.
+    For one without a network of its own: its state.
     """
-    found = sorted((name, end.get("EndpointID") or "") for name, end in endpoints(row).items())
-    return tuple(found) or (("", str(row.get("State"))),)
+    connections = sorted((name, e.get("EndpointID") or "") for name, e in endpoints(row).items())
+    return tuple(connections) or (("", str(row.get("State"))),)
 
 
 def read_making(inspected: Json | None) -> Making:
     """How a container was made, from its inspection."""
-    words = (dig(inspected, "Config", key) or () for key in ("Entrypoint", "Cmd"))
+    argvs = (dig(inspected, "Config", key) or () for key in ("Entrypoint", "Cmd"))
     return Making(
         image=dig(inspected, "Image") or "",
         user=dig(inspected, "Config", "User") or "",
-        command=tuple(word for each in words for word in each),
+        command=tuple(argument for argv in argvs for argument in argv),
         host=dig(inspected, "HostConfig") or {},
     )
 
@@ -138,8 +138,8 @@ def uplink_secret(rows: Iterable[Json], uplink: str) -> str:
     somebody made without one has at least an id of 256 random bits, which no container knows
     either; but it shows wherever a container on that network is inspected.
     """
-    found = next((row for row in rows if row.get("Name") == uplink), None)
-    return str(dig(found, "Labels", SECRET) or found["Id"]) if found else ""
+    network = next((row for row in rows if row.get("Name") == uplink), None)
+    return str(dig(network, "Labels", SECRET) or network["Id"]) if network else ""
 
 
 def name_of(row: Json) -> str:
@@ -156,7 +156,7 @@ def read_container(
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
     name, short_id = name_of(row), row["Id"][:12]
-    aliases = {key: _aliases(end) for key, end in endpoints(inspected).items()}
+    aliases = {key: _aliases(endpoint) for key, endpoint in endpoints(inspected).items()}
     started = dig(inspected, "State", "StartedAt") or ""
     variables = environment(inspected)
     return Container(
@@ -168,19 +168,19 @@ def read_container(
         attachments=tuple(
             Attachment(
                 network=network_names.get(key, key),
-                address=end.get("IPAddress") or "",
+                address=endpoint.get("IPAddress") or "",
                 names=frozenset({name, short_id, *aliases.get(key, ())}),
-                network_id=end.get("NetworkID") or "",
-                endpoint=end.get("EndpointID") or "",
+                network_id=endpoint.get("NetworkID") or "",
+                endpoint=endpoint.get("EndpointID") or "",
             )
-            for key, end in endpoints(row).items()
+            for key, endpoint in endpoints(row).items()
         ),
         master_uri=variables.get("ROS_MASTER_URI", ""),
         variables={name: text for name, text in variables.items() if name in _VARIABLES},
         host_ports=_bound_ports(inspected, "tcp") | _public_ports(row, "tcp"),
         udp_ports=_bound_ports(inspected, "udp") | _public_ports(row, "udp"),
         hostname=dig(inspected, "Config", "Hostname") or "",
-        started_at="" if started.startswith(_NEVER) else started,
+        started_at="" if started.startswith(_NEVER_STARTED) else started,
         exit_code=dig(inspected, "State", "ExitCode") or 0,
     )
 
@@ -189,7 +189,7 @@ def read_network(row: Json) -> Network:
     """A network from the engine's list."""
     configs = dig(row, "IPAM", "Config") or []
     gateways = [config.get("Gateway") or "" for config in configs]
-    subnets = [ip_network(each["Subnet"], strict=False) for each in configs if each.get("Subnet")]
+    subnets = [ip_network(c["Subnet"], strict=False) for c in configs if c.get("Subnet")]
     return Network(
         id=row["Id"],
         name=row["Name"],
@@ -209,9 +209,9 @@ def _bound_ports(inspected: Json | None, protocol: str) -> frozenset[int]:
     """The ports of the host that it asks for; all of a range, of which one is chosen."""
     return frozenset(
         port
-        for key, wanted in (dig(inspected, "HostConfig", "PortBindings") or {}).items()
+        for key, bindings in (dig(inspected, "HostConfig", "PortBindings") or {}).items()
         if (key.partition("/")[2] or "tcp") == protocol
-        for binding in wanted or ()
+        for binding in bindings or ()
         for port in _host_ports(binding.get("HostPort") or "")
     )
 
@@ -225,7 +225,7 @@ def _host_ports(text: str) -> range:
 
 
 def _public_ports(row: Json, protocol: str) -> frozenset[int]:
-    """Those that the engine has given it."""
+    """The ports of the host that the engine has given it."""
     return frozenset(
         port["PublicPort"]
         for port in row.get("Ports") or ()

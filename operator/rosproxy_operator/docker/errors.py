@@ -23,7 +23,7 @@ class Unavailable(EngineError):
 
 
 class Conflict(EngineError):
-    """The name is taken, or somebody else is at it."""
+    """The name is taken, or another request is at work on it."""
 
 
 class Gone(EngineError):
@@ -40,7 +40,7 @@ class PortTaken(EngineError):
 
 def refusal(status: int, text: str, request: str) -> EngineError:
     """The error for what an engine (or a proxy in front of it) answered to a request."""
-    message = _IDS.sub(lambda found: found[0][:12], " ".join(text.split()))
+    message = _IDS.sub(lambda match: match[0][:12], " ".join(text.split()))
     if status == 404 and "page not found" not in message:
         return Gone(message)
     if status == 409:

@@ -71,26 +71,26 @@ DONE: dict[type, tuple[str, ...]] = {
     Disconnect: ("is not connected",),
     Remove: ("is already in progress",),
 }
-"""What the engine says when there is nothing left to do; nor is there for what is gone."""
+"""Parts of the engine's error that mean there is nothing left to do; so does Gone, for these."""
 
 LONGEST_RUN = 10.0
-"""Seconds after which what does one thing, and takes milliseconds, is given up."""
+"""Seconds after which a container that does one thing, in milliseconds, is given up."""
 RUNNING = 0.03
-"""Seconds between looks whether it has ended."""
+"""Seconds between two checks whether it has ended."""
 
 CarryOut = Callable[[Action], Awaitable[None]]
 Job = tuple[Key | None, str]
-"""What is worked on apart from all else: a group's key, and what it is about."""
+"""What is worked on independently: a group's key, and what it is about."""
 UPLINK: Job = (None, "")
 
 
 @dataclass(slots=True)
 class _Failure:
-    """What failed for a key, how often in a row, when to try again, and what to tell."""
+    """What failed for a key, how often in a row, when to try again, and the problem to report."""
 
     actions: list[Action]
     count: int
-    again: float
+    retry_at: float
     problem: Problem
 
 
@@ -114,7 +114,7 @@ class Executor:
         self._port_taken, self._counted = port_taken, counted
         self._busy: dict[Job, asyncio.Task[None]] = {}
         self._failures: dict[Job, _Failure] = {}
-        self._over: dict[Job, float] = {}
+        self._ended_at: dict[Job, float] = {}
         self._refused: dict[Action, tuple[str, float]] = {}
 
     @property
@@ -130,30 +130,30 @@ class Executor:
     @property
     def again_in(self) -> float | None:
         """Seconds until something that has failed may be tried again; None if nothing has."""
-        times = [f.again for job, f in self._failures.items() if job not in self._busy]
+        times = [f.retry_at for job, f in self._failures.items() if job not in self._busy]
         return max(min(times) - self._now(), 0.0) if times else None
 
-    def start(self, groups: Iterable[Group], carry_out: CarryOut, seen: float) -> None:
+    def start(self, groups: Iterable[Group], carry_out: CarryOut, looked_at: float) -> None:
         """Begin what is not under way and did not fail just now, and return.
 
-        ``seen`` is when the look began (monotonic) that the groups were planned from: it may not
-        have seen what work did that was over only after that.
+        ``looked_at`` is when the look began (monotonic) from which the groups were planned: a job
+        that ended later may have done something that it did not see.
         """
         now = self._now()
-        self._refused = {a: each for a, each in self._refused.items() if each[1] > now - QUIET}
+        self._refused = {a: r for a, r in self._refused.items() if r[1] > now - QUIET}
         by_job: dict[Job, list[Group]] = {}
         for group in groups:
             job = group.key, group.about
-            if self._over.get(job, 0.0) < seen:
+            if self._ended_at.get(job, 0.0) < looked_at:
                 by_job.setdefault(job, []).append(group)
-        self._over = {job: at for job, at in self._over.items() if at >= seen}
+        self._ended_at = {job: at for job, at in self._ended_at.items() if at >= looked_at}
         self._failures = {
-            job: each for job, each in self._failures.items() if job in by_job or job in self._over
+            job: f for job, f in self._failures.items() if job in by_job or job in self._ended_at
         }
         for job in sorted(by_job, key=lambda job: job[0] is not None):  # the uplink first
             actions = [action for group in by_job[job] for action in group.actions]
             failure = self._failures.get(job)
-            waiting = failure and failure.actions == actions and now < failure.again
+            waiting = failure and failure.actions == actions and now < failure.retry_at
             if actions and not waiting and job not in self._busy:
                 work = self._run(job, by_job[job], actions, carry_out)
                 self._busy[job] = self._tasks.spawn(work, f"work for {_subject(job)}")
@@ -166,30 +166,30 @@ class Executor:
         try:
             if job != UPLINK and UPLINK in self._busy:
                 await asyncio.wait([self._busy[UPLINK]])
-            problems = [await self._group(group, carry_out) for group in groups]
+            problems = [await self._carry_out_group(group, carry_out) for group in groups]
             problem = next(filter(None, problems), None)
         except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
             log.exception("work for %s failed", _subject(job))
             problem = Problem(_subject(job), f"the operator failed: {error!r}")
         finally:
-            before = self._failures.pop(job, None)
+            previous = self._failures.pop(job, None)
             if problem is not None:
-                count = before.count + 1 if before and before.actions == actions else 1
-                again = self._now() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
-                self._failures[job] = _Failure(actions, count, again, problem)
+                count = previous.count + 1 if previous and previous.actions == actions else 1
+                retry_at = self._now() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
+                self._failures[job] = _Failure(actions, count, retry_at, problem)
             del self._busy[job]
-            self._over[job] = self._now()
+            self._ended_at[job] = self._now()
             self._finished()
 
-    async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
-        """Carry a group out as far as possible; what went wrong.
+    async def _carry_out_group(self, group: Group, carry_out: CarryOut) -> Problem | None:
+        """Carry a group out as far as possible; returns what went wrong.
 
         A network that can't be joined or left does not keep a proxy from serving the others.
         """
         problem: Problem | None = None
         for action in group.actions:
             try:
-                await self._one(action, carry_out)
+                await self._carry_out_action(action, carry_out)
             except PortTaken as error:
                 self._port_taken(action.name, error.port)
                 break
@@ -199,11 +199,11 @@ class Executor:
                     break
         return problem
 
-    async def _one(self, action: Action, carry_out: CarryOut) -> None:
+    async def _carry_out_action(self, action: Action, carry_out: CarryOut) -> None:
         """Carry an action out, and log why it failed: once while it is tried again and again."""
-        before, _ = self._refused.get(action, (None, 0.0))
-        about = action.log_fields
-        log.log(logging.INFO if before is None else logging.DEBUG, "%s", action, extra=about)
+        previous, _ = self._refused.get(action, (None, 0.0))
+        fields = action.log_fields
+        log.log(logging.INFO if previous is None else logging.DEBUG, "%s", action, extra=fields)
         outcome = "failed"
         started = self._now()
         try:
@@ -214,8 +214,8 @@ class Executor:
             reason = str(error)
             if isinstance(error, PortTaken):
                 outcome = reason = "taken"  # maybe another port each time
-            level = logging.DEBUG if reason == before else logging.WARNING
-            log.log(level, "%s: %s", action, error, extra=about)
+            level = logging.DEBUG if reason == previous else logging.WARNING
+            log.log(level, "%s: %s", action, error, extra=fields)
             self._refused[action] = reason, self._now()
             raise
         finally:
@@ -224,8 +224,8 @@ class Executor:
 
 
 def _subject(job: Job) -> str:
-    key, about = job
-    return about or (f"proxy {proxy_name(key)}" if key else "uplink")
+    key, subject = job
+    return subject or (f"proxy {proxy_name(key)}" if key else "uplink")
 
 
 class DockerApplier:
@@ -234,40 +234,40 @@ class DockerApplier:
     def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
         self._engine, self._settings, self._proxies = engine, settings, proxies
 
-    async def carry_out(self, action: Action, look: DockerSnapshot) -> None:
+    async def carry_out(self, action: Action, snapshot: DockerSnapshot) -> None:
         """Carry out an action that was planned from a look. Raises EngineError."""
-        if isinstance(action, Remove) and action.retire and action.name in look.access:
-            await self._retire(action.name, look.access[action.name])
-        await in_thread(self._do, action, look)
+        if isinstance(action, Remove) and action.retire and action.name in snapshot.access:
+            await self._retire(action.name, snapshot.access[action.name])
+        await in_thread(self._do, action, snapshot)
 
     async def _retire(self, name: str, access: ProxyAccess) -> None:
         try:
-            told = await self._proxies.retire(access.admin, access.token)
-            text, what = "%s has unregistered %s nodes at its master", told.get("unregistered")
-            log.info(text, name, what, extra={"proxy": name})
+            answer = await self._proxies.retire(access.admin, access.token)
+            text, count = "%s has unregistered %s nodes at its master", answer.get("unregistered")
+            log.info(text, name, count, extra={"proxy": name})
         except ProxyError as error:
             text = "%s could not unregister its nodes at the master: %s"
             log.warning(text, name, error, extra={"proxy": name})
 
-    def _do(self, action: Action, look: DockerSnapshot) -> None:
+    def _do(self, action: Action, snapshot: DockerSnapshot) -> None:
         try:
-            self._call(action, look)
+            self._call(action, snapshot)
         except EngineError as error:
-            done = DONE.get(type(action))
-            if done is None or not (
-                isinstance(error, Gone) or any(words in str(error) for words in done)
+            phrases = DONE.get(type(action))
+            if phrases is None or not (
+                isinstance(error, Gone) or any(phrase in str(error) for phrase in phrases)
             ):
                 raise
             log.debug("nothing left to do: %s", error)
 
-    def _call(self, action: Action, look: DockerSnapshot) -> None:  # noqa: C901 - one case per action
+    def _call(self, action: Action, snapshot: DockerSnapshot) -> None:  # noqa: C901 - cases only
         do = self._engine.do
         match action:
             case CreateNetwork(name):
-                labels = {MANAGED: "true", SECRET: look.fresh}
+                labels = {MANAGED: "true", SECRET: snapshot.fresh}
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
-                self._create(action.name, self._config(action, look), look.state.image_id)
+                self._create(action.name, self._config(action, snapshot), snapshot.state.image_id)
             case Start(name):
                 do("start", name)
             case Run(name):
@@ -284,10 +284,10 @@ class DockerApplier:
             case Disconnect(name, network):  # also from one that does not exist any more
                 do("disconnect_container_from_network", name, network, force=True)
             case Remove():
-                self._remove(action, look)
+                self._remove(action, snapshot)
 
     def _await_end(self, name: str) -> None:
-        """Wait until what does one thing has done it. Raises EngineError if it could not."""
+        """Wait until a container has ended. Raises EngineError if it failed or takes too long."""
         since = time.monotonic()
         while (state := self._engine.container(name)["State"])["Running"]:
             if time.monotonic() > since + LONGEST_RUN:
@@ -298,7 +298,7 @@ class DockerApplier:
             raise EngineError(f"ended with {state['ExitCode']}, docker logs {name} says why")
 
     def _config(
-        self, action: CreateSandbox | Create | CreateEar | CreateRedirect, look: DockerSnapshot
+        self, action: CreateSandbox | Create | CreateEar | CreateRedirect, snapshot: DockerSnapshot
     ) -> Json:
         if isinstance(action, CreateSandbox):
             return sandbox_config(action, self._settings)
@@ -306,11 +306,11 @@ class DockerApplier:
             return ear_config(action, self._settings)
         if isinstance(action, CreateRedirect):
             return redirect_config(action, self._settings)
-        secret, masters, key = look.state.secret, look.state.masters, action.key
+        secret, masters, key = snapshot.state.secret, snapshot.state.masters, action.key
         address = "" if key.is_ros2 else masters.get(master(key).host.lower(), "")
         return container_config(action, self._settings, secret, address)
 
-    def _remove(self, action: Remove, look: DockerSnapshot) -> None:
+    def _remove(self, action: Remove, snapshot: DockerSnapshot) -> None:
         name = action.name
         if action.stop:
             try:
@@ -322,16 +322,16 @@ class DockerApplier:
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
             if network not in (self._settings.uplink, "host"):  # an ear can't leave the latter
-                self._do(Disconnect(name, network), look)
+                self._do(Disconnect(name, network), snapshot)
         self._engine.do("remove_container", name, force=True)
 
     def _create(self, name: str, config: Json, image_id: str) -> None:
         try:
             self._engine.do("create_container_from_config", config, name)
         except Conflict:
-            found = self._engine.container(name)
-            own = read_own(found["Config"].get("Labels") or {})
-            making = engine_json.read_making(found)
+            container = self._engine.container(name)
+            own = read_own(container["Config"].get("Labels") or {})
+            making = engine_json.read_making(container)
             if own is None or gives_away(own, name, making, image_id):
                 raise EngineError(
                     f"a container that is not this operator's is called {name}; "

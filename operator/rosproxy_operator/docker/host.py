@@ -18,18 +18,20 @@ def ephemeral_ports() -> PortRange:
 
     The kernel's default if it can't be read.
     """
-    text = _text("/proc/sys/net/ipv4/ip_local_port_range") or _USUAL_EPHEMERAL
+    text = _read_text("/proc/sys/net/ipv4/ip_local_port_range") or _USUAL_EPHEMERAL
     return PortRange(*map(int, text.split()))
 
 
 def listening_ports() -> frozenset[int]:
     """The TCP ports on which anything listens, in this network namespace."""
-    return parse_listening(_text("/proc/net/tcp")) | parse_listening(_text("/proc/net/tcp6"))
+    return parse_listening(_read_text("/proc/net/tcp")) | parse_listening(
+        _read_text("/proc/net/tcp6")
+    )
 
 
 def bound_udp_ports() -> frozenset[int]:
     """The UDP ports that anything has, in this network namespace."""
-    return parse_bound(_text("/proc/net/udp")) | parse_bound(_text("/proc/net/udp6"))
+    return parse_bound(_read_text("/proc/net/udp")) | parse_bound(_read_text("/proc/net/udp6"))
 
 
 def parse_bound(text: str) -> frozenset[int]:
@@ -75,7 +77,7 @@ def far_address() -> str:
     return "" if is_loopback(far) else far
 
 
-def _text(path: str) -> str:
+def _read_text(path: str) -> str:
     try:
         return Path(path).read_text(encoding="ascii")
     except OSError:

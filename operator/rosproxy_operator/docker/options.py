@@ -1,7 +1,4 @@
-"""Options of ``rosproxy-operator docker`` by which an administrator bounds labels and proxies.
-
-And those for ROS 2, who is outside.
-"""
+"""Options of ``rosproxy-operator docker`` that bound labels and proxies, and those for ROS 2."""
 
 import click
 
@@ -92,5 +89,5 @@ _OPTIONS = (
 
 
 def bound_options(command: Command) -> Command:
-    """What labels may ask for, who is outside, what each proxy may take, the tokens' secret."""
+    """What labels may ask for, ROS 2's hosts outside, bounds of proxies, the tokens' secret."""
     return with_options(command, _OPTIONS)

@@ -1,11 +1,11 @@
-"""Keeping the proxies up to date about the containers on their networks, each apart.
+"""Keeping each proxy up to date about the containers on its networks, independently of others.
 
-Who may use a proxy as its master goes to it by itself and first: the call of a new container waits
-for that, while all other news may take a proxy long (it asks nodes and its master). Before either
-goes its policy, if that is another one than before: nobody is let in whose policy it does not have.
+Which addresses may use a proxy as their master is told first and alone: the call of a new container
+waits for that, while all other news may take a proxy long (it asks nodes and its master). Before
+both it is told its policy, if that has changed: no container is let in before its policy is known.
 
-A proxy for ROS 2 that had to leave its ports is told who had some of them, so that it has these
-meet everybody anew: outside heeds no other locators of participants that it knows.
+A proxy for ROS 2 that had to leave its ports is told which participants had some of them, so that
+these are discovered anew: outside ignores other locators of a participant that it knows.
 """
 
 import asyncio
@@ -61,21 +61,21 @@ class ProxyUpdater:
         self._policy: tuple[PolicyLayer, ...] | None = None
         self._telling_policy = asyncio.Lock()
 
-    def update(self, known: NetworkFacts) -> None:
+    def update(self, network_facts: NetworkFacts) -> None:
         """Take note of what a look has found."""
-        self._news.look(known, time.monotonic())
+        self._news.look(network_facts, time.monotonic())
         self._looked.set()
         self._selecting.set()
 
     async def run(self) -> None:
         """Tell what there is to be told, for good."""
-        async with asyncio.TaskGroup() as both:
-            both.create_task(self._keep_selected())
-            both.create_task(self._keep_told())
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._keep_selected())
+            tasks.create_task(self._keep_told())
 
     async def _keep_selected(self) -> None:
-        """Tell after each look who may use the proxy as its master."""
-        failures, told = 0, ""
+        """Tell after each look which addresses may use the proxy as their master."""
+        failures, logged = 0, ""
         while True:
             await self._selecting.wait()
             self._selecting.clear()
@@ -86,10 +86,10 @@ class ProxyUpdater:
                 await self._proxies.selected(
                     self.access.admin, self.access.token, addresses, former=former
                 )
-                failures, told = 0, ""
+                failures, logged = 0, ""
             except ProxyError as error:
-                if not error.away and failures >= len(PAUSES) and str(error) != told:
-                    told = str(error)
+                if not error.away and failures >= len(PAUSES) and str(error) != logged:
+                    logged = str(error)
                     text = "%s could not be told who may use it: %s"
                     log.warning(text, self._name, error, extra={"proxy": self._name})
                 self._selecting.set()
@@ -123,25 +123,25 @@ class ProxyUpdater:
 
     async def _tell(self) -> None:
         self._looked.clear()
-        where, token = self.access.admin, self.access.token
+        admin, token = self.access.admin, self.access.token
         refusal = await self._policy_refusal()
-        status = await self._proxies.status(where)
+        status = await self._proxies.status(admin)
         self.leases = leases(status)
         # The facts are not older than need be: its nodes may have come since the last look.
         address = self._news.facts.master_address
         if address and status.master.address != address:
-            await self._proxies.master_address(where, token, address)
+            await self._proxies.master_address(admin, token, address)
             text = "%s: its master is now at %s"
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
         body = self._news.body(inside_addresses(status), now)
         if refusal:
-            body.pop("arrived", None)  # who is adopted would not be kept to the policy
+            body.pop("arrived", None)  # adopted nodes would not be kept to the policy
         if body:
             log.debug("%s is told %s", self._name, body)
-            done = await self._proxies.containers(where, token, body)
-            counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}
-            if text := ", ".join(f"{count} {word}" for word, count in counts.items() if count):
+            answer = await self._proxies.containers(admin, token, body)
+            counts = {change: answer.get(change) for change in ("unregistered", "moved", "adopted")}
+            if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
                 log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
         self._news.told(now)
         self._heard(refusal)
@@ -179,55 +179,55 @@ class DockerProxySync:
         self._running: dict[str, tuple[ProxyUpdater, asyncio.Task[None]]] = {}
         self._leases: dict[str, Leases] = {}
 
-    def update(self, look: DockerSnapshot, members: Collection[Member]) -> None:
+    def update(self, snapshot: DockerSnapshot, members: Collection[Member]) -> None:
         """Begin to tell every running proxy what a look has found."""
         for name, (updater, task) in list(self._running.items()):
-            if look.access.get(name) != updater.access:
+            if snapshot.access.get(name) != updater.access:
                 task.cancel()
                 del self._running[name]
                 if updater.leases:
                     self._leases[name] = updater.leases
-        for proxy in look.state.proxies:
+        for proxy in snapshot.state.proxies:
             name = proxy.container.name
-            if name not in look.access:
+            if name not in snapshot.access:
                 continue
             if name not in self._running:
                 updater = ProxyUpdater(
                     name,
-                    look.access[name],
+                    snapshot.access[name],
                     self._proxies,
                     self._answered,
-                    self._left_behind(name, proxy.range),
+                    self._former_leases(name, proxy.range),
                 )
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
-            known = facts(look.state, proxy, members, self._settings.policy)
-            self._running[name][0].update(known)
+            network_facts = facts(snapshot.state, proxy, members, self._settings.policy)
+            self._running[name][0].update(network_facts)
 
-    def _left_behind(self, name: str, ports: PortRange) -> Leases:
-        """What its participants had, if not all of that is among the ports that a proxy has now."""
-        had = self._leases.get(name, {})
-        kept = all(port in ports for some in had.values() for port in some)
-        return {} if kept else had
+    def _former_leases(self, name: str, ports: PortRange) -> Leases:
+        """What its participants had, unless the proxy has all of these ports now."""
+        previous = self._leases.get(name, {})
+        is_kept = all(port in ports for leased in previous.values() for port in leased)
+        return {} if is_kept else previous
 
     def answers(self, name: str) -> bool:
         """Whether a proxy answers and knows everything."""
         return name in self._running and self._running[name][0].silent_since is None
 
-    def problems(self, look: DockerSnapshot) -> list[Problem]:
+    def problems(self, snapshot: DockerSnapshot) -> list[Problem]:
         """The proxies that do not answer, and what to do about it."""
         lately = time.monotonic() - STARTING
         return [
-            silence(name, updater.error, look, self._settings.uplink)
+            silence(name, updater.error, snapshot, self._settings.uplink)
             for name, (updater, _) in self._running.items()
             if updater.error and updater.silent_since and updater.silent_since < lately
         ]
 
 
-def silence(name: str, error: ProxyError, look: DockerSnapshot, uplink: str) -> Problem:
+def silence(name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str) -> Problem:
     """The problem of a proxy that does not answer, or not as it should."""
     if isinstance(error, PolicyRefused):
         return Problem(f"proxy {name}", str(error))
-    if error.away and not look.at_host:
+    if error.away and not snapshot.at_host:
         advice = f"attach the operator to network {uplink} or run it with network_mode: host"
     else:
         advice = f"docker logs {name} may say why"

@@ -33,8 +33,8 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
     Raises SettingError if they don't go together.
     """
     policy = administrators_policy(options["policy"], options["policy_mode"])
-    every = {**options, "policy": policy, "proxy_bounds": make_proxy_bounds(options)}
-    settings = PlanSettings(**{field.name: every[field.name] for field in fields(PlanSettings)})
+    values = {**options, "policy": policy, "proxy_bounds": make_proxy_bounds(options)}
+    settings = PlanSettings(**{field.name: values[field.name] for field in fields(PlanSettings)})
     window, ports = settings.port_window, settings.ports
     if len(window) < ports:
         raise SettingError("--port-window", f"{window} has {len(window)} ports, --ports is {ports}")
@@ -43,8 +43,8 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
 
 def read_shared_master_uri(text: str) -> str:
     """The URI of a master as all containers can use it; empty for no text. Raises ValueError."""
-    where = parse_slave_uri(read_master_uri(text)) if text else None
-    if where and is_loopback(where.host):
+    master = parse_slave_uri(read_master_uri(text)) if text else None
+    if master and is_loopback(master.host):
         raise ValueError(
             f"{text!r} means another machine to each container; give the address or name of the "
             "master's host, or http://host.docker.internal:PORT for this one"
@@ -64,8 +64,8 @@ def read_lan(text: str) -> str:
 
 def read_memory(text: str) -> int:
     """Bytes, as ``docker run --memory`` has them: 512m, 1g; 0 for no bound. Raises ValueError."""
-    found = _MEMORY.fullmatch(text.strip().lower())
-    size = int(found[1]) * _UNITS[found[2]] if found else -1
+    match = _MEMORY.fullmatch(text.strip().lower())
+    size = int(match[1]) * _UNITS[match[2]] if match else -1
     if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
         raise ValueError(f"{text[:40]!r} is not a size from 64m on, such as 1g; or 0 for no bound")
     return size
@@ -87,8 +87,8 @@ def read_secret(path: str) -> str:
     try:
         secret = Path(path).read_text("utf-8").strip()
     except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or "it is not UTF-8"
-        raise ValueError(f"{path} can't be read: {why}") from None
+        reason = getattr(error, "strerror", None) or "it is not UTF-8"
+        raise ValueError(f"{path} can't be read: {reason}") from None
     if len(secret) < LEAST_SECRET:
         raise ValueError(
             f"{path} must hold at least {LEAST_SECRET} characters: openssl rand -hex 32 gives them"

@@ -1,7 +1,7 @@
 """A look at a Docker host: the engine, the labels of its containers, and where their masters are.
 
-What is seen is data for the planner (`HostState`); beside it stands what the planner needs not
-know: how proxies are reached, and by which tokens. Labels are read here, once per look, since what
+What is seen is data for the planner (`HostState`), and what the planner need not know: how
+proxies are reached, and by which tokens. Labels are read here, once per look, since what
 they say decides which masters' names are resolved.
 """
 
@@ -60,7 +60,7 @@ _KINDS: Mapping[str, type[OwnContainer]] = {
 DOUBT = 1.0
 """Seconds for which a container is inspected with each look after something has happened to it."""
 CHECK = 30.0
-"""Seconds after which the operator's own containers are inspected whatever was heard."""
+"""Seconds after which the operator's own containers are inspected, even without an event."""
 MOST_INSPECTIONS = 16
 """Inspections that are under way at once."""
 
@@ -104,13 +104,13 @@ class Inspector:
     it (`doubt`), and those are inspected with each look for a moment; all of them once in a while,
     beside the look, in case an event was missed.
 
-    One that can't be read is told in the log, once, and is as good as none: it harms no other
-    container. ``late`` is called when something new comes after a look.
+    One that can't be read is logged once, and treated as missing: it affects no other container.
+    ``late`` is called when something new comes after a look.
     """
 
     def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
         self._engine, self._late = engine, late
-        self._known: dict[str, tuple[object, Json]] = {}
+        self._cached: dict[str, tuple[object, Json]] = {}
         self._asking: dict[str, asyncio.Task[bool]] = {}
         self._marks: dict[str, object] = {}
         self._unreadable: set[str] = set()
@@ -125,21 +125,21 @@ class Inspector:
 
     @property
     def waiting(self) -> bool:
-        """Whether inspections are under way, which are going to be told."""
+        """Whether inspections are under way whose end may call ``late``."""
         return bool(self._asking.keys() - self._checking)
 
     def get(self, container: str) -> Json | None:
         """The last known inspection of a container; None if there is none yet."""
-        return self._known.get(container, (None, None))[1]
+        return self._cached.get(container, (None, None))[1]
 
     def sure(self, row: Json) -> bool:
         """Whether the list and the inspection of a container, which is newer, say the same."""
-        mark, inspected = self._known.get(row["Id"], (None, None))
+        mark, inspected = self._cached.get(row["Id"], (None, None))
         fresh = mark == self._marks[row["Id"]]
         return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
 
     def doubt(self, container: str | None) -> None:
-        """Something has happened to a container; None: perhaps to any, unheard."""
+        """Something has happened to a container; None: perhaps to any, with events missed."""
         if container is None:
             self._all_doubted = time.monotonic()
         else:
@@ -157,42 +157,42 @@ class Inspector:
         self._doubted = {key: at for key, at in self._doubted.items() if at >= since}
         doubtful = own.keys() if self._all_doubted >= since else self._doubted.keys() & own.keys()
         self._marks = {row["Id"]: self._mark(row, own, doubtful) for row in rows}
-        self._known = {key: known for key, known in self._known.items() if key in self._marks}
+        self._cached = {key: c for key, c in self._cached.items() if key in self._marks}
         self._doubtful_look = {
             key: look for key, look in self._doubtful_look.items() if key in self._marks
         }
         self._unreadable &= self._marks.keys()
-        asked = [
+        tasks = [
             self._ask(key, mark)
             for key, mark in self._marks.items()
-            if self._known.get(key, (None,))[0] != mark and key not in self._asking
+            if self._cached.get(key, (None,))[0] != mark and key not in self._asking
         ]
-        if asked:
-            _, late = await asyncio.wait(asked, timeout=patience)
-            for task in late:
+        if tasks:
+            _, pending = await asyncio.wait(tasks, timeout=patience)
+            for task in pending:
                 task.add_done_callback(lambda _: self._late())
         if self._checked < now - CHECK:
             self._checked = now
             self._check(key for key, role in own.items() if role != ROLE_REDIRECT)
 
     def _mark(self, row: Json, own: Collection[str], doubtful: Collection[str]) -> object:
-        """What an inspection is for; it is asked for anew when that changes."""
-        key, seen = row["Id"], engine_json.signature(row)
+        """The state that an inspection is of; if that changes, the container is inspected anew."""
+        key, signature = row["Id"], engine_json.signature(row)
         if key not in own:
-            return seen
+            return signature
         if key in doubtful:
             self._doubtful_look[key] = self._looks
-        return row["State"], seen, self._doubtful_look.get(key)
+        return row["State"], signature, self._doubtful_look.get(key)
 
-    def _check(self, those: Iterable[str]) -> None:
+    def _check(self, ids: Iterable[str]) -> None:
         """Inspect all of these beside the looks, and tell if something is new."""
-        for key in those:
+        for key in ids:
             if key in self._marks and key not in self._asking:
                 self._checking.add(key)
-                self._ask(key, self._marks[key]).add_done_callback(self._checked_one)
+                self._ask(key, self._marks[key]).add_done_callback(self._after_check)
 
-    def _checked_one(self, done: asyncio.Task[bool]) -> None:
-        if not done.cancelled() and done.result():
+    def _after_check(self, task: asyncio.Task[bool]) -> None:
+        if not task.cancelled() and task.result():
             self._late()
 
     def _ask(self, container: str, mark: object) -> asyncio.Task[bool]:
@@ -201,12 +201,12 @@ class Inspector:
         return task
 
     async def _inspect(self, container: str, mark: object) -> bool:
-        """Inspect it; whether it is not as it was known."""
-        before = self.get(container)
+        """Inspect a container; whether the inspection differs from the last one."""
+        previous = self.get(container)
         try:
             async with self._turns:
                 inspected = await in_thread(self._engine.container, container)
-            self._known[container] = mark, engine_json.check_inspection(inspected)
+            self._cached[container] = mark, engine_json.check_inspection(inspected)
             self._unreadable.discard(container)
         except EngineError as error:
             log.debug("inspecting %s: %s", container[:12], error)
@@ -217,7 +217,7 @@ class Inspector:
         finally:
             del self._asking[container]
             self._checking.discard(container)
-        return self.get(container) != before
+        return self.get(container) != previous
 
 
 class DockerObserver:
@@ -236,7 +236,7 @@ class DockerObserver:
 
     @property
     def waiting(self) -> bool:
-        """Whether inspections are under way, whose end is going to be told."""
+        """Whether inspections are under way whose end may call ``late``."""
         return self._inspector.waiting
 
     def doubt(self, container: str | None) -> None:
@@ -249,29 +249,29 @@ class DockerObserver:
         Containers whose inspection takes longer than ``patience`` seconds are left out until it is
         there, unless an older one is known.
         """
-        # First: what the engine starts meanwhile is no stranger.
+        # First: ports that the engine opens meanwhile are not foreign.
         listening, bound = host.listening_ports(), host.bound_udp_ports()
-        rows, found, image = await asyncio.gather(
+        rows, net_rows, image = await asyncio.gather(
             in_thread(self._engine.containers),
             in_thread(self._engine.networks),
             in_thread(self._engine.image_id, self._settings.proxy_image),
         )
-        every = ((row["Id"], self._read_own(row)) for row in rows)
-        mine = {key: own.role for key, own in every if own}
-        await self._inspector.update(rows, mine, patience)
-        networks = tuple(map(engine_json.read_network, found))
+        labelled = ((row["Id"], self._read_own(row)) for row in rows)
+        own_roles = {key: own.role for key, own in labelled if own}
+        await self._inspector.update(rows, own_roles, patience)
+        networks = tuple(map(engine_json.read_network, net_rows))
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
         at_host = any(map(host.has, bridges))
         state = self._read(rows, networks, image)
         if at_host:
-            busy = [box for box in state.sandboxes if box.container.name in state.busy]
+            busy = [sandbox for sandbox in state.sandboxes if sandbox.container.name in state.busy]
             state = replace(
                 state,
                 listening=strangers(busy, (), listening),
                 listening_udp=strangers(busy, state.ears, bound),
                 far=host.far_address(),
             )
-        secret = self._settings.secret or engine_json.uplink_secret(found, self._settings.uplink)
+        secret = self._settings.secret or engine_json.uplink_secret(net_rows, self._settings.uplink)
         state = replace(state, image_id=image, secret=secret or self._fresh)
         labels = read_labels(state, self._settings)
         masters = await self._resolve(state, master_hosts(labels, state))
@@ -284,7 +284,7 @@ class DockerObserver:
         return DockerSnapshot(
             state=replace(state, masters=masters, advertise=advertise),
             labels=labels,
-            access={p.container.name: way for p in state.proxies if (way := self._way(p, state))},
+            access={p.container.name: a for p in state.proxies if (a := self._access(p, state))},
             at_host=at_host,
             fresh=self._fresh,
         )
@@ -307,7 +307,7 @@ class DockerObserver:
         as own if its name is right: until it is known, nothing is done to it.
         """
         containers: list[Container] = []
-        own_ones: dict[str, list[Any]] = {role: [] for role in _KINDS}
+        own_by_role: dict[str, list[Any]] = {role: [] for role in _KINDS}
         busy: set[str] = set()
         for row in rows:
             own, forged = self._read_own(row), ""
@@ -323,35 +323,35 @@ class DockerObserver:
                 containers.append(replace(container, forged=forged))
                 own = None
             else:
-                made = _KINDS[own.role](own.key, container, own.range, own.fingerprint)
-                own_ones[own.role].append(made)
+                own_container = _KINDS[own.role](own.key, container, own.range, own.fingerprint)
+                own_by_role[own.role].append(own_container)
             if own and not self._inspector.sure(row):
                 busy.add(container.name)
         return HostState(
             containers=tuple(containers),
             networks=networks,
-            proxies=tuple(own_ones[ROLE_PROXY]),
+            proxies=tuple(own_by_role[ROLE_PROXY]),
             ephemeral=host.ephemeral_ports(),
-            sandboxes=tuple(own_ones[ROLE_SANDBOX]),
-            ears=tuple(own_ones[ROLE_EAR]),
-            redirects=tuple(own_ones[ROLE_REDIRECT]),
+            sandboxes=tuple(own_by_role[ROLE_SANDBOX]),
+            ears=tuple(own_by_role[ROLE_EAR]),
+            redirects=tuple(own_by_role[ROLE_REDIRECT]),
             busy=frozenset(busy),
             addresses=frozenset(
-                end.get("IPAddress") or ""
+                endpoint.get("IPAddress") or ""
                 for row in rows
-                for end in engine_json.endpoints(row).values()
+                for endpoint in engine_json.endpoints(row).values()
             ),
         )
 
     async def _resolve(self, state: HostState, names: Collection[str]) -> dict[str, str]:
         """The addresses of masters' hosts, empty where unknown."""
         uplink = self._settings.uplink
-        known = {name: found for name in names if (found := address_in(state, name, uplink))}
-        never = [a.address for box in state.sandboxes for a in box.container.attachments]
-        await self._masters.learn(names, known, never)
+        local = {name: address for name in names if (address := address_in(state, name, uplink))}
+        excluded = [a.address for sandbox in state.sandboxes for a in sandbox.container.attachments]
+        await self._masters.learn(names, local, excluded)
         return {name: self._masters.address(name) for name in names}
 
-    def _way(self, proxy: Proxy, state: HostState) -> ProxyAccess | None:
+    def _access(self, proxy: Proxy, state: HostState) -> ProxyAccess | None:
         box = state.sandbox_of(proxy)
         if box is None or proxy.container.state != "running" or box.container.state != "running":
             return None
@@ -367,12 +367,12 @@ class DockerObserver:
 def strangers(
     starting: Iterable[Sandbox], ears: Iterable[EarContainer], listening: frozenset[int]
 ) -> frozenset[int]:
-    """Which of the host's ports on which something listens may be somebody else's.
+    """Which of the host's ports on which something listens may belong to other programs.
 
     Not those of a sandbox that is just being started: the engine takes them one by one before it
     says that it runs. Nor those of the ears.
     """
-    own = {port for box in starting for port in box.range.ports()}
+    own = {port for sandbox in starting for port in sandbox.range.ports()}
     return listening - own - {ear.range.last for ear in ears}
 
 
@@ -381,7 +381,7 @@ def address_in(state: HostState, name: str, uplink: str) -> str:
     if name == THIS_HOST:
         return next((n.gateway for n in state.networks if n.name == uplink), "")
     for container in state.containers:
-        for place in container.attachments if container.state in STARTED else ():
-            if place.address and name in {known.lower() for known in place.names}:
-                return place.address
+        for attachment in container.attachments if container.state in STARTED else ():
+            if attachment.address and name in {n.lower() for n in attachment.names}:
+                return attachment.address
     return ""

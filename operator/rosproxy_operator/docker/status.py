@@ -36,14 +36,14 @@ from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
-Said = Mapping[str, ProxyStatus]
-"""What the proxies that answer say, by the names of their containers."""
+ProxyStatuses = Mapping[str, ProxyStatus]
+"""The status of each proxy that answers, by the name of its container."""
 STEPS_LEFT = 3
 """The exit code of ``plan`` if there is something to do."""
 WAIT_INTERVAL = 1.0
 """Seconds between two looks of ``--wait``."""
 PATIENCE = 3.0
-"""Seconds that are waited for inspections: nobody looks a second time."""
+"""Seconds to wait for inspections: there is no second look."""
 
 
 def show_plan(settings: PlanSettings, as_json: bool, wait: float) -> int:
@@ -51,15 +51,15 @@ def show_plan(settings: PlanSettings, as_json: bool, wait: float) -> int:
 
     ``wait`` are the seconds in which there may come to be nothing to do.
     """
-    found = _await(settings, wait, lambda status: not status["actions"])
-    told = {key: found[key] for key in ("actions", "problems")}
+    status = _await(settings, wait, lambda status: not status["actions"])
+    shown = {key: status[key] for key in ("actions", "problems")}
     if as_json:
-        write(json.dumps(told, indent=2))
+        write(json.dumps(shown, indent=2))
     else:
-        write("\n".join(found["actions"]) or "Nothing to do.")
-        for problem in found["problems"]:
+        write("\n".join(status["actions"]) or "Nothing to do.")
+        for problem in status["problems"]:
             write(f"{problem['subject']}: {problem['text']}")
-    return STEPS_LEFT if found["actions"] else int(_is_wrong(found))
+    return STEPS_LEFT if status["actions"] else int(_is_wrong(status))
 
 
 def show_status(settings: PlanSettings, as_json: bool, wait: float) -> int:
@@ -75,9 +75,9 @@ def show_status(settings: PlanSettings, as_json: bool, wait: float) -> int:
 def _await(settings: PlanSettings, seconds: float, good: Callable[[Json], bool]) -> Json:
     """A survey that is good, or the last one after so many seconds. Raises EngineError."""
     end = time.monotonic() + seconds
-    while not good(found := asyncio.run(survey(settings))) and time.monotonic() < end:
+    while not good(status := asyncio.run(survey(settings))) and time.monotonic() < end:
         time.sleep(WAIT_INTERVAL)
-    return found
+    return status
 
 
 def _is_as_wanted(status: Json) -> bool:
@@ -106,35 +106,37 @@ async def survey(settings: PlanSettings) -> Json:
     """What there is, what would be done, and what the proxies say. Raises EngineError.
 
     Containers are those that have a proxy or whose labels are wrong; one with both versions of ROS
-    is there twice. Actions are all but those for what the engine is busy with and tells nothing of.
+    is listed twice. Actions for what the engine is busy with, and tells nothing of, are left out.
     """
     proxies = ProxyClient()
     # Nobody has to be woken: there is no second look.
     observer = DockerObserver(DockerClient(), settings, MasterResolver(lambda: None), lambda: None)
     try:
-        look = await observer.look(PATIENCE)
-        planned = plan(look.state, look.labels, settings, DockerMemory(), time.monotonic())
-        asked = (_ask(proxies, name, look, settings.uplink) for name in look.access)
-        answers = dict(zip(look.access, await asyncio.gather(*asked), strict=True))
+        snapshot = await observer.look(PATIENCE)
+        planned = plan(snapshot.state, snapshot.labels, settings, DockerMemory(), time.monotonic())
+        calls = (_ask(proxies, name, snapshot, settings.uplink) for name in snapshot.access)
+        answers = dict(zip(snapshot.access, await asyncio.gather(*calls), strict=True))
     finally:
         await proxies.close()
-    said = {name: each for name, each in answers.items() if isinstance(each, ProxyStatus)}
-    silent = [each for each in answers.values() if isinstance(each, Problem)]
+    statuses = {name: answer for name, answer in answers.items() if isinstance(answer, ProxyStatus)}
+    silent = [answer for answer in answers.values() if isinstance(answer, Problem)]
     problems = [*planned.problems, *silent]
-    wrong = {problem.subject for problem in problems}
-    redirects = _redirects(planned.members, look.state)
+    subjects = {problem.subject for problem in problems}
+    redirects = _redirects(planned.members, snapshot.state)
     keys: dict[str, list[Key]] = {}
     for member in planned.members:
-        if member.key in look.state.keys:
+        if member.key in snapshot.state.keys:
             keys.setdefault(member.container.id, []).append(member.key)
     return {
         "version": __version__,
         "uplink": settings.uplink,
-        "proxies": [_proxy(key, look.state, said, settings) for key in sorted(look.state.keys)],
+        "proxies": [
+            _proxy(key, snapshot.state, statuses, settings) for key in sorted(snapshot.state.keys)
+        ],
         "containers": [
-            _container(container, key, said, redirects.get((container.id, key)))
-            for container in look.state.containers
-            if container.id in keys or f"container {container.name}" in wrong
+            _container(container, key, statuses, redirects.get((container.id, key)))
+            for container in snapshot.state.containers
+            if container.id in keys or f"container {container.name}" in subjects
             for key in keys.get(container.id, [None])
         ],
         "problems": [asdict(problem) for problem in problems],
@@ -147,29 +149,29 @@ async def survey(settings: PlanSettings) -> Json:
 
 
 async def _ask(
-    proxies: ProxyClient, name: str, look: DockerSnapshot, uplink: str
+    proxies: ProxyClient, name: str, snapshot: DockerSnapshot, uplink: str
 ) -> ProxyStatus | Problem:
     try:
-        return await proxies.status(look.access[name].admin)
+        return await proxies.status(snapshot.access[name].admin)
     except ProxyError as error:
-        return silence(name, error, look, uplink)
+        return silence(name, error, snapshot, uplink)
 
 
-def _proxy(key: Key, observed: HostState, said: Said, settings: PlanSettings) -> Json:
-    """One row per proxy; its sandbox is only told of where it is what is wrong."""
-    process = _best(observed.proxies_of(key), proxy_name(key))
-    box = _best(observed.sandboxes_of(key), sandbox_name(key))
-    own = box or process
-    home = box.container.state if box else "absent"
-    told = said.get(process.container.name) if process else None
-    problems = [f"{one.subject}: {one.text}" for one in (told.problems if told else ())]
-    if home != "running":
-        held = f"the container {sandbox_name(key)}, which holds its ports and networks"
-        problems.insert(0, f"{held}, is {home}")
+def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: PlanSettings) -> Json:
+    """One row per proxy; its sandbox is only mentioned where that is what is wrong."""
+    proxy = _best(observed.proxies_of(key), proxy_name(key))
+    sandbox = _best(observed.sandboxes_of(key), sandbox_name(key))
+    own = sandbox or proxy
+    sandbox_state = sandbox.container.state if sandbox else "absent"
+    status = statuses.get(proxy.container.name) if proxy else None
+    problems = [f"{p.subject}: {p.text}" for p in (status.problems if status else ())]
+    if sandbox_state != "running":
+        subject = f"the container {sandbox_name(key)}, which holds its ports and networks"
+        problems.insert(0, f"{subject}, is {sandbox_state}")
     ear = _best(observed.ears_of(key), ear_name(key))
     if ear and ear.container.state != "running":
         problems.append(f"the container {ear_name(key)}, its ear, is {ear.container.state}")
-    domain = told.domains[0] if told and told.domains else None
+    domain = status.domains[0] if status and status.domains else None
     return {
         "name": proxy_name(key),
         "ros": "2" if key.is_ros2 else "1",
@@ -177,46 +179,46 @@ def _proxy(key: Key, observed: HostState, said: Said, settings: PlanSettings) ->
         "peers": list(domain.peers) if domain else [],
         "ear": ear.container.state if ear else None,
         "master_uri": key.master_uri,
-        "master_address": (told.master.address if told else None) or "",
-        "master_up": told.master.up if told else None,
+        "master_address": (status.master.address if status else None) or "",
+        "master_up": status.master.up if status else None,
         "advertise_host": key.advertise_host,
         "range": str(own.range) if own else "",
-        "state": process.container.state if process else "absent",
-        "reachable": told is not None,
-        "networks": sorted(box.container.networks - {settings.uplink}) if box else [],
-        "data_plane": told.data_plane.plane if told and told.data_plane else None,
-        "used": told.ports.used if told else None,
-        "free": told.ports.free if told else None,
+        "state": proxy.container.state if proxy else "absent",
+        "reachable": status is not None,
+        "networks": sorted(sandbox.container.networks - {settings.uplink}) if sandbox else [],
+        "data_plane": status.data_plane.plane if status and status.data_plane else None,
+        "used": status.ports.used if status else None,
+        "free": status.ports.free if status else None,
         "problems": problems,
     }
 
 
-def _best(found: Iterable[OwnContainer], name: str) -> OwnContainer | None:
-    """The one that is called so, if it runs; else any that runs; else any."""
+def _best(containers: Iterable[OwnContainer], name: str) -> OwnContainer | None:
+    """The container of this name, if it runs; else any that runs; else any."""
     return min(
-        found,
-        key=lambda one: (one.container.state != "running", one.container.name != name),
+        containers,
+        key=lambda own: (own.container.state != "running", own.container.name != name),
         default=None,
     )
 
 
-def _participant(one: ParticipantStatus) -> Json:
+def _participant(participant: ParticipantStatus) -> Json:
     return {
-        "guid_prefix": one.guid_prefix,
-        "vendor": one.vendor,
-        "address": one.address,
-        "ports": [lease.port for lease in one.leases],
-        "publishes": list(one.publishes),
-        "subscribes": list(one.subscribes),
-        "services": list(one.services),
-        "problem": one.problem,
+        "guid_prefix": participant.guid_prefix,
+        "vendor": participant.vendor,
+        "address": participant.address,
+        "ports": [lease.port for lease in participant.leases],
+        "publishes": list(participant.publishes),
+        "subscribes": list(participant.subscribes),
+        "services": list(participant.services),
+        "problem": participant.problem,
     }
 
 
 def _redirects(
     members: Iterable[Member], observed: HostState
 ) -> dict[tuple[str, Key | None], Json]:
-    """What is led to proxies in containers' networks, by container and proxy."""
+    """The redirects in containers' networks, by container and proxy."""
     by_id = {container.id: container for container in observed.containers}
     return {
         (member.container.id, member.key): {
@@ -231,22 +233,22 @@ def _redirects(
 
 
 def _container(
-    container: Container, key: Key | None, said: Said, redirect: Json | None = None
+    container: Container, key: Key | None, statuses: ProxyStatuses, redirect: Json | None = None
 ) -> Json:
     proxy = proxy_name(key) if key else None
     addresses = {a.network: a.address for a in container.attachments if a.address}
-    told = said.get(proxy or "")
-    nodes = nodes_by_address(told) if told else {}
-    participants = participants_by_address(told) if told else {}
+    status = statuses.get(proxy or "")
+    nodes = nodes_by_address(status) if status else {}
+    participants = participants_by_address(status) if status else {}
     return {
         "name": container.name,
         "state": container.state,
         "proxy": proxy,
         "ros": ("2" if key.is_ros2 else "1") if key else None,
         "participants": [
-            _participant(one)
+            _participant(p)
             for address in dict.fromkeys(addresses.values())
-            for one in participants.get(address, ())
+            for p in participants.get(address, ())
         ],
         "redirect": redirect,
         "networks": sorted(container.networks),

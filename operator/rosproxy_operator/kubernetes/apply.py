@@ -1,8 +1,8 @@
-"""Carrying out what was planned.
+"""Carries out the planned actions on the Kubernetes API.
 
-Every action may be carried out twice, or after somebody else did it, or on something that has
-vanished meanwhile: that is no error, the next look sees what is left to do. Before anything is
-deleted it is read again whether that is still right (`confirm`).
+An action may run twice, or after somebody else did the same, or on an object that has vanished:
+that is no error, and the next look plans what is left to do. Before an object is deleted, what
+that was decided from is read again (`confirm`).
 """
 
 import asyncio
@@ -57,9 +57,9 @@ AT_ONCE = 8
 RETIRING = 10.0
 """Seconds that a proxy has to unregister its nodes at the master before it is deleted."""
 RELEASED = (0.2, 0.5, 1.0)
-"""Seconds between tries to have a Service's former address, by which alone pods know it.
+"""Seconds between tries to create a Service under its former address, the only one pods know.
 
-The API server tells that a Service is gone before it gives the address back.
+The API server reports a Service as deleted before it frees the address.
 """
 
 _KINDS: Mapping[type, tuple[str, str]] = {
@@ -72,16 +72,16 @@ _KINDS: Mapping[type, tuple[str, str]] = {
     CreateEar: ("Pod", "pods"),
     DeleteEar: ("Pod", "pods"),
 }
-"""What is created and deleted: its kind, and the same as the API's paths have it."""
+"""By action: the kind that it creates or deletes, and that kind's name in the API's paths."""
 Count = Callable[[Action, str], None]
 
 
 class ClusterApplier:
     """Carries out actions, those of one RosProxy one after the other.
 
-    ``counted`` is called with each action and its outcome (ok, failed); ``doubted`` where what is
-    known stays another than what is read: a watch has lost something. ``busy`` are those that are
-    under way or wait for room.
+    ``counted`` is called with each action and its outcome (ok, failed); ``doubted`` if the watched
+    state still differs from what is read: a watch has missed something. ``busy`` is the number of
+    actions that are under way or wait for their turn.
     """
 
     def __init__(
@@ -103,85 +103,85 @@ class ClusterApplier:
 
     @property
     def failed(self) -> int:
-        """How much has failed and is to be tried again."""
+        """How many actions have failed and are to be tried again."""
         return sum(map(len, self.failures.values())) + len(self.problems)
 
     def forget(self) -> None:
-        """Begin anew: another operator has acted meanwhile."""
+        """Drop what is remembered: another operator has acted meanwhile."""
         self.failures, self.problems = {}, {}
         self._stale.clear()
         self._retiring.clear()
         self._retired.clear()
 
     async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
-        """Carry out what was planned from what was observed. What fails is noted, not raised."""
+        """Carry out what was planned from ``observed``. Failures are noted, not raised."""
         groups: dict[Name, list[Action]] = {}
         for action in actions:
             groups.setdefault(action.of, []).append(action)
-        await asyncio.gather(*(self._group(of, some, observed) for of, some in groups.items()))
-        there = {each.id for each in observed.rosproxies} | set(observed.unusable)
-        self.failures = {of: some for of, some in self.failures.items() if of in there}
-        self.problems = {of: each for of, each in self.problems.items() if of in there}
+        await asyncio.gather(*(self._group(name, todo, observed) for name, todo in groups.items()))
+        existing = {rosproxy.id for rosproxy in observed.rosproxies} | set(observed.unusable)
+        self.failures = {name: errors for name, errors in self.failures.items() if name in existing}
+        self.problems = {name: p for name, p in self.problems.items() if name in existing}
         self._retired &= {proxy.pod.uid for proxy in observed.proxies}
 
-    async def _group(self, of: Name, actions: list[Action], observed: ClusterSnapshot) -> None:
-        doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
-        tried = [(_subject(action), await self._one(action, observed)) for action in doing]
-        failures = {id: text for id, text in tried if text is not None}
-        if doing:
-            self.failures = {**self.failures, of: failures}
+    async def _group(self, name: Name, actions: list[Action], observed: ClusterSnapshot) -> None:
+        changes = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
+        outcomes = [(_subject(action), await self._perform(action, observed)) for action in changes]
+        failures = {id: text for id, text in outcomes if text is not None}
+        if changes:
+            self.failures = {**self.failures, name: failures}
         for action in actions:
             if isinstance(action, PatchStatus):
-                said = await self._one(action, observed)
-                self.problems.pop(of, None)
-                if said is not None:
-                    text = f"its status can't be written: {said}"
-                    self.problems[of] = Problem(f"rosproxy {of}", text)
+                error = await self._perform(action, observed)
+                self.problems.pop(name, None)
+                if error is not None:
+                    text = f"its status can't be written: {error}"
+                    self.problems[name] = Problem(f"rosproxy {name}", text)
         emits = [action for action in actions if isinstance(action, Emit)]
-        wanted = [each for each in emits if not (failures and each.type == "Normal")]
-        await asyncio.gather(*(self._one(each, observed) for each in wanted))
+        wanted = [emit for emit in emits if not (failures and emit.type == "Normal")]
+        await asyncio.gather(*(self._perform(emit, observed) for emit in wanted))
 
-    async def _one(self, action: Action, observed: ClusterSnapshot) -> str | None:
-        """Carry out one action; what went wrong."""
+    async def _perform(self, action: Action, observed: ClusterSnapshot) -> str | None:
+        """Carry out one action. Returns why it failed; None if it did not, or was not due."""
         quiet = isinstance(action, PatchStatus | Emit)
         self.busy += 1
         try:
-            waits = isinstance(action, DeleteProxy) and action.retire
-            if waits and not await self._is_retired(action, observed):
+            retires = isinstance(action, DeleteProxy) and action.retire
+            if retires and not await self._is_retired(action, observed):
                 return None
             async with self._room:
-                await in_thread(self._do, action, observed)
+                await in_thread(self._call_api, action, observed)
         except Stale as error:
-            log.debug("%s: not now: %s has changed meanwhile", line(action), error)
+            log.debug("%s: not now: %s has changed meanwhile", describe(action), error)
             self._doubt(_subject(action))
             return None
         except NotLeading:
-            return None  # another one does it, or this one in another term
+            return None  # another operator does it, or this one in a later term
         except _nothing_left(action) as error:
-            log.debug("%s: nothing to do: %s", line(action), error)
+            log.debug("%s: nothing to do: %s", describe(action), error)
             return None
         except ApiError as error:
             text = str(error)
         except Exception as error:  # a mistake of ours must not stop the others
-            log.exception("%s failed", line(action))
+            log.exception("%s failed", describe(action))
             text = f"the operator failed: {error!r}"
         else:
             self._stale.discard(_subject(action))
             level = logging.DEBUG if quiet else logging.INFO
-            log.log(level, "%s", line(action), extra=_log_fields(action))
+            log.log(level, "%s", describe(action), extra=_log_fields(action))
             self._counted(action, "ok")
             return None
         finally:
             self.busy -= 1
-        before = self.failures.get(action.of, {}).get(_subject(action))
-        told = text == before or isinstance(action, PatchStatus)
-        level = logging.DEBUG if told else logging.WARNING
-        log.log(level, "%s: %s", line(action), text, extra=_log_fields(action))
+        previous = self.failures.get(action.of, {}).get(_subject(action))
+        is_reported = text == previous or isinstance(action, PatchStatus)
+        level = logging.DEBUG if is_reported else logging.WARNING
+        log.log(level, "%s: %s", describe(action), text, extra=_log_fields(action))
         self._counted(action, "failed")
         return text
 
     def _doubt(self, id: Name) -> None:
-        """What is known was not so. Once that is a watch that lags, a second time it is not."""
+        """The watched state was wrong: once a watch may lag, the second time it has lost events."""
         if id in self._stale:
             self._stale.clear()
             self._doubted()
@@ -189,7 +189,7 @@ class ClusterApplier:
             self._stale.add(id)
 
     async def _is_retired(self, action: Action, observed: ClusterSnapshot) -> bool:
-        """Whether a proxy has unregistered its nodes; else it begins to, if that is right."""
+        """Whether a proxy has unregistered its nodes; if not, starts that if `confirm` agrees."""
         assert isinstance(action, DeleteProxy)  # noqa: S101 - no other is to be retired
         if action.uid in self._retired:
             return True
@@ -206,7 +206,7 @@ class ClusterApplier:
             self._tasks.spawn(self._retire(action, observed), f"retiring {action.id}")
         return False
 
-    def _do(self, action: Action, observed: ClusterSnapshot) -> None:
+    def _call_api(self, action: Action, observed: ClusterSnapshot) -> None:
         api = self._api
         match action:
             case CreateService() | CreatePolicy() | CreateProxy() | CreateEar():
@@ -218,15 +218,15 @@ class ClusterApplier:
                 api.evict(action.id, action.uid)
             case SetImage():
                 container = "/spec/containers/0"
-                named = {"op": "test", "path": f"{container}/name", "value": CONTAINER}
+                name_test = {"op": "test", "path": f"{container}/name", "value": CONTAINER}
                 image = {"op": "replace", "path": f"{container}/image", "value": action.image}
-                api.patch("pods", action.id, [_still(action.uid), named, image])
+                api.patch("pods", action.id, [_uid_test(action.uid), name_test, image])
             case SetPolicy():
                 spec = {"op": "replace", "path": "/spec", "value": action.spec}
-                api.patch(POLICIES, action.id, [_still(action.uid), spec])
+                api.patch(POLICIES, action.id, [_uid_test(action.uid), spec])
             case PatchStatus():
                 status = {"op": "add", "path": "/status", "value": action.status}
-                api.patch(f"{PLURAL}/status", action.of, [_still(action.uid), status])
+                api.patch(f"{PLURAL}/status", action.of, [_uid_test(action.uid), status])
             case Emit():
                 _emit(api, action)
 
@@ -236,30 +236,30 @@ class ClusterApplier:
 
     async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         """Let a proxy unregister its nodes, then delete it, beside everything else."""
-        about = _log_fields(action)
+        fields = _log_fields(action)
         try:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
             if proxy is not None and proxy.pod.ip:
                 async with asyncio.timeout(RETIRING):
                     token = token_for(proxy, observed.key)
-                    told = await self._proxies.retire(address_of(proxy), token)
-                log.info("%s has unregistered its nodes: %s", action.id, told, extra=about)
+                    answer = await self._proxies.retire(address_of(proxy), token)
+                log.info("%s has unregistered its nodes: %s", action.id, answer, extra=fields)
         except (ProxyError, TimeoutError) as error:
             reason = str(error) or f"no answer in {RETIRING:g} s"
             text = "%s could not unregister its nodes at the master: %s"
-            log.info(text, action.id, reason, extra=about)
+            log.info(text, action.id, reason, extra=fields)
         finally:
             self._retired.add(action.uid)
             self._retiring.discard(action.uid)
-            await self._one(action, observed)
+            await self._perform(action, observed)
 
 
-def _still(uid: str) -> Json:
-    """The first operation of a JSON patch: it changes nothing if the object is another one."""
+def _uid_test(uid: str) -> Json:
+    """The first operation of a JSON patch, which fails if the object has another uid by now."""
     return {"op": "test", "path": "/metadata/uid", "value": uid}
 
 
-def line(action: Action) -> str:
+def describe(action: Action) -> str:
     """An action in one line."""
     match action:
         case CreateService() | CreatePolicy() | CreateProxy() | CreateEar():
@@ -294,7 +294,7 @@ def _subject(action: Action) -> Name:
 
 
 def _log_fields(action: Action) -> dict[str, str]:
-    """What a log entry about an action has as fields: the proxy's pod."""
+    """Extra fields of a log line about an action: the proxy's pod, if it is about one."""
     of_proxy = isinstance(action, CreateProxy | DeleteProxy | SetImage)
     return {"proxy": str(_subject(action))} if of_proxy else {}
 
@@ -310,7 +310,7 @@ def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
 
 
 def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED) -> None:
-    """Create an object if it is not there; a Service if need be under another address than before.
+    """Create an object if it is not there; a Service under a new address if the former is refused.
 
     Raises ApiError.
     """
@@ -331,15 +331,15 @@ def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED)
 def _check_ours(api: Api, kind: str, body: Json) -> None:
     """Raise ApiError if the object that has the name already is not the operator's.
 
-    If it is, the list that was planned from was a little old, or a RosProxy of the same name has
-    just been deleted.
+    If it is the operator's, the plan was made from a list that was a little old, or a RosProxy of
+    the same name has just been deleted.
     """
     try:
-        there = part(api.get(kind, name_of(body["metadata"])), "metadata")
+        metadata = part(api.get(kind, name_of(body["metadata"])), "metadata")
     except ApiGone:
         return
-    owners = {word(one, "kind") for one in parts(there, "ownerReferences")}
-    if not is_own(words(there, "labels")) or KIND not in owners:
+    owners = {word(owner, "kind") for owner in parts(metadata, "ownerReferences")}
+    if not is_own(words(metadata, "labels")) or KIND not in owners:
         raise ApiConflict(
             f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
             "or rename the RosProxy"

@@ -24,5 +24,5 @@ def doctor(namespaces: tuple[str, ...], names: tuple[str, ...], as_json: bool) -
     from rosproxy_operator.kubernetes.doctor import examine
 
     with one_line(ApiError):
-        found = examine(namespaces, names)
-    tell(found, as_json)
+        findings = examine(namespaces, names)
+    tell(findings, as_json)

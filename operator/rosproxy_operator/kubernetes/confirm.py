@@ -1,10 +1,10 @@
-"""Before something is deleted: whether that which it was decided from is still so.
+"""Checks, before an object is deleted, that the facts behind that decision still hold.
 
-What watches tell may be old. So the RosProxy, the node and the pods there that matter are read
-from the API server's store; if one of them is another one than the look had seen, nothing is done:
-the watch is about to tell, and the next look decides. Then the object is deleted only if it is as
-it was read (uid and resourceVersion), so that nothing can come between. Where the RosProxy is gone
-nothing else matters: the garbage collector is at its pods already, so they change meanwhile.
+Watches may lag. So the RosProxy, the node and the pods there that matter are read from the API
+server's store; if one of them differs from what the look had seen, nothing is deleted: the watch
+will deliver the change, and the next look decides. Then the object is deleted only if it is as it
+was read (uid and resourceVersion), so that nothing can change in between. Where the RosProxy is
+gone nothing else matters: the garbage collector deletes its pods already, so they keep changing.
 """
 
 from collections.abc import Iterable
@@ -28,53 +28,53 @@ Deletion = DeleteService | DeletePolicy | DeleteProxy | DeleteEar | EvictPod
 
 
 class Stale(Exception):
-    """What was decided from is not so any more; the message says what is another one."""
+    """The facts behind a deletion have changed; the message says which object differs."""
 
 
 def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
     """The version in which the object may be deleted; empty for any. Raises Stale, ApiError."""
-    gone = _check_rosproxy(api, action.of, observed)
+    is_gone = _check_rosproxy(api, action.of, observed)
     if isinstance(action, EvictPod):
         _check_pod(api, action, observed)
-    if gone or not isinstance(action, DeleteProxy | DeleteEar):
+    if is_gone or not isinstance(action, DeleteProxy | DeleteEar):
         return ""
     own = own_pods(observed.proxies, observed.ears)
-    one = next((one for one in own if one.pod.uid == action.uid), None)
-    if one is None:
+    target = next((p for p in own if p.pod.uid == action.uid), None)
+    if target is None:
         raise Stale(f"pod {action.id}")
-    _check_node(api, one.on, observed)
-    found = api.fresh("pods", "", f"spec.nodeName={one.on}")
-    there = [pod for pod in map(_pod, found) if _matters(pod, action.of)]
-    seen = (pod for pod in observed.pods if pod.node == one.on and _matters(pod, action.of))
-    if _by_uid(there) != _by_uid(seen):
-        raise Stale(f"the pods on node {one.on}")
-    if one.pod.node != one.on:
+    _check_node(api, target.on, observed)
+    raw_pods = api.fresh("pods", "", f"spec.nodeName={target.on}")
+    current = [pod for pod in map(_pod, raw_pods) if _matters(pod, action.of)]
+    expected = (pod for pod in observed.pods if pod.node == target.on and _matters(pod, action.of))
+    if _by_uid(current) != _by_uid(expected):
+        raise Stale(f"the pods on node {target.on}")
+    if target.pod.node != target.on:
         return ""
-    return next((_version(obj) for obj in found if _uid(obj) == action.uid), "")
+    return next((_version(obj) for obj in raw_pods if _uid(obj) == action.uid), "")
 
 
-def _check_rosproxy(api: Api, of: Name, observed: ClusterSnapshot) -> bool:
+def _check_rosproxy(api: Api, name: Name, observed: ClusterSnapshot) -> bool:
     """Whether the RosProxy is gone."""
-    found = api.fresh(PLURAL, of.namespace, f"metadata.name={of.name}")
-    now = {_asked(rosproxy_record(obj)) for obj in found}
-    seen = {_asked(one) for one in observed.rosproxies if one.id == of}
-    if of in observed.unusable:
-        seen.add(_asked(observed.unusable[of]))
-    if now != seen:
-        raise Stale(f"RosProxy {of}")
-    return not now
+    objs = api.fresh(PLURAL, name.namespace, f"metadata.name={name.name}")
+    current = {_requested(rosproxy_record(obj)) for obj in objs}
+    expected = {_requested(rosproxy) for rosproxy in observed.rosproxies if rosproxy.id == name}
+    if name in observed.unusable:
+        expected.add(_requested(observed.unusable[name]))
+    if current != expected:
+        raise Stale(f"RosProxy {name}")
+    return not current
 
 
 def _check_node(api: Api, name: str, observed: ClusterSnapshot) -> None:
-    found = [objects.node(obj) for obj in api.fresh("nodes", "", f"metadata.name={name}")]
-    if found != [*filter(None, [observed.nodes.get(name)])]:
+    nodes = [objects.node(obj) for obj in api.fresh("nodes", "", f"metadata.name={name}")]
+    if nodes != [*filter(None, [observed.nodes.get(name)])]:
         raise Stale(f"node {name}")
 
 
 def _check_pod(api: Api, action: EvictPod, observed: ClusterSnapshot) -> None:
-    found = api.fresh("pods", action.id.namespace, f"metadata.name={action.id.name}")
-    now = {_wiring(pod) for pod in map(_pod, found)}
-    if now != {_wiring(pod) for pod in observed.pods if pod.uid == action.uid}:
+    objs = api.fresh("pods", action.id.namespace, f"metadata.name={action.id.name}")
+    current = {_wiring(pod) for pod in map(_pod, objs)}
+    if current != {_wiring(pod) for pod in observed.pods if pod.uid == action.uid}:
         raise Stale(f"pod {action.id}")
 
 
@@ -83,23 +83,23 @@ def _wiring(pod: Pod) -> tuple[object, ...]:
     return pod.uid, pod.deleting, pod.ended, pod.wired, pod.own_masters, pod.controller, labels
 
 
-def _asked(one: RosProxy | InvalidRosProxy) -> tuple[object, ...]:
-    more = (one.deleting, one.remakes) if isinstance(one, RosProxy) else ()
-    return one.uid, one.generation, *more
+def _requested(rosproxy: RosProxy | InvalidRosProxy) -> tuple[object, ...]:
+    flags = (rosproxy.deleting, rosproxy.remakes) if isinstance(rosproxy, RosProxy) else ()
+    return rosproxy.uid, rosproxy.generation, *flags
 
 
 def _pod(obj: Json) -> Pod:
-    found = pod_record(obj)
-    return found if isinstance(found, Pod) else found.pod
+    record = pod_record(obj)
+    return record if isinstance(record, Pod) else record.pod
 
 
-def _matters(pod: Pod, of: Name) -> bool:
+def _matters(pod: Pod, rosproxy: Name) -> bool:
     """Whether a pod may want the proxy, or take its ports."""
-    return pod.id.namespace == of.namespace or bool(pod.every_port)
+    return pod.id.namespace == rosproxy.namespace or bool(pod.every_port)
 
 
 def _by_uid(pods: Iterable[Pod]) -> dict[str, object]:
-    """What of pods is decided from: which there are, where they are, what they take and ask for."""
+    """The facts about pods that a deletion is decided from, by the pods' uids."""
     return {
         pod.uid: (pod.labels, pod.ended, pod.deleting, pod.every_port, pod.host_network)
         for pod in pods

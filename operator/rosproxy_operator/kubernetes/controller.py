@@ -1,15 +1,14 @@
-"""Reconciling a cluster: look, plan, carry out, tell. The loop around that is `ControlLoop`.
+"""Reconciles a cluster: look, plan, carry out, report. The loop around that is `ControlLoop`.
 
-The way of a RosProxy, in one direction: watches tell of it, and what they tell is
-kept (`watch`), which wakes the loop if it concerns anybody. A look takes the cluster from there,
-adds what the proxies say of themselves (`proxies`), decides (`planner.plan`), and carries out
-what was decided (`apply`): Services and pods, then the RosProxies' statuses and the Events. Only
-the parts that something has happened to are planned (`planner.parts`), and now and then all of
-them. Nothing is decided from an event alone, and nothing here decides.
+Data flows in one direction: watches deliver objects, which are kept (`watch`), and wake the loop
+if they concern a RosProxy. A look takes the cluster from there, adds the proxies' reports
+(`proxies`), decides (`planner.plan`), and carries the decisions out (`apply`): Services and pods,
+then the RosProxies' statuses and the Events. Only the parts of the cluster that have changed are
+planned (`planner.parts`), and now and then all of them. Nothing is decided from an event alone,
+and nothing is decided in this file.
 
 Of several operators one acts, for a term (`leader`). The others keep up with the cluster and with
-what the proxies say, so that the next one begins at once; what it remembers of a term it forgets
-with that.
+the proxies' reports, so that the next leader begins at once; at its end a term is forgotten.
 """
 
 import asyncio
@@ -49,7 +48,7 @@ log = logging.getLogger(__name__)
 DEBOUNCE = 0.1
 """Least seconds between two looks: one roll-out makes dozens of events."""
 SETTLED = 1.0
-"""Seconds after something was done at which there is one more look, should nobody tell of it."""
+"""Seconds from an action to one more look, in case no watch reports its effect."""
 LONGEST_LOOK = 90.0
 """Seconds after which a look that has not ended is given up."""
 STANDING_BY = 5.0
@@ -80,12 +79,12 @@ class KubernetesController:
         kinds, corrected = every_kind(api), metrics.view_corrections.inc
         self._store = ClusterStore(kinds, api.places(PLURAL), loop.wake, loop.retry, corrected)
         self._sandbox = SandboxFailures(api)
-        self._applier = doing = ClusterApplier(
-            api, self._proxies, self._tasks, metrics.count, self._doubt
+        self._applier = applier = ClusterApplier(
+            api, self._proxies, self._tasks, metrics.count, self._relist
         )
-        metrics.watch_jobs(lambda: doing.busy, lambda: doing.failed)
+        metrics.watch_jobs(lambda: applier.busy, lambda: applier.failed)
         leads = self._leads
-        self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, self._news, leads)
+        self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, self._wake_for, leads)
         self._state, self._due, self._stood_by = ClusterState(), Due(), -STANDING_BY
         self._reflectors: list[Reflector] = []
         self._secret = b""
@@ -94,25 +93,26 @@ class KubernetesController:
 
     async def run(self) -> None:
         """Look after the cluster until cancelled. Proxies go on without an operator."""
-        soon = asyncio.get_running_loop().call_soon_threadsafe
-        lost = self._metrics.watch_restarts.inc
+        call_soon = asyncio.get_running_loop().call_soon_threadsafe
+        count_restart = self._metrics.watch_restarts.inc
         self._reflectors = reflectors = [
-            Reflector(self._api, what, self._store, soon, lost) for what in every_kind(self._api)
+            Reflector(self._api, collection, self._store, call_soon, count_restart)
+            for collection in every_kind(self._api)
         ]
-        for one in reflectors:
-            one.start()
+        for reflector in reflectors:
+            reflector.start()
         try:
             await self._loop.run(self.look)
         finally:
-            for one in reflectors:
-                one.stop()
+            for reflector in reflectors:
+                reflector.stop()
             await self._tasks.cancel()
             await self._proxies.close()
-            for one in reflectors:
-                await in_thread(one.join)
+            for reflector in reflectors:
+                await in_thread(reflector.join)
 
     async def stop_acting(self) -> None:
-        """End what goes on beside the looks. The next one finds that it leads no more."""
+        """Cancel the tasks beside the looks. The next look finds that this one leads no more."""
         await self._tasks.cancel()
 
     async def documents(self) -> dict[str, Document | str]:
@@ -131,37 +131,37 @@ class KubernetesController:
 
     async def _look(self) -> float | None:
         if self._term() != self._acting:
-            await self._turn()  # also while the API server is away: then another one may lead
+            await self._change_term()  # even without the API server: another one may lead then
         await self._store.check()
         return await (self._act() if self._acting else self._stand_by())
 
     def _leads(self) -> bool:
         return self._term() != 0
 
-    async def _turn(self) -> None:
-        """Begin a term, or end one: of that nothing is to be left."""
+    async def _change_term(self) -> None:
+        """Begin a term, or end one and forget all that belongs to it."""
         if self._acting:
             await self._tasks.cancel()
             await self._proxy_sync.forget()
             self._applier.forget()
-            self._problems, self._log = {}, ProblemLog()  # nothing is solved by that
+            self._problems, self._log = {}, ProblemLog()  # ending a term solves none
             self._state = ClusterState(former=self._state.former)
             self._report(ClusterSnapshot())
         self._acting, self._stood_by = self._term(), -STANDING_BY
         self._due.all()
 
     async def _stand_by(self) -> float:
-        """Remember what the next term needs; in how many seconds again."""
-        left = self._stood_by + STANDING_BY - time.monotonic()
-        if left > 0:
-            return left
+        """Remember what the next term needs. Returns in how many seconds to do that again."""
+        remaining = self._stood_by + STANDING_BY - time.monotonic()
+        if remaining > 0:
+            return remaining
         self._secret = await in_thread(self._key.read)
         self._store.touched()
-        seen = self._store.snapshot(self._secret)
-        self._proxy_sync.follow(seen.proxies, seen.key)
-        seen = replace(seen, reports=self._proxy_sync.reports)
+        observed = self._store.snapshot(self._secret)
+        self._proxy_sync.follow(observed.proxies, observed.key)
+        observed = replace(observed, reports=self._proxy_sync.reports)
         self._stood_by = time.monotonic()
-        self._state = stand_by(seen, self._settings.plan, self._state, self._stood_by)
+        self._state = stand_by(observed, self._settings.plan, self._state, self._stood_by)
         return STANDING_BY
 
     async def _act(self) -> float | None:
@@ -169,71 +169,73 @@ class KubernetesController:
         if self._due.is_all(started, self._settings.resync):
             self._secret = await in_thread(self._key.read)
         self._due.at_once(await self._sandbox.read(self._store.snapshot()))
-        # From here on nothing is waited for: what has changed is what is seen.
-        touched, seen = self._store.touched(), self._store.snapshot(self._secret)
-        seen = self._sandbox.shown(seen)
-        self._proxy_sync.follow(seen.proxies, seen.key)
-        seen = replace(seen, reports=self._proxy_sync.reports, failures=self._applier.failures)
-        part = self._due.part(seen, touched.namespaces, touched.nodes, time.monotonic())
-        planned = self._planned(seen, part)
+        # No await before all is planned: so the snapshot has exactly the changes noted so far.
+        touched, observed = self._store.touched(), self._store.snapshot(self._secret)
+        observed = self._sandbox.shown(observed)
+        self._proxy_sync.follow(observed.proxies, observed.key)
+        observed = replace(
+            observed, reports=self._proxy_sync.reports, failures=self._applier.failures
+        )
+        scope = self._due.part(observed, touched.namespaces, touched.nodes, time.monotonic())
+        planned = self._planned(observed, scope)
         took = time.monotonic() - started
         self._metrics.look_time.observe(took)
-        log.debug("looked in %.3f s, %s", took, "at all" if part is None else part.namespaces)
-        await self._carry_out(planned, seen, part)
-        self._report(seen)
+        log.debug("looked in %.3f s, %s", took, "at all" if scope is None else scope.namespaces)
+        await self._carry_out(planned, observed, scope)
+        self._report(observed)
         return self._due.again_in(time.monotonic(), self._sandbox.again_in())
 
-    def _planned(self, seen: ClusterSnapshot, part: Part | None) -> ClusterPlan:
-        """The plan for a part, None for all; what it remembers is kept."""
-        now, said, settings = time.monotonic(), stamp(time.time()), self._settings.plan
-        if part is None:
-            planned = plan(seen, settings, self._state, now, said)
+    def _planned(self, observed: ClusterSnapshot, scope: Part | None) -> ClusterPlan:
+        """The plan for a part of the cluster, None for all; the state that it returns is kept."""
+        now, timestamp, settings = time.monotonic(), stamp(time.time()), self._settings.plan
+        if scope is None:
+            planned = plan(observed, settings, self._state, now, timestamp)
             self._state, self._problems = planned.state, {}
         else:
-            before = cut_state(self._state, part)
-            planned = plan(cut(seen, part), settings, before, now, said)
-            self._state = joined(self._state, part, planned.state)
-            for namespace in part.namespaces:
+            state = cut_state(self._state, scope)
+            planned = plan(cut(observed, scope), settings, state, now, timestamp)
+            self._state = joined(self._state, scope, planned.state)
+            for namespace in scope.namespaces:
                 self._problems.pop(namespace, None)
-        for one in planned.problems:
-            self._problems.setdefault(one.of.namespace, []).append(one)
-        self._due.planned(part, seen, planned.again_in, now)
+        for problem in planned.problems:
+            self._problems.setdefault(problem.of.namespace, []).append(problem)
+        self._due.planned(scope, observed, planned.again_in, now)
         return planned
 
     async def _carry_out(
-        self, planned: ClusterPlan, seen: ClusterSnapshot, part: Part | None
+        self, planned: ClusterPlan, observed: ClusterSnapshot, scope: Part | None
     ) -> None:
         self._proxy_sync.report_policies(planned.policies)
         self._proxy_sync.report_callers(planned.callers, planned.peers, planned.former)
         self._proxy_sync.report_gone(planned.gone)
-        await self._applier.carry_out(planned.actions, seen)
+        await self._applier.carry_out(planned.actions, observed)
         concerned = {action.of.namespace for action in planned.actions}
-        if self._applier.failures != seen.failures:
-            self._news(concerned)  # the status is to tell
+        if self._applier.failures != observed.failures:
+            self._wake_for(concerned)  # their statuses have to show it
         else:
             self._due.soon(concerned, time.monotonic() + SETTLED)
 
-    def _news(self, namespaces: Iterable[str]) -> None:
-        """Something is known of these that no watch has told."""
+    def _wake_for(self, namespaces: Iterable[str]) -> None:
+        """Plan these soon: something about them has changed that no watch reports."""
         self._due.at_once(namespaces)
         self._loop.wake()
 
-    def _doubt(self) -> None:
-        """What is known is not so: have everything listed anew."""
-        for one in self._reflectors:
-            one.doubt()
+    def _relist(self) -> None:
+        """The watched state is wrong: have everything listed anew."""
+        for reflector in self._reflectors:
+            reflector.doubt()
 
-    def _report(self, seen: ClusterSnapshot) -> None:
-        own = (*self._applier.problems.values(), *self._key.problems)
-        found = [one for _, some in sorted(self._problems.items()) for one in some]
-        problems: list[Problem] = [*found, *own]
+    def _report(self, observed: ClusterSnapshot) -> None:
+        own_problems = (*self._applier.problems.values(), *self._key.problems)
+        findings = [finding for _, group in sorted(self._problems.items()) for finding in group]
+        problems: list[Problem] = [*findings, *own_problems]
         self._log.update(problems)
         metrics = self._metrics
-        metrics.rosproxies.set(len(seen.rosproxies))
-        metrics.pods.set(len(seen.selected))
+        metrics.rosproxies.set(len(observed.rosproxies))
+        metrics.pods.set(len(observed.selected))
         metrics.problems.set(len(problems))
-        metrics.show_proxies(map(_proxy_state, seen.proxies))
-        metrics.show_participants(participants(seen))
+        metrics.show_proxies(map(_proxy_state, observed.proxies))
+        metrics.show_participants(participants(observed))
 
 
 def _proxy_state(proxy: ProxyPod) -> str:

@@ -39,13 +39,13 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     """All findings; of proxies about these nodes and topics, if any. Raises ApiError."""
     api = Api(namespaces)
     try:
-        found = cluster_findings(api.rosproxies())
+        findings = cluster_findings(api.rosproxies())
         pods = [pod for pod in api.own_pods() if pod["status"].get("phase") == "Running"]
     finally:
         api.close()
     with ThreadPoolExecutor(AT_ONCE) as threads:
-        said = threads.map(lambda pod: [*_ask(pod["metadata"], names)], pods)
-        return [*found, *(one for each in said for one in each)]
+        answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], pods)
+        return [*findings, *(finding for answer in answers for finding in answer)]
 
 
 def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
@@ -53,25 +53,25 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
     namespace, name = pod["namespace"], pod["name"]
     subject = f"proxy {namespace}/{name}"
     try:
-        said = _run(namespace, name, command(names))
-    except (ApiException, WebSocketException, OSError) as wrong:
-        why = getattr(wrong, "reason", "") or str(wrong)
-        first = str(why).strip().partition("\n")[0][:300]
-        text = f"its own doctor could not be asked ({first})"
+        output = _run(namespace, name, command(names))
+    except (ApiException, WebSocketException, OSError) as error:
+        reason = getattr(error, "reason", "") or str(error)
+        line = str(reason).strip().partition("\n")[0][:300]
+        text = f"its own doctor could not be asked ({line})"
         fix = "may you create pods/exec? kubectl auth can-i create pods/exec -n "
         yield warning("proxy", subject, text, fix + namespace)
         return
-    yield from read_findings(subject, said, CURES)
+    yield from read_findings(subject, output, CURES)
 
 
-def _run(namespace: str, pod: str, words: Sequence[str]) -> bytes:
+def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:
     """What a command prints in a pod, to its end."""
     with ApiClient(configuration()) as client:  # a stream makes it one for streams alone
         channel = stream(
             CoreV1Api(client).connect_get_namespaced_pod_exec,
             pod,
             namespace,
-            command=list(words),
+            command=list(arguments),
             stdout=True,
             stderr=False,
             stdin=False,

@@ -1,8 +1,8 @@
-"""Taking part in the choice of the operator that acts: reads the Lease, and writes it when it may.
+"""Leader election among operators: reads the Lease, and writes it when it may.
 
-What is read and when is decided by `planner.leadership`; here are the clock, the requests, and who
-is told. The `leaderelection` of the `kubernetes` client does not do: it counts on the wall clock,
-renews in a loop that nobody can end and that gives nothing back, and does not say until when its
+`planner.leadership` decides; here are the clock, the requests and the notification of a change.
+The `leaderelection` of the `kubernetes` client does not do: it relies on the wall clock, renews in
+a loop that nobody can end and that never releases the Lease, and does not say until when its
 leader may act. kopf's peering says of itself that it locks nothing.
 """
 
@@ -33,7 +33,7 @@ from rosproxy_operator.kubernetes.resources.values import number, part, word
 log = logging.getLogger(__name__)
 
 LONGEST = 60.0
-"""Seconds that a Lease may promise at most: what is longer nobody here has written."""
+"""Seconds that a Lease may last at most: no operator here has written a longer one."""
 
 
 def clock() -> float:
@@ -42,7 +42,7 @@ def clock() -> float:
 
 
 class LeaderElection:
-    """One candidate. Without a ``lease`` there are no others, and it leads from the start.
+    """This operator's candidacy. Without a ``lease`` it has no rivals, and leads from the start.
 
     `leads` may be asked from any thread, all else belongs to the event loop.
     """
@@ -60,7 +60,7 @@ class LeaderElection:
         return self._lease is None or self._one.leads(clock())
 
     def term(self) -> int:
-        """Which time this operator leads, from 1; 0: it does not."""
+        """The number of this operator's present term, from 1; 0: it does not lead."""
         return (1 if self._lease is None else self._one.terms) if self.leads() else 0
 
     async def run(self, changed: Callable[[], None]) -> None:
@@ -70,7 +70,7 @@ class LeaderElection:
                 if not self._leaving:
                     self._one = await in_thread(self._round, self._one, self._lease)
             self._show(changed)
-            # Not all at the same time; one that fails to renew has little time left.
+            # Candidates are spread in time; a leader that fails to renew has little time left.
             calm = self.leads() and not self._error
             await asyncio.sleep(RENEW if calm else LOOK * random.uniform(0.5, 1.0))  # noqa: S311
         await asyncio.Event().wait()
@@ -81,22 +81,22 @@ class LeaderElection:
         self._one = leadership.resigned(self._one)
 
     async def release(self) -> None:
-        """Let another one lead at once: this one has stopped to act."""
+        """Let another operator lead at once: this one has stopped acting."""
         async with self._room:  # a renewal may be under way
             self._one = leadership.resigned(self._one)
             if self._lease is not None:
                 await in_thread(self._release, self._lease)
         self._metrics.leader.set(0)
 
-    def _round(self, one: Candidate, lease: Name) -> Candidate:
+    def _round(self, candidate: Candidate, lease: Name) -> Candidate:
         """Look at the Lease once, and write it if that is right."""
         try:
-            one = leadership.observe(one, self._read(lease), clock())
-            record = leadership.wanted(one, clock())
+            candidate = leadership.observe(candidate, self._read(lease), clock())
+            record = leadership.wanted(candidate, clock())
             if record is not None:
                 begun = clock()
                 self._write(lease, record)
-                one = leadership.wrote(one, record, begun, clock())
+                candidate = leadership.wrote(candidate, record, begun, clock())
             self._error = ""
         except ApiConflict:
             log.debug("Lease %s: somebody else was faster", lease)
@@ -104,7 +104,7 @@ class LeaderElection:
             if str(error) != self._error:
                 log.warning("Lease %s: %s", lease, error)
             self._error = str(error)
-        return one
+        return candidate
 
     def _release(self, lease: Name) -> None:
         try:
@@ -136,15 +136,15 @@ class LeaderElection:
         self._api.patch(LEASES, lease, operations, SOON)
 
     def _show(self, changed: Callable[[], None]) -> None:
-        """Tell who leads, if that is another one than before."""
-        term, seen = self.term(), self._one.seen
-        other = seen.holder if seen and seen.holder != self._one.name else ""
-        holder = self._one.name if term else other
-        before, self._shown = self._shown, (term, holder)
-        if self._shown == before:
+        """Report who leads, if that has changed."""
+        term, record = self.term(), self._one.seen
+        rival = record.holder if record and record.holder != self._one.name else ""
+        holder = self._one.name if term else rival
+        previous, self._shown = self._shown, (term, holder)
+        if self._shown == previous:
             return
         self._metrics.leader.set(bool(term))
-        if before[1] != holder and before[0] >= 0:
+        if previous[1] != holder and previous[0] >= 0:
             self._metrics.leader_changes.inc()
         if term:
             log.info("leads: this operator acts (%s)", holder)
@@ -167,11 +167,11 @@ def lease_record(obj: Json) -> LeaseRecord:
 
 def lease_spec(record: LeaseRecord, now: datetime) -> Json:
     """The spec of a Lease that is written ``now``; one that is taken says when that was."""
-    said = now.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    timestamp = now.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
     return {
         "holderIdentity": record.holder,
         "leaseDurationSeconds": int(record.duration),
         "leaseTransitions": record.transitions,
-        "acquireTime": record.acquired or said,
-        "renewTime": said,
+        "acquireTime": record.acquired or timestamp,
+        "renewTime": timestamp,
     }

@@ -1,7 +1,7 @@
 """Running the Kubernetes operator.
 
-When it is told to end, it first stops to act and gives the lead away, then serves the webhook until
-nobody is led here any more.
+When it is told to end, it first stops acting and gives the lead away, then serves the webhook until
+kube-proxy sends no more requests here.
 """
 
 import asyncio
@@ -44,9 +44,9 @@ def run(settings: KubernetesSettings) -> None:
 
 
 def _raise_limit() -> None:
-    """Let it have as many open files as it may: it waits at each proxy, which is a connection."""
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    """Allow as many open files as possible: each proxy takes a connection that waits."""
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
 
 
 async def _run(settings: KubernetesSettings, api: Api) -> None:
@@ -63,7 +63,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         server = WebhookServer(settings.webhook.bind, rotation)
         webhook = Injector(api, settings.plan, metrics, controller.wake), server
     page = operator_page(controller.documents)
-    unready = _first(controller.unready, *([webhook[1].unready] if webhook else []))
+    unready = _first_reason(controller.unready, *([webhook[1].unready] if webhook else []))
     health = HealthServer(metrics.registry, controller.dead, unready, page)
     await health.start(settings.admin)
     log.info(
@@ -102,13 +102,13 @@ async def hand_over(api: Api, controller: KubernetesController, election: Leader
 
 
 async def _drain(server: WebhookServer, stopped: asyncio.Event) -> None:
-    """Serve those who are yet led here. Who asks a second time does not want to wait."""
+    """Serve the requests that still come here. A second signal ends the wait."""
     stopped.clear()
     server.drain()
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(stopped.wait(), DRAINING)
 
 
-def _first(*checks: Callable[[], str | None]) -> Callable[[], str | None]:
+def _first_reason(*checks: Callable[[], str | None]) -> Callable[[], str | None]:
     """The first reason that one of these gives."""
     return lambda: next(filter(None, (check() for check in checks)), None)

@@ -1,8 +1,8 @@
 """Running kopf in a thread of its own, again whenever it ends: it serves webhook and liveness.
 
-It watches nothing: for each object it would keep a task and the whole of what the API server says
-of it, and it ends as a whole when one of its watches does (`reflector` watches). Nothing depends on
-it but the admission of pods.
+kopf watches nothing here: it would keep a task and the whole object for each, and ends as a whole
+when one of its watches does (`reflector` watches instead). Only the admission of pods depends on
+kopf.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ class Endless:
 
 
 def quieten() -> None:
-    """Keep kopf and the libraries below from telling of each request; looks say what is wrong."""
+    """Keep kopf and its libraries from logging each request; looks report what is wrong."""
     debug = logging.getLogger().isEnabledFor(logging.DEBUG)
     for name in ("kopf", "kubernetes", "urllib3"):
         logging.getLogger(name).setLevel(logging.INFO if debug else logging.CRITICAL)
@@ -103,11 +103,11 @@ class ClusterServing:
         failures = 0
         while not self._ending.is_set():
             started = time.monotonic()
-            self._once()
+            self._run_once()
             failures = 1 if time.monotonic() - started > WELL else failures + 1
             self._ending.wait(BACK_OFF[min(failures, len(BACK_OFF)) - 1])
 
-    def _once(self) -> None:
+    def _run_once(self) -> None:
         try:
             with warnings.catch_warnings(action="ignore"):
                 asyncio.run(self._operate())
@@ -121,7 +121,7 @@ class ClusterServing:
 
     async def _operate(self) -> None:
         loop, task = asyncio.get_running_loop(), asyncio.current_task()
-        loop.set_exception_handler(_forgotten)
+        loop.set_exception_handler(_log_exception)
         if task is not None:
             self._running = loop, task
         if self._ending.is_set():
@@ -152,11 +152,11 @@ class ClusterServing:
             return "ok"
 
         if self._webhook:
-            _serve(handlers, self._webhook[0])
+            _register_webhook(handlers, self._webhook[0])
         return handlers
 
 
-def _serve(handlers: kopf.OperatorRegistry, injector: Injector) -> None:
+def _register_webhook(handlers: kopf.OperatorRegistry, injector: Injector) -> None:
     @kopf.on.mutate(
         "",
         "v1",
@@ -179,6 +179,6 @@ def _serve(handlers: kopf.OperatorRegistry, injector: Injector) -> None:
             patch.metadata["annotations"] = dict(wiring.annotations)
 
 
-def _forgotten(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Tasks that kopf leaves behind when it ends; why it does is told where it is started anew."""
+def _log_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log errors of tasks that kopf leaves behind when it ends; why it ends `_run_once` logs."""
     log.debug("kopf: %s: %r", context.get("message"), context.get("exception"))

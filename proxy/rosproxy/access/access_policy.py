@@ -31,22 +31,22 @@ PARAMETERS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
 
 
 class AccessPolicy:
-    """The layers in force: ``own`` are those of the options, ``told`` those of an operator.
+    """The layers in force: of the options, of the policy file and of an operator.
 
     ``version`` is another number after each change of them, ``empty`` whether there is no rule.
     """
 
     def __init__(
         self,
-        own: Sequence[PolicyLayer],
-        told: Sequence[PolicyLayer],
+        option_layers: Sequence[PolicyLayer],
+        operator_layers: Sequence[PolicyLayer],
         metrics: Metrics,
         refusals: Refusals,
     ) -> None:
         self._metrics, self._refusals = metrics, refusals
-        self._own, self._told = tuple(own), tuple(told)
-        self._file = tuple[PolicyLayer, ...]()
-        self._heard = asyncio.Event()
+        self._option_layers, self._operator_layers = tuple(option_layers), tuple(operator_layers)
+        self._file_layers = tuple[PolicyLayer, ...]()
+        self._operator_told = asyncio.Event()
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
         self.version, self.empty = 0, False
         self._note_change()
@@ -54,37 +54,37 @@ class AccessPolicy:
     @property
     def layers(self) -> tuple[PolicyLayer, ...]:
         """All layers in force."""
-        return (*self._own, *self._file, *self._told)
+        return (*self._option_layers, *self._file_layers, *self._operator_layers)
 
     def use_file(self, layer: PolicyLayer) -> None:
         """Take in what the file says now. Raises ValueError if that is too much."""
-        bounded((*self._own, layer, *self._told))
-        self._file = (layer,)
+        bounded((*self._option_layers, layer, *self._operator_layers))
+        self._file_layers = (layer,)
         self._note_change()
 
     def use_told(self, layers: Sequence[PolicyLayer]) -> None:
         """Take in what an operator says now. Raises ValueError if that is too much."""
-        bounded((*self._own, *self._file, *layers))
-        self._told = tuple(layers)
+        bounded((*self._option_layers, *self._file_layers, *layers))
+        self._operator_layers = tuple(layers)
         self._note_change()
-        self._heard.set()
+        self._operator_told.set()
 
     async def wait_for_operator(self, seconds: float) -> None:
         """Wait until an operator has told its layers, once and for so many seconds at most."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
-                await self._heard.wait()
-        self._heard.set()
+                await self._operator_told.wait()
+        self._operator_told.set()
 
     def judge(self, kind: RuleKind, name: str, callers: Sequence[str], address: str) -> Verdict:
-        """Whether a thing is allowed to all of the callers at a node inside; nobody is told.
+        """Whether a thing is allowed to all of the callers at a node inside; nothing is reported.
 
         What only some of them may not have is denied: nobody can tell them apart at one URI.
         """
         if self.empty:
             return ALLOWED
-        layers = self._about(kind)
-        return strictest([decide(layers, kind, name, one, address) for one in callers or ("",)])
+        layers = self._layers_for(kind)
+        return strictest([decide(layers, kind, name, c, address) for c in callers or ("",)])
 
     def ask(
         self,
@@ -94,23 +94,23 @@ class AccessPolicy:
         address: str,
         source: str = "",
     ) -> Verdict:
-        """The same, and a denial is told; ``source`` is the address of who asks, if another."""
+        """The same, and a denial is reported; ``source`` is the address of who asks, if another."""
         verdict = self.judge(kind, name, callers, address)
-        what = f"{name} of {callers[0]}" if callers else name
-        return self.tell(verdict, kind, what, source or address)
+        subject = f"{name} of {callers[0]}" if callers else name
+        return self.tell(verdict, kind, subject, source or address)
 
     def judge_below(self, kind: RuleKind, prefix: str, caller: str, address: str) -> Verdict:
-        """Whether all is allowed whose name begins with a prefix; nobody is told."""
-        return decide_below(self._about(kind), kind, prefix, caller, address)
+        """Whether all is allowed whose name begins with a prefix; nothing is reported."""
+        return decide_below(self._layers_for(kind), kind, prefix, caller, address)
 
-    def tell(self, verdict: Verdict, kind: RuleKind, what: str, source: str) -> Verdict:
-        """Tell of a verdict, if a rule denies or would deny."""
+    def tell(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Verdict:
+        """Report a verdict in metrics, log and status, if a rule denies or would deny."""
         if verdict.rule is not None:
-            audit = verdict.mode is PolicyMode.AUDIT
+            is_audit = verdict.mode is PolicyMode.AUDIT
             self._metrics.policy_denied.labels(kind.value, verdict.mode.value).inc()
-            done = "would be denied" if audit else "denied"
-            reason = "policy_audit" if audit else "policy"
-            text = f"{kind.value} {what} {done} by {verdict.reason}"
+            outcome = "would be denied" if is_audit else "denied"
+            reason = "policy_audit" if is_audit else "policy"
+            text = f"{kind.value} {subject} {outcome} by {verdict.reason}"
             self._refusals.note(reason, source, text)
         return verdict
 
@@ -123,14 +123,14 @@ class AccessPolicy:
         """
         if self.empty:
             return False
-        return any(may_deny(self._about(kind), (kind,), callers, address) for kind in kinds)
+        return any(may_deny(self._layers_for(kind), (kind,), callers, address) for kind in kinds)
 
     def _note_change(self) -> None:
         self._by_kind.clear()
         self.version += 1
         self.empty = not any(layer.rules for layer in self.layers)
 
-    def _about(self, kind: RuleKind) -> tuple[PolicyLayer, ...]:
+    def _layers_for(self, kind: RuleKind) -> tuple[PolicyLayer, ...]:
         """The layers with their rules of one kind; those without any are left out."""
         if kind not in self._by_kind:
             self._by_kind[kind] = of_kind(self.layers, kind)

@@ -100,13 +100,13 @@ def decide_below(
 
 def of_kind(layers: Iterable[PolicyLayer], kind: RuleKind) -> tuple[PolicyLayer, ...]:
     """Layers with their rules of one kind alone, which decide the same for that kind."""
-    rules = [(layer, tuple(rule for rule in layer.rules if rule.kind is kind)) for layer in layers]
-    return tuple(msgspec.structs.replace(layer, rules=mine) for layer, mine in rules if mine)
+    pairs = [(layer, tuple(rule for rule in layer.rules if rule.kind is kind)) for layer in layers]
+    return tuple(msgspec.structs.replace(layer, rules=kept) for layer, kept in pairs if kept)
 
 
 def strictest(verdicts: Iterable[Verdict]) -> Verdict:
-    """The one of some verdicts that counts: a denial, else what would be denied."""
-    return min(verdicts, key=lambda one: (one.allowed, one.rule is None))
+    """The verdict that counts of several: a denial, else what would be denied."""
+    return min(verdicts, key=lambda verdict: (verdict.allowed, verdict.rule is None))
 
 
 def may_deny(
@@ -149,7 +149,7 @@ def read_layers(value: object) -> tuple[PolicyLayer, ...]:
         written = msgspec.convert(value, tuple[WrittenLayer, ...])
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from None
-    return bounded([read_layer(one) for one in written])
+    return bounded([read_layer(layer) for layer in written])
 
 
 def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
@@ -175,17 +175,17 @@ def bounded(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
     return tuple(layers)
 
 
-def _verdict(found: Iterable[tuple[PolicyLayer, Rule | None]]) -> Verdict:
+def _verdict(deciding_rules: Iterable[tuple[PolicyLayer, Rule | None]]) -> Verdict:
     """What follows from the rule that decides in each layer: the first that is enforced denies."""
-    told = ALLOWED
-    for layer, rule in found:
+    verdict = ALLOWED
+    for layer, rule in deciding_rules:
         if rule is None or rule.action is RuleAction.ALLOW:
             continue
         if layer.mode is PolicyMode.ENFORCE:
             return Verdict(False, rule, layer.name)
-        if told.rule is None:
-            told = Verdict(True, rule, layer.name)
-    return told
+        if verdict.rule is None:
+            verdict = Verdict(True, rule, layer.name)
+    return verdict
 
 
 def _first_below(layer: PolicyLayer, kind: RuleKind, prefix: str, caller: str) -> Rule | None:
@@ -203,8 +203,8 @@ def _first_below(layer: PolicyLayer, kind: RuleKind, prefix: str, caller: str) -
 def _addresses(written: Sequence[str] | None) -> frozenset[str] | None:
     if written is None:
         return None
-    found = {text: parse_address(text) for text in written}
-    for text, address in found.items():
+    address_by_text = {text: parse_address(text) for text in written}
+    for text, address in address_by_text.items():
         if address is None:
             raise ValueError(f"addresses: must be IP addresses, not {text[:40]!r}")
-    return frozenset(address for address in found.values() if address)
+    return frozenset(address for address in address_by_text.values() if address)

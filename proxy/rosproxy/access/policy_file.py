@@ -23,20 +23,20 @@ OPTION = "--policy-file"
 
 
 class PolicyFile:
-    """The file, and what it was when it was read last."""
+    """The file, and its signature when it was read last."""
 
     def __init__(
         self, path: str, mode: PolicyMode, policy: AccessPolicy, problems: Problems
     ) -> None:
         self._path, self._mode = Path(path), mode
         self._policy, self._problems = policy, problems
-        self._seen: tuple[int, ...] | None = None
+        self._last_signature: tuple[int, ...] | None = None
 
     def read(self) -> None:
         """Take in what the file says. Raises ValueError, which says what is wrong with it."""
         try:
             with self._path.open("rb") as file:
-                self._seen = _signature(os.fstat(file.fileno()))
+                self._last_signature = _signature(os.fstat(file.fileno()))
                 text = file.read(LONGEST_FILE + 1)
             if len(text) > LONGEST_FILE:
                 raise ValueError(f"{self._path} is longer than {LONGEST_FILE} bytes")
@@ -50,10 +50,10 @@ class PolicyFile:
     async def look(self) -> None:
         """Read the file again if it has changed."""
         try:
-            if _signature(self._path.stat()) == self._seen:
+            if _signature(self._path.stat()) == self._last_signature:
                 return
         except OSError:
-            self._seen = None
+            self._last_signature = None
         try:
             self.read()
         except ValueError as error:
@@ -67,6 +67,6 @@ class PolicyFile:
             self._problems.solved(OPTION)
 
 
-def _signature(found: os.stat_result) -> tuple[int, ...]:
-    """What is another when the file has changed, or another file has its name."""
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+def _signature(stat: os.stat_result) -> tuple[int, ...]:
+    """What differs once the file has changed, or another file has its name."""
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns

@@ -95,8 +95,8 @@ def parse_rules(text: str) -> tuple[Rule, ...]:
     Raises ValueError, which names the rule.
     """
     lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
-    parts = (part.strip() for line in lines for part in line.split(";"))
-    return tuple(parse_rule(part) for part in parts if part)
+    rule_texts = (rule_text.strip() for line in lines for rule_text in line.split(";"))
+    return tuple(parse_rule(rule_text) for rule_text in rule_texts if rule_text)
 
 
 def parse_rule(text: str) -> Rule:
@@ -118,38 +118,38 @@ def matches(glob: str, name: str) -> bool:
     return glob == "*" or _expression(glob).fullmatch(name) is not None
 
 
-def _parse(words: list[str]) -> Rule:
-    if len(words) not in (3, 5) or (len(words) == 5 and words[3] != "by"):
+def _parse(tokens: list[str]) -> Rule:
+    if len(tokens) not in (3, 5) or (len(tokens) == 5 and tokens[3] != "by"):
         raise ValueError("must be ACTION KIND GLOB [by GLOB]")
-    action, kind = _ACTIONS.get(words[0]), _KINDS.get(words[1])
+    action, kind = _ACTIONS.get(tokens[0]), _KINDS.get(tokens[1])
     if action is None:
-        raise ValueError(f"the action must be {' or '.join(_ACTIONS)}, not {words[0][:20]!r}")
+        raise ValueError(f"the action must be {' or '.join(_ACTIONS)}, not {tokens[0][:20]!r}")
     if kind is None:
-        raise ValueError(f"the kind must be one of {', '.join(_KINDS)}, not {words[1][:20]!r}")
-    by = words[4] if len(words) == 5 else "*"
-    if max(len(words[2]), len(by)) > LONGEST_GLOB:
+        raise ValueError(f"the kind must be one of {', '.join(_KINDS)}, not {tokens[1][:20]!r}")
+    by = tokens[4] if len(tokens) == 5 else "*"
+    if max(len(tokens[2]), len(by)) > LONGEST_GLOB:
         raise ValueError(f"a glob has at most {LONGEST_GLOB} characters")
-    names = [by] if kind is RuleKind.SLAVE else [words[2], by]
-    for glob in names:
+    globs = [by] if kind is RuleKind.SLAVE else [tokens[2], by]
+    for glob in globs:
         if glob[0] not in "/*?":  # it would never match: names that the master knows begin so
             raise ValueError(f"{glob[:40]!r} must begin with / or *, as ROS names do")
-    return Rule(action, kind, words[2], by)
+    return Rule(action, kind, tokens[2], by)
 
 
 @lru_cache(maxsize=2 * MOST_RULES)
 def _expression(glob: str) -> re.Pattern[str]:
-    """The regular expression of a glob; each ``*`` takes as little as the part after it lets it.
+    """The regular expression of a glob; each ``*`` takes as little as the next segment lets it.
 
-    That is right for all parts but the last, which has to be at the name's end.
+    That is right for all segments but the last, which has to be at the name's end.
     """
-    first, *others = (_fixed(part) for part in re.sub(r"\*+", "*", glob).split("*"))
-    if not others:
+    first, *rest = (_fixed(segment) for segment in re.sub(r"\*+", "*", glob).split("*"))
+    if not rest:
         return re.compile(first, re.DOTALL)
-    *middle, last = others
-    atoms = "".join(f"(?>.*?{part})" for part in middle)
+    *middle, last = rest
+    atoms = "".join(f"(?>.*?{segment})" for segment in middle)
     return re.compile(f"{first}{atoms}.*{last}", re.DOTALL)
 
 
-def _fixed(part: str) -> str:
-    """A part of a glob without ``*``."""
-    return ".".join(map(re.escape, part.split("?")))
+def _fixed(segment: str) -> str:
+    """The expression of a glob's segment, which has no ``*``."""
+    return ".".join(map(re.escape, segment.split("?")))

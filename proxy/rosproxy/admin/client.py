@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 DEFAULT_URL = "http://127.0.0.1:11312"
 MAX_REPLY = 64 * 1024 * 1024
 """Longest reply in bytes that is read."""
-_EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+_WILDCARD_TO_LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class AdminError(Exception):
@@ -32,12 +32,12 @@ class AdminClient:
     """
 
     def __init__(self, url: str) -> None:
-        bare = url.removeprefix("http://").rstrip("/")
-        where = parse_host_port(bare)
-        if where is None:
+        authority = url.removeprefix("http://").rstrip("/")
+        server = parse_host_port(authority)
+        if server is None:
             raise ValueError(f"{url!r} is not of the form {DEFAULT_URL}")
-        self.where = where
-        self.url = f"http://{where}"
+        self.server = server
+        self.url = f"http://{server}"
 
     def get(self, path: str, within: float = 5.0) -> str:
         """The text at a path; ``within`` bounds each wait in seconds. Raises AdminError."""
@@ -67,16 +67,16 @@ class AdminClient:
         return f"{self.url}/?key={self._json(self._ask('POST', '/page-key', 5.0), 'key')['key']}"
 
     def _ask(self, method: str, path: str, within: float) -> str:
-        connection = http.client.HTTPConnection(self.where.host, self.where.port, timeout=within)
+        connection = http.client.HTTPConnection(self.server.host, self.server.port, timeout=within)
         try:
             connection.request(method, path, headers=_authorization())
             reply = connection.getresponse()
             text = reply.read(MAX_REPLY).decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:
-            why = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise AdminError(
-                f"no rosproxy answers at {self.url} ({why.lower()}). Run this where the proxy runs "
-                "(docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
+                f"no rosproxy answers at {self.url} ({reason.lower()}). Run this where the proxy "
+                "runs (docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
                 "http://HOST:PORT or ROSPROXY_ADMIN"
             ) from None
         finally:
@@ -87,28 +87,27 @@ class AdminClient:
 
     def _json(self, text: str, key: str) -> dict[str, Any]:
         try:
-            found = json.loads(text)
+            answer = json.loads(text)
         except (ValueError, RecursionError):
-            found = None
-        if not isinstance(found, dict) or key not in found:
+            answer = None
+        if not isinstance(answer, dict) or key not in answer:
             raise AdminError(f"what answers at {self.url} is not the admin endpoint of a rosproxy")
-        return found
+        return answer
 
 
 def _authorization() -> dict[str, str]:
-    """What lets callers change things that are not on the proxy's own loopback."""
+    """The header that lets callers change things from elsewhere than the proxy's own loopback."""
     token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
     fits = token and token.isascii() and token.isprintable()
     return {"Authorization": f"Bearer {token}"} if fits else {}
 
 
-def default_url(told: str | None = None) -> str:
-    """Where the proxy of this container or shell has its admin endpoint.
+def default_url(admin_bind: str | None = None) -> str:
+    """The URL of the admin endpoint of the proxy in this container or shell.
 
-    The same variable that told the proxy where to listen tells where to ask, or what ``told`` it
-    instead.
+    It listens at ``admin_bind``, else where the variable says that tells the proxy to listen.
     """
-    bound = parse_host_port(told or os.environ.get("ROSPROXY_ADMIN_BIND", ""))
+    bound = parse_host_port(admin_bind or os.environ.get("ROSPROXY_ADMIN_BIND", ""))
     if bound is None:
         return DEFAULT_URL
-    return f"http://{HostPort(_EVERYWHERE.get(bound.host, bound.host), bound.port)}"
+    return f"http://{HostPort(_WILDCARD_TO_LOOPBACK.get(bound.host, bound.host), bound.port)}"

@@ -27,7 +27,7 @@ class DomainPlane(Collector):
     def locator(self, lease: Lease) -> document.LocatorStatus:
         """A port, where it leads, and who forwards what arrives there."""
         is_read = lease.kind is LeaseKind.METATRAFFIC
-        told = document.LocatorStatus(
+        status = document.LocatorStatus(
             lease.port,
             str(lease.where),
             lease.kind.value,
@@ -39,10 +39,10 @@ class DomainPlane(Collector):
         )
         forwarded = self._forwarded.by_port.get(lease.port)
         if forwarded is None:
-            return told
+            return status
         kernel = self._plane.status_of(forwarded)
         return msgspec.structs.replace(
-            told,
+            status,
             plane=kernel["plane"],
             reason=kernel["reason"],
             kernel_datagrams=kernel["received_packets"],

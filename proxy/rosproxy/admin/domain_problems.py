@@ -1,7 +1,7 @@
 """What keeps participants of a domain from meeting, as its status tells: the cause, and the cure.
 
-``rosproxy doctor`` says it when it is asked, the proxy in its log and in ``rosproxy status`` once
-it is so. Of a participant only the first cause is told: what follows from it says nothing more.
+``rosproxy doctor`` reports it when it is run; the proxy, once it is so, in its log and in
+``rosproxy status``. Only the first cause is given for a participant: the others follow from it.
 """
 
 from collections.abc import Iterator
@@ -14,9 +14,9 @@ from rosproxy.telemetry.text import plural
 
 
 class DomainProblem(msgspec.Struct, frozen=True):
-    """A cause: which ``check`` has found it, with which participant or name, what, and its cure.
+    """A cause: the ``check`` that found it, the participant or name it is about, and its cure.
 
-    ``grave``: somebody is kept from somebody by it for certain.
+    ``grave``: it keeps participants apart for certain.
     """
 
     check: str
@@ -49,7 +49,7 @@ _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
         "where it runs: give it a transport of UDPv4 in its profile",
     ),
 }
-_BOTH = "give both the same {policy}"
+_DEFAULT_CURE = "give both the same {policy}"
 _CURES = {
     "type": "mend one of the programs, or remap its name",
     "reliability": "make the publisher RELIABLE, or the subscription BEST_EFFORT",
@@ -63,8 +63,8 @@ _CURES = {
 
 
 def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
-    """All that keeps somebody in a domain from meeting somebody, those to be mended first first."""
-    yield from (problem for _, problem in _of_participants(domain))
+    """All that keeps participants of a domain from meeting; what to mend first comes first."""
+    yield from (problem for _, problem in _participant_problems(domain))
     yield from (problem for _, problem in mismatch_problems(domain))
     if domain.mismatches_left_out:
         text = f"{plural(domain.mismatches_left_out, 'more pair')} of endpoints don't match"
@@ -74,66 +74,78 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
 
 
 def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, DomainProblem]]:
-    """What keeps pairs apart neither of which is hindered otherwise."""
-    hindered = {one.guid_prefix for one, problem in _of_participants(domain) if problem.grave}
-    where = {one.guid_prefix: named(one, True) for one in domain.inside}
-    where |= {one.guid_prefix: named(one, False) for one in domain.outside}
+    """The mismatches of pairs of which neither participant has a grave problem of its own."""
+    hindered = {p.guid_prefix for p, problem in _participant_problems(domain) if problem.grave}
+    labels = {p.guid_prefix: named(p, True) for p in domain.inside}
+    labels |= {p.guid_prefix: named(p, False) for p in domain.outside}
     for pair in domain.mismatches:
         if not hindered & {pair.writer, pair.reader}:
-            yield pair, _mismatch(pair, where.get(pair.writer, ""), where.get(pair.reader, ""))
+            yield pair, _mismatch(pair, labels.get(pair.writer, ""), labels.get(pair.reader, ""))
 
 
-def named(one: ParticipantStatus, is_inside: bool) -> str:
+def named(participant: ParticipantStatus, is_inside: bool) -> str:
     """A participant as texts name it, besides its GUID prefix."""
-    return f"at {one.address} ({one.vendor}, {'inside' if is_inside else 'outside'})"
+    return (
+        f"at {participant.address} ({participant.vendor}, {'inside' if is_inside else 'outside'})"
+    )
 
 
-def _of_participants(
+def _participant_problems(
     domain: DomainStatus,
 ) -> Iterator[tuple[ParticipantStatus, DomainProblem]]:
     for side in (domain.inside, domain.outside):
-        for one in side:
-            problem = next(_problems(one, domain, side is domain.inside), None)
+        for participant in side:
+            problem = next(_problems(participant, domain, side is domain.inside), None)
             if problem:
-                yield one, problem
+                yield participant, problem
 
 
 def _problems(
-    one: ParticipantStatus, domain: DomainStatus, is_inside: bool
+    participant: ParticipantStatus, domain: DomainStatus, is_inside: bool
 ) -> Iterator[DomainProblem]:
     """What is wrong with a participant, the first cause first."""
-    where = named(one, is_inside)
-    if one.domain is not None and one.domain != domain.domain:
-        text = f"{where}: it is of domain {one.domain}, and was heard in domain {domain.domain}"
-        fix = f"ROS_DOMAIN_ID={domain.domain} for it, or --ros2-domain {one.domain} for the proxy"
-        yield DomainProblem("domain", one.guid_prefix, text, fix)
-    fault = _LOCATOR_FAULTS.get(one.locator_fault)
+    label = named(participant, is_inside)
+    if participant.domain is not None and participant.domain != domain.domain:
+        text = (
+            f"{label}: it is of domain {participant.domain}, and was heard in "
+            f"domain {domain.domain}"
+        )
+        fix = (
+            f"ROS_DOMAIN_ID={domain.domain} for it, or "
+            f"--ros2-domain {participant.domain} for the proxy"
+        )
+        yield DomainProblem("domain", participant.guid_prefix, text, fix)
+    fault = _LOCATOR_FAULTS.get(participant.locator_fault)
     if fault:
-        yield DomainProblem("transport", one.guid_prefix, f"{where}: {fault[0]}", fault[1])
+        yield DomainProblem("transport", participant.guid_prefix, f"{label}: {fault[0]}", fault[1])
     if is_inside:
-        yield from _security(one, where)
-    if one.problem:
+        yield from _security(participant, label)
+    if participant.problem:
         fix = "give a longer --port-range, and publish it"
-        yield DomainProblem("ports", one.guid_prefix, f"{where}: {one.problem}", fix)
-    if not one.proven:
-        text = f"{where}: nothing has come from it at the ports of the range"
+        yield DomainProblem(
+            "ports", participant.guid_prefix, f"{label}: {participant.problem}", fix
+        )
+    if not participant.proven:
+        text = f"{label}: nothing has come from it at the ports of the range"
         fix = f"see that it reaches {domain.discovery.rpartition(':')[0]} there, by UDP"
-        yield DomainProblem("reached", one.guid_prefix, text, fix, grave=False)
+        yield DomainProblem("reached", participant.guid_prefix, text, fix, grave=False)
 
 
-def _security(one: ParticipantStatus, where: str) -> Iterator[DomainProblem]:
+def _security(participant: ParticipantStatus, label: str) -> Iterator[DomainProblem]:
     """What DDS Security keeps from one inside: the proxy can't change what is protected.
 
     Fast DDS repeats its addresses with each reader and writer; Cyclone DDS only announces them with
     the participant itself, which is never protected.
     """
-    if one.security != DdsSecurity.PROTECTED or one.vendor == CYCLONE_DDS:
+    if participant.security != DdsSecurity.PROTECTED or participant.vendor == CYCLONE_DDS:
         return
-    text = f"{where}: DDS Security protects its discovery, so that the proxy can't change the "
+    text = f"{label}: DDS Security protects its discovery, so that the proxy can't change the "
     text += "addresses of its readers and writers: what outside sends does not reach them"
     fix = "a governance with discovery_protection_kind and rtps_protection_kind NONE; or "
     fix += "ROS_SECURITY_ENABLE=false"
-    yield DomainProblem("security", one.guid_prefix, text, fix, grave=one.vendor == FAST_DDS)
+    yield DomainProblem(
+        "security", participant.guid_prefix, text, fix, grave=participant.vendor == FAST_DDS
+    )
 
 
 def _mismatch(pair: MismatchStatus, writer: str, reader: str) -> DomainProblem:
@@ -142,6 +154,6 @@ def _mismatch(pair: MismatchStatus, writer: str, reader: str) -> DomainProblem:
         f"{pair.policy} differs: the {sides[0]} {pair.writer} {writer} offers {pair.offered}, "
         f"the {sides[1]} {pair.reader} {reader} requests {pair.requested}"
     )
-    fix = _CURES.get(pair.policy, _BOTH.format(policy=pair.policy))
+    fix = _CURES.get(pair.policy, _DEFAULT_CURE.format(policy=pair.policy))
     check = "type" if pair.policy == "type" else "qos"
     return DomainProblem(check, f"{pair.kind} {pair.name}", text, fix)

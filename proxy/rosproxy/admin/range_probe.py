@@ -36,29 +36,29 @@ MAX_REQUEST = 65536
 class _Trial:
     """A port under test: the secrets by which its two callers are told from strangers."""
 
-    mine: str = field(default_factory=lambda: secrets.token_hex(16))
-    masters: str = field(default_factory=lambda: secrets.token_hex(16))
+    proxy_secret: str = field(default_factory=lambda: secrets.token_hex(16))
+    master_secret: str = field(default_factory=lambda: secrets.token_hex(16))
     reached: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def greet(self, conn: socket.socket, peer: str) -> None:
         """Answer a caller, in the way of a node, if it knows one of the secrets."""
-        loop, seen = asyncio.get_running_loop(), b""
+        loop, request = asyncio.get_running_loop(), b""
         async with asyncio.timeout(TIMEOUT):
-            while not self._known(seen) and len(seen) < MAX_REQUEST:
-                part = await loop.sock_recv(conn, 4096)
-                if not part:
+            while not self._recognize(request) and len(request) < MAX_REQUEST:
+                chunk = await loop.sock_recv(conn, 4096)
+                if not chunk:
                     break
-                seen += part
-            if self._known(seen):
-                body = xmlrpc.dump_reply([1, self.mine, 0])
+                request += chunk
+            if self._recognize(request):
+                body = xmlrpc.dump_reply([1, self.proxy_secret, 0])
                 head = "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length:"
                 await loop.sock_sendall(conn, f"{head} {len(body)}\r\n\r\n".encode() + body)
         conn.close()
 
-    def _known(self, seen: bytes) -> bool:
-        if self.masters.encode() in seen:
+    def _recognize(self, request: bytes) -> bool:
+        if self.master_secret.encode() in request:
             self.reached.set()
-        return self.masters.encode() in seen or self.mine.encode() in seen
+        return self.master_secret.encode() in request or self.proxy_secret.encode() in request
 
 
 async def probe_range(
@@ -66,7 +66,7 @@ async def probe_range(
 ) -> RangeProbe:
     """Try the lowest and the highest free port of the range; where none is free, one fast port.
 
-    Its node's topics are then forwarded by the proxy for a while, so nobody does it unasked:
+    After that the proxy forwards the topics of the fast port's node for a while, so it is optional:
     without ``or_fast`` nothing is tried where no port is free.
 
     The second port is left out where the master misses the first: rosmaster calls back from three
@@ -79,78 +79,78 @@ async def probe_range(
         async with leases.lent(order, trial.greet, or_fast) as port:
             if port is None:
                 break
-            where = context.addressing.outside(port)
-            mine, masters = await asyncio.gather(
-                _dial(context, trial, where), _ask_master(context, trial, where)
+            target = context.addressing.outside(port)
+            from_proxy, from_master = await asyncio.gather(
+                _dial(context, trial, target), _ask_master(context, trial, target)
             )
             if not leases.is_lent(port):
                 break  # a node has got it meanwhile, so nothing is known
-        probes.append(PortProbe(port, str(where), mine, masters))
+        probes.append(PortProbe(port, str(target), from_proxy, from_master))
         if probes[0].from_master == "missed" or pool.free == 1:
             break
     return RangeProbe(tuple(probes))
 
 
-async def _dial(context: Context, trial: _Trial, where: HostPort) -> str:
+async def _dial(context: Context, trial: _Trial, target: HostPort) -> str:
     """Connect through the advertised address and see who answers."""
-    addresses = await resolve(context.upstream.reach(where).host)
+    addresses = await resolve(context.upstream.reach(target).host)
     if not addresses:
         return "unresolvable"
     try:
         async with asyncio.timeout(TIMEOUT):
-            reader, writer = await asyncio.open_connection(addresses[0], where.port)
+            reader, writer = await asyncio.open_connection(addresses[0], target.port)
     except TimeoutError:
         return "silent"
     except ConnectionRefusedError:
         return "refused"
     except OSError:
         return "unreachable"
-    return await _greeted(trial, reader, writer)
+    return await _await_greeting(trial, reader, writer)
 
 
-async def _greeted(
+async def _await_greeting(
     trial: _Trial, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
 ) -> str:
     answer = b""
     try:
         async with asyncio.timeout(TIMEOUT):
-            writer.write(f"GET /{trial.mine} HTTP/1.0\r\n\r\n".encode())
-            while len(answer) < MAX_REQUEST and (part := await reader.read(4096)):
-                answer += part
+            writer.write(f"GET /{trial.proxy_secret} HTTP/1.0\r\n\r\n".encode())
+            while len(answer) < MAX_REQUEST and (chunk := await reader.read(4096)):
+                answer += chunk
     except TimeoutError:
         return "stranger"
     except OSError as error:
         log.debug("the port under test ended the connection: %s", error)
     finally:
         writer.close()
-    if trial.mine.encode() in answer:
+    if trial.proxy_secret.encode() in answer:
         return "ok"
     return "stranger" if answer else "closed"
 
 
-async def _ask_master(context: Context, trial: _Trial, where: HostPort) -> str:
+async def _ask_master(context: Context, trial: _Trial, target: HostPort) -> str:
     """Have the master call the port, as it calls a node whose parameter has changed."""
     try:
-        async with _subscribed(context, trial, where), asyncio.timeout(MASTER_WAIT):
+        async with _subscribed(context, trial, target), asyncio.timeout(MASTER_WAIT):
             await trial.reached.wait()
     except TimeoutError:
         return "missed"
     except Unreachable as error:
-        log.debug("the master can't try %s: %s", where, error)
+        log.debug("the master can't try %s: %s", target, error)
         return "unknown"
     return "ok"
 
 
 @asynccontextmanager
-async def _subscribed(context: Context, trial: _Trial, where: HostPort) -> AsyncIterator[None]:
+async def _subscribed(context: Context, trial: _Trial, target: HostPort) -> AsyncIterator[None]:
     """A parameter with the port under test as its subscriber, for as long as it takes."""
-    name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(where)
+    name, uri = f"{CALLER_ID}_probe_{trial.master_secret}", slave_uri(target)
     multicall = context.upstream.multicall
     try:
-        done = await multicall(
+        replies = await multicall(
             [("subscribeParam", [name, uri, name]), ("setParam", [CALLER_ID, name, True])]
         )
-        if None in done:
+        if None in replies:
             raise Unreachable("the master refused a call")
         yield
     finally:

@@ -74,12 +74,12 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def former_ports(self) -> dict[bytes, tuple[int, ...]]:
-        """The same by the prefix itself."""
-        return {bytes.fromhex(text.replace(".", "")): each for text, each in self.former.items()}
+        """``former`` by the bytes of the prefix."""
+        return {bytes.fromhex(text.replace(".", "")): ports for text, ports in self.former.items()}
 
     @property
     def ros2_peers(self) -> tuple[HostPort, ...] | None:
-        """The peers, read."""
+        """The peers, parsed."""
         return None if self.peers is None else tuple(map(read_peer, self.peers))
 
     @property
@@ -88,7 +88,7 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return bool(self.gone or self.moved or self.arrived)
 
     def __post_init__(self) -> None:
-        gone = tuple(_address(f"gone[{i}]", each) for i, each in enumerate(self.gone))
+        gone = tuple(_address(f"gone[{i}]", text) for i, text in enumerate(self.gone))
         moved = {
             _address("moved", old): _address(f"moved[{old[:40]!r}]", new)
             for old, new in self.moved.items()
@@ -106,8 +106,8 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             except ValueError as error:
                 raise ValueError(f"peers[{i}]: {error}") from None
         if self.selected is not None:
-            told = (_address(f"selected[{i}]", each) for i, each in enumerate(self.selected))
-            msgspec.structs.force_setattr(self, "selected", tuple(told))
+            selected = (_address(f"selected[{i}]", text) for i, text in enumerate(self.selected))
+            msgspec.structs.force_setattr(self, "selected", tuple(selected))
 
 
 class PolicyNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -151,13 +151,13 @@ def read_body(body: object, kind: type[Body]) -> Body:
     try:
         return msgspec.convert(body, kind)
     except msgspec.ValidationError as error:
-        wrong, _, path = str(error).partition(" - at `$")
-        where = path.removeprefix(".").removesuffix("`")
+        fault, _, path = str(error).partition(" - at `$")
+        field = path.removeprefix(".").removesuffix("`")
         if error.__cause__ is None:  # msgspec's own, which does not begin with a field
-            known = "" if where else f"; known: {', '.join(kind.__struct_fields__) or 'none'}"
-            text = f"{where or 'the body'}: {wrong}" + (known if "unknown field" in wrong else "")
+            hint = "" if field else f"; known: {', '.join(kind.__struct_fields__) or 'none'}"
+            text = f"{field or 'the body'}: {fault}" + (hint if "unknown field" in fault else "")
         else:
-            text = f"{where}.{wrong}" if where else wrong
+            text = f"{field}.{fault}" if field else fault
         raise BodyError(shorten(clean(text), _LONGEST)) from None
 
 

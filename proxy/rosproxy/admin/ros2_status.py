@@ -25,16 +25,16 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.servers.domain_server import DomainServer
 
 MOST_NAMES = 200
-"""Topics and services of a participant that are told; the rest is counted."""
+"""Topics and services of a participant that are listed; the rest is counted."""
 MOST_MISMATCHES = 100
-"""Mismatches of a domain that are told; the rest is counted."""
+"""Mismatches of a domain that are listed; the rest is counted."""
 
 
 @dataclass(eq=False)
 class Ros2State(Collector):
     """What there is to tell of ROS 2, read when somebody asks.
 
-    Without ``with_names`` no topics and services are told, which takes a tenth of the time.
+    Without ``with_names`` no topics and services are listed: that takes a tenth of the time.
     """
 
     _servers: Sequence[DomainServer]
@@ -46,19 +46,19 @@ class Ros2State(Collector):
         return tuple(self._domain(server) for server in self._servers)
 
     def policy(
-        self, policy: AccessPolicy, told: document.PolicyStatus | None
+        self, policy: AccessPolicy, ros1_policy: document.PolicyStatus | None
     ) -> document.PolicyStatus:
-        """The layers in force and what they hide, next to what is told of ROS 1."""
-        hidden = list(told.hidden) if told else []
+        """The layers in force and what they hide, of ROS 2 and, in ``ros1_policy``, of ROS 1."""
+        hidden = list(ros1_policy.hidden) if ros1_policy else []
         for server in self._servers:
-            for one in server.domain.inside.by_prefix.values():
-                for (kind, name), allowed in one.verdicts.items():
+            for participant in server.domain.inside.by_prefix.values():
+                for (kind, name), allowed in participant.verdicts.items():
                     if not allowed:
-                        reason = policy.judge(kind, name, (), one.address).reason
+                        reason = policy.judge(kind, name, (), participant.address).reason
                         hidden.append(
-                            document.HiddenStatus(kind.value, name, one.guid_prefix, reason)
+                            document.HiddenStatus(kind.value, name, participant.guid_prefix, reason)
                         )
-        return policy_status(policy, hidden, told.left_out if told else 0)
+        return policy_status(policy, hidden, ros1_policy.left_out if ros1_policy else 0)
 
     def collect(self) -> Iterable[Metric]:
         """The state as metrics: gauges, and counters of datagrams."""
@@ -93,14 +93,14 @@ class Ros2State(Collector):
         yield from (used, free, lacking, dropped, passed)
 
     def _participants(self) -> Iterator[Metric]:
-        found = GaugeMetricFamily(
+        gauge = GaugeMetricFamily(
             "rosproxy_ros2_participants", "Participants by side.", labels=["domain", "side"]
         )
         for server in self._servers:
             number = str(server.domain.settings.number)
-            found.add_metric([number, "inside"], len(server.domain.inside.by_prefix))
-            found.add_metric([number, "outside"], len(server.domain.outside.by_prefix))
-        yield found
+            gauge.add_metric([number, "inside"], len(server.domain.inside.by_prefix))
+            gauge.add_metric([number, "outside"], len(server.domain.outside.by_prefix))
+        yield gauge
 
     def _domain(self, server: DomainServer) -> document.DomainStatus:
         domain, settings = server.domain, server.domain.settings
@@ -121,29 +121,29 @@ class Ros2State(Collector):
             mismatches=tuple(map(_mismatch, pairs[:MOST_MISMATCHES])),
             mismatches_left_out=max(len(pairs) - MOST_MISMATCHES, 0),
             inside=bounded_names(
-                self._inside(one, domain.inside.lacking.get(one.prefix, ""), domain.is_kept(one))
-                for one in domain.inside.by_prefix.values()
+                self._inside(p, domain.inside.lacking.get(p.prefix, ""), domain.is_kept(p))
+                for p in domain.inside.by_prefix.values()
             ),
-            outside=bounded_names(self._outside(one) for one in domain.outside.by_prefix.values()),
+            outside=bounded_names(self._outside(p) for p in domain.outside.by_prefix.values()),
         )
 
     def _inside(
-        self, one: InsideParticipant, problem: str, kept: bool
+        self, participant: InsideParticipant, problem: str, kept: bool
     ) -> document.ParticipantStatus:
-        return msgspec.structs.replace(self._told(one, problem=problem), kept=kept)
+        return msgspec.structs.replace(self._status_of(participant, problem=problem), kept=kept)
 
-    def _outside(self, one: OutsideParticipant) -> document.ParticipantStatus:
-        return self._told(one, proven=one.proven)
+    def _outside(self, participant: OutsideParticipant) -> document.ParticipantStatus:
+        return self._status_of(participant, proven=participant.proven)
 
-    def _told(
+    def _status_of(
         self,
-        one: Participant,
+        participant: Participant,
         proven: bool = True,
         problem: str = "",
     ) -> document.ParticipantStatus:
-        ends = list(one.endpoints.values()) if self.with_names else []
-        writers = {end.topic for end in ends if end.kind is EndpointKind.WRITER}
-        readers = {end.topic for end in ends if end.kind is EndpointKind.READER}
+        endpoints = list(participant.endpoints.values()) if self.with_names else []
+        writers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.WRITER}
+        readers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.READER}
         lists = [
             sorted(filter(None, map(ros_topic, writers))),
             sorted(filter(None, map(ros_topic, readers))),
@@ -152,28 +152,28 @@ class Ros2State(Collector):
         shown = [names[:MOST_NAMES] for names in lists]
         left_out = sum(map(len, lists)) - sum(map(len, shown))
         return document.ParticipantStatus(
-            guid_prefix=one.guid_prefix,
-            address=one.address,
-            vendor=one.vendor_name,
-            leases=tuple(self._plane.locator(lease) for lease in one.leases.values()),
+            guid_prefix=participant.guid_prefix,
+            address=participant.address,
+            vendor=participant.vendor_name,
+            leases=tuple(self._plane.locator(lease) for lease in participant.leases.values()),
             publishes=tuple(shown[0]),
             subscribes=tuple(shown[1]),
             services=tuple(shown[2]),
             left_out=left_out,
             proven=proven,
             problem=problem,
-            domain=one.traits.domain,
-            security=one.traits.security.value,
-            locator_fault=one.traits.locator_fault.value,
-            types=_types(ends, {name for names in shown for name in names}),
+            domain=participant.traits.domain,
+            security=participant.traits.security.value,
+            locator_fault=participant.traits.locator_fault.value,
+            types=_types(endpoints, {name for names in shown for name in names}),
         )
 
 
 def _types(
-    ends: Iterable[DdsEndpoint], names: Container[str]
+    endpoints: Iterable[DdsEndpoint], names: Container[str]
 ) -> tuple[document.NamedTypeStatus, ...]:
     """The types of topics and services, one for each."""
-    types = {ros_name(end.topic): ros_type(end.type_name) for end in ends}
+    types = {ros_name(endpoint.topic): ros_type(endpoint.type_name) for endpoint in endpoints}
     return tuple(
         document.NamedTypeStatus(name, kind)
         for name, kind in sorted(types.items())

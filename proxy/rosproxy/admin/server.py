@@ -1,13 +1,13 @@
 """The admin endpoint: health, readiness, metrics, status, and what an operator tells the proxy.
 
-GET only tells, and is open to whoever reaches the endpoint, which is on loopback by default; the
-live page, whose routes it is given, decides by itself whom it tells (`rosproxy.page`). POST
+GET only reads, and is open to whoever reaches the endpoint, which is on loopback by default; the
+live page, whose routes it is given, decides by itself whom it answers (`rosproxy.page`). POST
 changes things: it is for callers on loopback that are no web page, and for those that know the
-token, of which only the hash is held here. So is waiting for a change (`status_changes`). What a
-POST does is given as an action by its path; actions wait for each other as far as they have to.
+token, of which only the hash is held here. So is waiting for a change (`status_changes`). Each
+path of a POST has an action; actions wait for each other as far as they have to.
 
-It serves few and friends, so its bounds are tight and no options: a source that has too many
-connections loses its oldest, and who sends half a request or reads no reply is cut.
+Callers are few and friendly, so its bounds are tight and no options: a source with too many
+connections loses its oldest, and a caller that sends half a request or reads no reply is cut off.
 """
 
 import asyncio
@@ -75,12 +75,12 @@ class AdminServer:
         """Nobody waits yet."""
         self._changes = StatusChanges(self._status)
 
-    async def start(self, where: HostPort) -> None:
+    async def start(self, listener: HostPort) -> None:
         """Listen. Raises OSError."""
         self._runner = web.ServerRunner(_BoundedServer(self._answer))
         await self._runner.setup()
-        # Who finds no place in the queue tries again after a second: too late for a health check.
-        await web.TCPSite(self._runner, where.host, where.port, backlog=BACKLOG).start()
+        # A caller that finds the queue full tries again after 1 s: too late for a health check.
+        await web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG).start()
 
     async def stop(self) -> None:
         """Stop listening."""
@@ -97,16 +97,16 @@ class AdminServer:
             return page()
         if route is not None:
             return await route(request)
-        posted = request.path in self._actions
-        if posted and method == "POST":
+        has_action = request.path in self._actions
+        if has_action and method == "POST":
             return await self._post(request)
-        allowed = {known for known, path in self._routes if path == request.path}
-        allowed |= ({"GET"} if page else set()) | ({"POST"} if posted else set())
+        allowed = {verb for verb, path in self._routes if path == request.path}
+        allowed |= ({"GET"} if page else set()) | ({"POST"} if has_action else set())
         if not allowed:
             return web.Response(status=404, text="404: Not Found")
-        told = ",".join(sorted(allowed | ({"HEAD"} if "GET" in allowed else set())))
+        methods = ",".join(sorted(allowed | ({"HEAD"} if "GET" in allowed else set())))
         text = "405: Method Not Allowed"
-        return web.Response(status=405, text=text, headers={"Allow": told})
+        return web.Response(status=405, text=text, headers={"Allow": methods})
 
     def _pages(self) -> dict[str, Callable[[], web.Response]]:
         return {
@@ -139,22 +139,22 @@ class AdminServer:
             return web.Response(status=503, text="rosproxy: too many wait already; ask /status\n")
         return web.json_response({"version": version, "status": to_json(status)})
 
-    def _forbidden(self, what: str) -> web.Response:
+    def _forbidden(self, operation: str) -> web.Response:
         hint = "" if self._token_hash else "; this proxy has none"
-        return web.Response(status=403, text=FORBIDDEN.format(what, hint))
+        return web.Response(status=403, text=FORBIDDEN.format(operation, hint))
 
     async def _post(self, request: web.BaseRequest) -> web.Response:
         if not self._may_post(request):
             return self._forbidden("POST")
         try:
             async with asyncio.timeout(BODY_TIMEOUT):
-                sent = await read_bounded(request.content, MAX_BODY)
+                raw_body = await read_bounded(request.content, MAX_BODY)
         except TimeoutError:
             return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
         except TooLong as error:
             return web.Response(status=413, text=f"{error}\n")
         try:
-            body = _read_json(sent)
+            body = _read_json(raw_body)
             return web.json_response(await self._actions[request.path](body))
         except BodyError as error:
             return web.Response(status=400, text=f"rosproxy: {error}\n")
@@ -165,19 +165,19 @@ class AdminServer:
     def _may_post(self, request: web.BaseRequest) -> bool:
         """Whether a caller may post.
 
-        A browser on this host is on loopback too; it says on behalf of which page it calls.
+        A browser on this host is on loopback too; its ``Origin`` says for which page it calls.
         """
-        scheme, _, said = request.headers.get("Authorization", "").partition(" ")
+        scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if self._token_hash and scheme == "Bearer":
             # aiohttp keeps bytes that are no UTF-8 as surrogates.
-            sent = hashlib.sha256(said.encode("utf-8", "surrogateescape")).hexdigest()
-            if hmac.compare_digest(sent, self._token_hash):
+            token_hash = hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
+            if hmac.compare_digest(token_hash, self._token_hash):
                 return True
         return is_loopback(request.remote or "") and "Origin" not in request.headers
 
 
 class _BoundedServer(web.Server):
-    """Serves so many connections from one address."""
+    """Serves MOST_CONNECTIONS from one address at most."""
 
     def __init__(self, answer: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]) -> None:
         super().__init__(
@@ -188,10 +188,10 @@ class _BoundedServer(web.Server):
         """Take a connection in, and end the oldest one of its source if that has too many."""
         end_if_stalled(transport.get_extra_info("socket"))
         source = _source(handler)
-        mine = [other for other in self.connections if _source(other) == source]
-        open_ones = [other for other in mine if other.transport is not None]
-        if len(open_ones) >= MOST_CONNECTIONS:  # those that end are there until the next turn
-            open_ones[0].force_close()
+        same_source = [c for c in self.connections if _source(c) == source]
+        open_connections = [c for c in same_source if c.transport is not None]
+        if len(open_connections) >= MOST_CONNECTIONS:  # those that end stay until the next turn
+            open_connections[0].force_close()
         super().connection_made(handler, transport)
 
 

@@ -1,8 +1,8 @@
 """Whether outside can reach a proxy as it was set up: its advertised host, its range, its ports.
 
-One word for all who say it: ``rosproxy doctor`` when it is asked, the proxy itself in its log and
-its status, and ``rosproxy run --check --deep`` before anything runs. The first cause comes first,
-and what follows from one that was told is not told again.
+The same rules serve ``rosproxy doctor``, the proxy itself for its log and its status, and
+``rosproxy run --check --deep`` before anything runs. The first cause comes first, and what follows
+from it is not reported.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ _OF_THIS_HOST = (
 )
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
 """How the proxy's own try may end although outside gets through: NAT has no hairpin."""
-_TRIES = {
+_TEXT_BY_OUTCOME = {
     "refused": "nothing listens there: the range is not published, or the host is another machine",
     "silent": "no answer: a firewall drops it, or the host is not this one",
     "unreachable": "no way leads there",
@@ -54,26 +54,26 @@ def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iter
 
 
 def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterator[DoctorFinding]:
-    """What tries at some ports of the range mean."""
+    """The findings from tries at some ports of the range."""
     outcomes: dict[tuple[str, str, str], list[str]] = {}
-    for one in probe.probes:
-        port = one.advertised.rpartition(":")[2]
-        outcomes.setdefault((one.transport, one.from_proxy, one.from_master), []).append(port)
-    for (transport, mine, masters), tried in outcomes.items():
-        at = f"{host}, port {' and '.join(tried)}"
-        whole = len({key for key in outcomes if key[0] == transport}) == 1
+    for trial in probe.probes:
+        port = trial.advertised.rpartition(":")[2]
+        outcomes.setdefault((trial.transport, trial.from_proxy, trial.from_master), []).append(port)
+    for (transport, from_proxy, from_master), tried_ports in outcomes.items():
+        target = f"{host}, port {' and '.join(tried_ports)}"
+        is_uniform = len({key for key in outcomes if key[0] == transport}) == 1
         if transport == "udp":
-            yield _by_udp(host, ports, mine, at)
-        elif mine == "ok" or masters == "ok":
-            yield _reached(host, mine, masters, at)
+            yield _by_udp(host, ports, from_proxy, target)
+        elif from_proxy == "ok" or from_master == "ok":
+            yield _reached(host, from_proxy, from_master, target)
         else:
-            yield _not_reached(host, ports, mine, masters, at, whole)
+            yield _not_reached(host, ports, from_proxy, from_master, target, is_uniform)
 
 
 def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
     """How many ports are left, and who else has some."""
     used, free, blocked = ports.used, ports.free, ports.blocked
-    larger = (
+    larger_range = (
         "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
         "was refused"
     )
@@ -88,61 +88,61 @@ def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
         yield warning("ports", "ports", text, fix)
     if not free:
         text = f"none is free, {used} used: no further node gets in"
-        yield error("ports", "ports", text, larger)
+        yield error("ports", "ports", text, larger_range)
     elif free < FEW_FREE * (used + free + blocked):
-        yield warning("ports", "ports", f"only {free} left, {used} used", larger)
+        yield warning("ports", "ports", f"only {free} left, {used} used", larger_range)
     else:
         text = f"{ports.listen} as {ports.advertise}, {used} used, {free} free"
         yield ok("ports", "ports", text)
 
 
-def _reached(host: str, mine: str, masters: str, at: str) -> DoctorFinding:
-    """What tries at free ports mean of which one came through, the proxy's own or the master's."""
-    if masters == "ok":
-        back = "" if mine == "ok" else f" (the proxy itself does not, {mine}: no harm)"
-        return ok(RANGE, RANGE, f"the master reaches {at}{back}")
-    if masters == "unknown":
-        return ok(RANGE, RANGE, f"the proxy reaches {at}; the master could not be asked to try")
+def _reached(host: str, from_proxy: str, from_master: str, target: str) -> DoctorFinding:
+    """The finding where a try at free ports came through, the proxy's own or the master's."""
+    if from_master == "ok":
+        aside = "" if from_proxy == "ok" else f" (the proxy itself does not, {from_proxy}: no harm)"
+        return ok(RANGE, RANGE, f"the master reaches {target}{aside}")
+    if from_master == "unknown":
+        return ok(RANGE, RANGE, f"the proxy reaches {target}; the master could not be asked to try")
     text = (
-        f"{at}: reached from here, but not from the master's machine. For that it is another "
+        f"{target}: reached from here, but not from the master's machine. For that it is another "
         "machine, an address that only this side has, or behind a firewall"
     )
     fix = (
         "--advertise-host ADDRESS: this host as the master's machine knows it "
         "(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz"
     )
-    return error(RANGE, RANGE, text, f"{fix} {host} {at.rpartition(' ')[2]}")
+    return error(RANGE, RANGE, text, f"{fix} {host} {target.rpartition(' ')[2]}")
 
 
 def _not_reached(
-    host: str, ports: PortsStatus, mine: str, masters: str, at: str, whole: bool
+    host: str, ports: PortsStatus, from_proxy: str, from_master: str, target: str, is_uniform: bool
 ) -> DoctorFinding:
     fix = f"docker run -p {ports.advertise}:{ports.listen}"
-    if mine == "unresolvable":
+    if from_proxy == "unresolvable":
         fix = BY_ADDRESS
-    elif whole:
+    elif is_uniform:
         fix += f", and let it through the firewall; or correct --advertise-host, now {host}"
     else:
         fix = f"publish the whole range: {fix}"
-    text = f"{at}: {_TRIES.get(mine, mine)}"
-    if masters == "missed":
+    text = f"{target}: {_TEXT_BY_OUTCOME.get(from_proxy, from_proxy)}"
+    if from_master == "missed":
         return error(RANGE, RANGE, f"{text}. The master does not get through either", fix)
-    if mine in _NO_WAY_BACK:
+    if from_proxy in _NO_WAY_BACK:
         text += ". Or only the way back is missing; the master, which could tell, is not there"
         return warning(RANGE, RANGE, text, fix)
     return error(RANGE, RANGE, text, fix)
 
 
-def _by_udp(host: str, ports: PortsStatus, mine: str, at: str) -> DoctorFinding:
-    """What a try by UDP means: one that fails proves nothing where NAT has no way back.
+def _by_udp(host: str, ports: PortsStatus, from_proxy: str, target: str) -> DoctorFinding:
+    """The finding from a try by UDP; failing proves nothing where NAT has no way back.
 
-    Who outside does not get through is told once somebody there is heard (`domain_problems`).
+    Who outside does not get through is reported once somebody there is heard (`domain_problems`).
     """
-    if mine == "ok":
-        return ok(RANGE, RANGE, f"the proxy reaches {at} by UDP")
+    if from_proxy == "ok":
+        return ok(RANGE, RANGE, f"the proxy reaches {target} by UDP")
     text = (
-        f"{at}: what the proxy sends there by UDP does not come back to it. Perhaps only the way "
-        "back is missing; perhaps the range is not published for UDP, or a firewall drops it"
+        f"{target}: what the proxy sends there by UDP does not come back to it. Perhaps only the "
+        "way back is missing; perhaps the range is not published for UDP, or a firewall drops it"
     )
     fix = f"if nobody outside is heard: docker run -p {ports.advertise}:{ports.listen}/udp; is "
     return note(RANGE, RANGE, text, f"{fix}--advertise-host {host} this host?")

@@ -58,15 +58,15 @@ class ProxyState(Collector):
             data_plane=msgspec.convert(self._plane.status(), document.DataPlaneStatus),
             udpros=tuple(
                 document.UdprosStatus(
-                    one.topic,
-                    one.caller_id,
-                    one.peer,
+                    subscription.topic,
+                    subscription.caller_id,
+                    subscription.peer,
                     relay.port,
-                    one.inside_asks,
+                    subscription.inside_asks,
                     relay.sent,
                     relay.dropped,
                 )
-                for one, relay in self._stand_ins.udpros
+                for subscription, relay in self._stand_ins.udpros
             ),
             stand_ins=msgspec.convert(self._stand_ins.status(), tuple[document.StandInStatus, ...]),
             policy=self._policy(),
@@ -113,18 +113,18 @@ class ProxyState(Collector):
         yield "master_up", "Whether the master answers.", bool(self._monitor.up)
         text = "Whether the kernel forwards topics."
         yield "kernel_plane", text, self._plane.syncer.usable
-        forwarded = sum(one.fast_connections for one in self._plane.holders)
+        forwarded = sum(holder.fast_connections for holder in self._plane.holders)
         yield "kernel_connections", "TCPROS connections that the kernel forwards.", forwarded
 
     def _nodes_down(self) -> Metric:
-        """Who does not answer, by name: it is who is on call that has to know."""
+        """The nodes that do not answer, by name, for whoever is on call."""
         text = "Inside nodes that do not answer, by name."
-        found = GaugeMetricFamily("rosproxy_nodes_down", text, labels=["node"])
+        gauge = GaugeMetricFamily("rosproxy_nodes_down", text, labels=["node"])
         down = [endpoint for endpoint in self._context.registry if endpoint.is_down]
         names = [name for endpoint in down for name in endpoint.caller_ids]
         for name, count in self._down.tally(names).items():
-            found.add_metric([name], count)
-        return found
+            gauge.add_metric([name], count)
+        return gauge
 
     def _bytes(self) -> Iterable[Metric]:
         relayed = CounterMetricFamily(
@@ -194,9 +194,9 @@ class ProxyState(Collector):
         hidden = []
         for (kind, name), holders in sorted(self._context.registry.hidden.items(), key=str):
             for node, endpoint in sorted(holders.items()):
-                asked = KINDS[kind]
-                verdict = policy.judge(asked, name, [node], endpoint.address)
-                hidden.append(document.HiddenStatus(asked.value, name, node, verdict.reason))
+                rule_kind = KINDS[kind]
+                verdict = policy.judge(rule_kind, name, [node], endpoint.address)
+                hidden.append(document.HiddenStatus(rule_kind.value, name, node, verdict.reason))
         return policy_status(policy, hidden)
 
     def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
@@ -223,7 +223,7 @@ class ProxyState(Collector):
 def policy_status(
     policy: AccessPolicy, hidden: Sequence[document.HiddenStatus], left_out: int = 0
 ) -> document.PolicyStatus:
-    """The layers in force and what they hide, of which so much was left out before."""
+    """The layers in force and what they hide, besides what was ``left_out`` before."""
     layers = tuple(
         document.LayerStatus(
             layer.name,
@@ -240,6 +240,6 @@ def policy_status(
 def told_problems(problems: Problems) -> tuple[document.ProblemStatus, ...]:
     """The problems that were noted, each with how long ago."""
     return tuple(
-        document.ProblemStatus(round(max(time.time() - one.when, 0.0), 1), one.subject, one.text)
-        for one in problems.all()
+        document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
+        for p in problems.all()
     )

@@ -1,9 +1,8 @@
-"""How long the document at ``/status`` gets, whatever nodes and strangers call things.
+"""Bounds for the document at ``/status``, whatever nodes and strangers call things.
 
-Names are theirs, and so is how many there are: registrations, and connections from outside. All
-nodes together have MOST characters for these; who has few is shown in whole, and of the others
-each gets as much as the next, so that nobody hides what a neighbour has. Within a node its names
-come first, since connections are what anybody outside can add.
+Nodes choose their names and how many they register; anybody outside can add connections. All nodes
+together have MOST characters for these. A node with few is shown in whole, and the others get equal
+shares, so that none hides what another has. Within a node its names come before its connections.
 """
 
 import json
@@ -27,8 +26,8 @@ MOST_HIDDEN = 256 * 1024
 """The same for what the policy hides."""
 MOST_OF_PARTICIPANTS = 128 * 1024
 """The same for topics and services of the participants of ROS 2 on one side of a domain."""
-CONNECTION = 160
-"""Those of a connection besides its texts."""
+CONNECTION_OVERHEAD = 160
+"""Characters of a connection besides its texts."""
 Item = str | ConnectionStatus
 _LISTS = ("nodes", "publishes", "services", "subscribes", "parameters", "connections")
 
@@ -45,46 +44,46 @@ def bounded(status: ProxyStatus, most: int = MOST) -> ProxyStatus:
 
 def first_hidden(hidden: Sequence[HiddenStatus], most: int = MOST_HIDDEN) -> list[HiddenStatus]:
     """The first of the hidden names, as many as fit."""
-    sizes = accumulate(len(msgspec.json.encode(one)) for one in hidden)
-    return [one for one, size in zip(hidden, sizes, strict=True) if size <= most]
+    sizes = accumulate(len(msgspec.json.encode(h)) for h in hidden)
+    return [h for h, size in zip(hidden, sizes, strict=True) if size <= most]
 
 
 def bounded_names(
     participants: Iterable[ParticipantStatus], most: int = MOST_OF_PARTICIPANTS
 ) -> tuple[ParticipantStatus, ...]:
     """Participants with so many of each one's names that all fit."""
-    all_of_them = tuple(participants)
-    sizes = [[len(msgspec.json.encode(name)) + 1 for name in _names(one)] for one in all_of_them]
-    shares = fair_shares([sum(own) for own in sizes], most)
+    all_participants = tuple(participants)
+    sizes = [[len(msgspec.json.encode(name)) + 1 for name in _names(p)] for p in all_participants]
+    shares = fair_shares([sum(name_sizes) for name_sizes in sizes], most)
     return tuple(
-        _with_names(one, sum(1 for used in accumulate(own) if used <= share))
-        for one, own, share in zip(all_of_them, sizes, shares, strict=True)
+        _with_names(p, sum(1 for used in accumulate(name_sizes) if used <= share))
+        for p, name_sizes, share in zip(all_participants, sizes, shares, strict=True)
     )
 
 
-def _names(one: ParticipantStatus) -> tuple[str, ...]:
-    return (*one.publishes, *one.subscribes, *one.services)
+def _names(participant: ParticipantStatus) -> tuple[str, ...]:
+    return (*participant.publishes, *participant.subscribes, *participant.services)
 
 
-def _with_names(one: ParticipantStatus, count: int) -> ParticipantStatus:
+def _with_names(participant: ParticipantStatus, count: int) -> ParticipantStatus:
     """A participant with the first of its names."""
-    subscribed = max(count - len(one.publishes), 0)
+    subscribed = max(count - len(participant.publishes), 0)
     return msgspec.structs.replace(
-        one,
-        publishes=one.publishes[:count],
-        subscribes=one.subscribes[:subscribed],
-        services=one.services[: max(subscribed - len(one.subscribes), 0)],
-        left_out=one.left_out + len(_names(one)) - count,
+        participant,
+        publishes=participant.publishes[:count],
+        subscribes=participant.subscribes[:subscribed],
+        services=participant.services[: max(subscribed - len(participant.subscribes), 0)],
+        left_out=participant.left_out + len(_names(participant)) - count,
     )
 
 
 def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
     """How much each gets of ``most``: what it wants, or as much as all others that want more."""
-    shares, left = [0] * len(wanted), most
+    shares, remaining = [0] * len(wanted), most
     by_size = sorted(range(len(wanted)), key=wanted.__getitem__)
     for served, index in enumerate(by_size):
-        shares[index] = min(wanted[index], left // (len(wanted) - served))
-        left -= shares[index]
+        shares[index] = min(wanted[index], remaining // (len(wanted) - served))
+        remaining -= shares[index]
     return shares
 
 
@@ -113,4 +112,4 @@ def _size(item: Item) -> int:
     if isinstance(item, str):
         return len(json.dumps(item)) + 2
     texts = item.kind, item.name, item.caller_id, item.peer
-    return CONNECTION + sum(len(json.dumps(text)) for text in texts)
+    return CONNECTION_OVERHEAD + sum(len(json.dumps(text)) for text in texts)

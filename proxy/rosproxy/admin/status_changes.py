@@ -1,7 +1,7 @@
 """Waiting for a change of the proxy's state, so that nobody has to ask for it again and again.
 
-The state is in many places, none of which knows who waits. So as long as somebody does it is looked
-at, at most twice a second and as seldom as it takes to cost a hundredth of a processor.
+The state is in many places, none of which knows who waits. So it is polled while somebody waits: at
+most twice a second, and seldom enough to cost a hundredth of a processor.
 """
 
 import asyncio
@@ -16,11 +16,11 @@ from rosproxy.admin.status_news import version_of
 EVERY = 0.5
 """Seconds between two looks at the state, at least."""
 SHARE = 0.01
-"""Of a processor, that looking may cost for each who waits."""
+"""Share of a processor that polling may cost for each caller that waits."""
 LONGEST = 300.0
-"""Seconds that somebody may wait."""
+"""Seconds that a caller may wait."""
 MOST = 4
-"""Who may wait at the same time: operators, one after the other."""
+"""Callers that may wait at the same time: operators, one after the other."""
 
 
 class Crowded(Exception):
@@ -28,7 +28,7 @@ class Crowded(Exception):
 
 
 class StatusChanges:
-    """Lets callers wait until the state is another one than they know."""
+    """Lets callers wait until the state differs from the one that they know."""
 
     def __init__(self, status: Callable[[], ProxyStatus]) -> None:
         self._status = status
@@ -40,11 +40,11 @@ class StatusChanges:
         self._ending.set()
 
     async def after(
-        self, since: str, within: float, there: Callable[[], bool]
+        self, since: str, within: float, connected: Callable[[], bool]
     ) -> tuple[str, ProxyStatus]:
         """The state and its version, once that is another one than ``since``.
 
-        Or after ``within`` seconds, or once the caller is not ``there`` any more. Raises Crowded.
+        Or after ``within`` seconds, or once the caller is no longer ``connected``. Raises Crowded.
         """
         if self._waiting >= MOST:
             raise Crowded
@@ -56,7 +56,7 @@ class StatusChanges:
                 began = time.perf_counter()
                 status = self._status()
                 version, took = version_of(status), time.perf_counter() - began
-                if version != since or clock() >= until or self._ending.is_set() or not there():
+                if version != since or clock() >= until or self._ending.is_set() or not connected():
                     return version, status
                 await self._pause(min(max(EVERY, took / SHARE), until - clock()))
         finally:

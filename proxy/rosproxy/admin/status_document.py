@@ -3,8 +3,8 @@
 `rosproxy.admin.status` fills it in; ``rosproxy status``, ``rosproxy doctor`` and the operator read
 it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made of what ROS
 nodes say of themselves and may come from another version of the proxy. So reading is tolerant:
-unknown keys are ignored, what is missing or of another type is as its default says, and an item of
-a list that is no such item is left out. The proxy bounds texts and lists by what it admits
+unknown keys are ignored, what is missing or of another type gets its default, and items of a list
+that are of another type are left out. The proxy bounds texts and lists by what it admits
 (`rosproxy.ros1.protocol.bounds`), but another version may not, and texts may hold control
 characters: `rosproxy.telemetry.text` makes them fit to be shown.
 
@@ -29,11 +29,11 @@ class NotAStatus(ValueError):
 
 
 class StatusSettings(msgspec.Struct, frozen=True):
-    """The settings that others have to know.
+    """The settings that other programs have to know.
 
     ``ros`` are the versions of ROS that it is for. ``inside_networks``: those in force, as CIDRs.
     ``direction``: ``out``, or ``both`` where inside reaches outside through the proxy, too.
-    ``udp``: UDPROS of publishers outside finds its way in.
+    ``udp``: UDPROS from publishers outside can come in.
     ``selected``: how many addresses an operator has selected; None: it has told of none yet.
     """
 
@@ -72,7 +72,7 @@ class MasterStatus(msgspec.Struct, frozen=True):
 
 
 class PortsStatus(msgspec.Struct, frozen=True):
-    """The range of ports, ``A-B`` here and as outside sees it; ``blocked`` ones others hold.
+    """The range of ports, ``A-B`` here and as outside sees it; others hold ``blocked`` of them.
 
     ``held_by``: the other proxies on this machine that have some of them.
     """
@@ -244,8 +244,8 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
 
     ``leases`` are ports of the range for one inside; for one outside its stand-ins, which inside
     reaches. ``kept``: one inside keeps them for when the proxy starts again. ``proven``: one
-    outside gets what it is sent. ``problem``: what it lacks. ``domain``: that which it says it is
-    in. ``security`` and ``locator_fault`` are one of `rosproxy.ros2.registry.participants`.
+    outside gets what it is sent. ``problem``: what it lacks. ``domain``: the one that it says it
+    is in. ``security`` and ``locator_fault`` are one of `rosproxy.ros2.registry.participants`.
     ``types`` are those of the topics and services.
     """
 
@@ -283,7 +283,7 @@ class MismatchStatus(msgspec.Struct, frozen=True):
 
 
 class DomainStatus(msgspec.Struct, frozen=True):
-    """A domain of ROS 2: its participants, and what came of datagrams.
+    """A domain of ROS 2: its participants, and what became of datagrams.
 
     ``discovery`` is where outside announces itself to the proxy. ``dropped`` were refused, ``lost``
     are those that the kernel did not take. ``data_plane``: how user data is forwarded.
@@ -308,7 +308,7 @@ class DomainStatus(msgspec.Struct, frozen=True):
 class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
-    ``instance`` is another one after each start; ``retired``: it registers nothing any more;
+    ``instance`` differs after each start; ``retired``: it registers nothing any more;
     ``stand_ins`` are the ports that stand in for nodes outside, for inside nodes; ``udpros`` the
     subscriptions by UDPROS that it passes on; ``domains`` those of ROS 2.
     """
@@ -343,7 +343,7 @@ def parse_status(text: str | bytes) -> ProxyStatus:
 
 def read_status(document: object) -> ProxyStatus:
     """The status in decoded JSON; never raises."""
-    return _as_far_as_it_fits(document, ProxyStatus)
+    return _convert_leniently(document, ProxyStatus)
 
 
 def to_json(document: msgspec.Struct) -> dict[str, Any]:
@@ -352,28 +352,28 @@ def to_json(document: msgspec.Struct) -> dict[str, Any]:
     return plain
 
 
-def _as_far_as_it_fits(value: object, kind: type[Document]) -> Document:
+def _convert_leniently(value: object, kind: type[Document]) -> Document:
     """A document with defaults in place of what does not fit."""
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
-        given = value if isinstance(value, dict) else {}
-    fitting = {}
+        raw_fields = value if isinstance(value, dict) else {}
+    fields = {}
     for field in msgspec.structs.fields(kind):
         try:
-            fitting[field.name] = _field(given[field.encode_name], field.type)
+            fields[field.name] = _convert_field(raw_fields[field.encode_name], field.type)
         except (KeyError, msgspec.ValidationError):
             continue
-    return kind(**fitting)
+    return kind(**fields)
 
 
-def _field(value: Any, kind: Any) -> Any:
+def _convert_field(value: Any, kind: Any) -> Any:
     """A value as a field's type. Raises ValidationError where nothing of it fits."""
     inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
-    document = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
-    if document and isinstance(value, dict) and get_origin(kind) is not tuple:
-        return _as_far_as_it_fits(value, inner)
+    is_struct = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
+    if is_struct and isinstance(value, dict) and get_origin(kind) is not tuple:
+        return _convert_leniently(value, inner)
     if get_origin(kind) is not tuple or not isinstance(value, list):
         return msgspec.convert(value, kind)
-    items = [item for item in value if isinstance(item, dict if document else str)]
-    return tuple(_as_far_as_it_fits(item, inner) if document else item for item in items)
+    items = [item for item in value if isinstance(item, dict if is_struct else str)]
+    return tuple(_convert_leniently(item, inner) if is_struct else item for item in items)

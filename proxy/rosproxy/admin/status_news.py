@@ -1,6 +1,6 @@
 """What of a proxy's status is news to an operator: not how long or how fast, but who and what.
 
-Whoever waits for a change (``/status/changes``) is answered when this is another one.
+Callers that wait for a change (``/status/changes``) are answered when the version differs.
 """
 
 import hashlib
@@ -11,32 +11,32 @@ from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxySt
 
 
 def version_of(status: ProxyStatus) -> str:
-    """The same text for as long as nothing of it is news."""
-    told = (
+    """A text that stays the same until the status has news."""
+    news = (
         status.instance,
         status.retired,
         status.master.up,
         status.master.error,
-        [_node(one) for one in status.nodes],
-        [_domain(one) for one in status.domains],
-        sorted((one.subject, one.text) for one in status.problems),
+        [_node(node) for node in status.nodes],
+        [_domain(domain) for domain in status.domains],
+        sorted((problem.subject, problem.text) for problem in status.problems),
     )
-    return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
+    return hashlib.sha256(msgspec.json.encode(news)).hexdigest()[:16]
 
 
-def _node(one: EndpointStatus) -> object:
-    return one.nodes, one.address, one.given_up, one.publishes, one.subscribes
+def _node(node: EndpointStatus) -> object:
+    return node.nodes, node.address, node.given_up, node.publishes, node.subscribes
 
 
-def _domain(one: DomainStatus) -> object:
+def _domain(domain: DomainStatus) -> object:
     inside = [
         (
-            member.guid_prefix,
-            member.address,
-            member.publishes,
-            member.subscribes,
-            [lease.port for lease in member.leases],
+            participant.guid_prefix,
+            participant.address,
+            participant.publishes,
+            participant.subscribes,
+            [lease.port for lease in participant.leases],
         )
-        for member in one.inside
+        for participant in domain.inside
     ]
-    return one.domain, inside
+    return domain.domain, inside

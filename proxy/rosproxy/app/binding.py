@@ -8,15 +8,15 @@ from rosproxy.settings import SettingError
 
 
 @contextlib.contextmanager
-def binding(option: str, what: object, holders: Collection[object] = ()) -> Iterator[None]:
-    """While something is bound; raises SettingError instead of OSError.
+def binding(option: str, subject: object, holders: Collection[object] = ()) -> Iterator[None]:
+    """While ``subject`` is bound; raises SettingError instead of OSError.
 
     ``holders`` are those who are likely to have it, if somebody has.
     """
     try:
         yield
     except OSError as error:
-        text = f"{what} can't be bound: {error.strerror}"
+        text = f"{subject} can't be bound: {error.strerror}"
         if error.errno == errno.EADDRINUSE:
             text += f" by {'; '.join(map(str, holders))}" if holders else " (ss -ltunp: by whom)"
         raise SettingError(option, text) from None

@@ -1,7 +1,7 @@
-"""Tells once of what keeps participants of ROS 2 apart: in the log, and as a problem.
+"""Reports once what keeps participants of ROS 2 apart: in the log, and as a problem.
 
-What is wrong only for a moment is not told: a participant that has just been heard, or one whose
-readers and writers are not all known. When it is mended, the problem goes.
+What is wrong only for a moment is not reported: a participant that has just been heard, or one
+whose readers and writers are not all known. When it is mended, the problem goes.
 """
 
 import logging
@@ -13,7 +13,7 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 MOST_TOLD = 20
-"""Told of at a time, so that nobody hides all other problems behind those of his own."""
+"""Problems noted at a time, so that nobody hides all others behind those of his own."""
 
 
 class DomainWatch:
@@ -21,26 +21,26 @@ class DomainWatch:
 
     def __init__(self, state: Ros2State, problems: Problems) -> None:
         self._state, self._problems = state, problems
-        self._before: set[DomainProblem] = set()
-        self._told: dict[str, set[DomainProblem]] = {}
+        self._previous: set[DomainProblem] = set()
+        self._noted: dict[str, set[DomainProblem]] = {}
 
     async def look(self) -> None:
-        """Tell of what was found this time and the last, and forget what has gone."""
-        found = {one for domain in self._state.status() for one in domain_problems(domain)}
-        lasting = sorted(found & self._before, key=lambda one: (not one.grave, one.subject))
-        self._before = found
-        now: dict[str, set[DomainProblem]] = {}
-        for one in lasting[:MOST_TOLD]:
-            now.setdefault(one.subject, set()).add(one)
-        for subject in self._told.keys() | now.keys():
-            self._note(subject, self._told.get(subject, set()), now.get(subject, set()))
-        self._told = now
+        """Report what was found this time and the last, and forget what has gone."""
+        problems = {p for domain in self._state.status() for p in domain_problems(domain)}
+        lasting = sorted(problems & self._previous, key=lambda p: (not p.grave, p.subject))
+        self._previous = problems
+        current: dict[str, set[DomainProblem]] = {}
+        for problem in lasting[:MOST_TOLD]:
+            current.setdefault(problem.subject, set()).add(problem)
+        for subject in self._noted.keys() | current.keys():
+            self._note(subject, self._noted.get(subject, set()), current.get(subject, set()))
+        self._noted = current
 
-    def _note(self, subject: str, before: set[DomainProblem], now: set[DomainProblem]) -> None:
-        if before - now:
+    def _note(self, subject: str, former: set[DomainProblem], current: set[DomainProblem]) -> None:
+        if former - current:
             self._problems.solved(subject)
-        for one in sorted(now, key=lambda one: one.text):
-            if before - now or one not in before:
-                self._problems.add(subject, f"{one.text}: {one.fix}")
-            if one not in before:
-                log.warning("%s: %s; %s", subject, one.text, one.fix)
+        for problem in sorted(current, key=lambda p: p.text):
+            if former - current or problem not in former:
+                self._problems.add(subject, f"{problem.text}: {problem.fix}")
+            if problem not in former:
+                log.warning("%s: %s; %s", subject, problem.text, problem.fix)

@@ -21,8 +21,8 @@ from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 
-TOLD_POLICY = "the operator's policy"
-"""The subject of the problem that it is refused: whoever looks at the proxy sees it."""
+OPERATOR_POLICY = "the operator's policy"
+"""The subject of the problem that it was refused, which the proxy's status shows."""
 
 
 class PolicySources:
@@ -49,27 +49,27 @@ class PolicySources:
         """
         problems = self._runtime.problems
         try:
-            self._use_told(body)
+            self._use_operator_layers(body)
         except BodyError as error:
-            problems.solved(TOLD_POLICY)
-            problems.add(TOLD_POLICY, f"refused, that of before stays in force: {error}")
+            problems.solved(OPERATOR_POLICY)
+            problems.add(OPERATOR_POLICY, f"refused, that of before stays in force: {error}")
             raise
-        problems.solved(TOLD_POLICY)
+        problems.solved(OPERATOR_POLICY)
         if self._ros2:
             await self._ros2.apply_policy()
         return to_json(await self._ros1.enforce_policy() if self._ros1 else Enforced())
 
-    def _use_told(self, body: Any) -> None:
+    def _use_operator_layers(self, body: Any) -> None:
         """Take in the rules of a post. Raises BodyError."""
         written = read_body(body, PolicyNews).layers
         try:
-            self._runtime.policy.use_told([read_layer(one) for one in written])
+            self._runtime.policy.use_told([read_layer(layer) for layer in written])
         except ValueError as error:
             raise BodyError(f"layers: {error}") from None
 
 
 def read_policy_file(settings: Settings) -> None:
-    """Read the policy's file, if there is one, for a look whether it is sound. Raises SettingError.
+    """Read the policy's file, if there is one, to check it. Raises SettingError.
 
     Its rules count together with those of the options, as they do in a running proxy.
     """

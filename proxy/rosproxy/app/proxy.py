@@ -85,15 +85,15 @@ class App:
         with binding("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
         self._policy.start()
-        parts = [part for part in (self.ros1, self.ros2) if part]
-        for part in parts:
-            await part.start()
+        stacks = [stack for stack in (self.ros1, self.ros2) if stack]
+        for stack in stacks:
+            await stack.start()
         with binding("--admin-bind", settings.admin):
             await self._admin.start(settings.admin)
         ports = settings.ports.listen
         self._sign = signs.put_up(settings.ros, ports.first, ports.last, settings.admin)
         await self._check.start()
-        log.info("ready: %s", "; ".join(part.greeting for part in parts))
+        log.info("ready: %s", "; ".join(stack.greeting for stack in stacks))
 
     async def stop(self) -> None:
         """End everything."""
@@ -114,23 +114,23 @@ class App:
     def state(self) -> ProxyStatus:
         """The state."""
         domains = self.ros2.state.status() if self.ros2 else ()
-        found = self.ros1.status() if self.ros1 else self._bare_status(domains)
+        status = self.ros1.status() if self.ros1 else self._bare_status(domains)
         if self.ros2:
-            policy = self.ros2.state.policy(self.runtime.policy, found.policy)
-            found = msgspec.structs.replace(found, domains=domains, policy=policy)
-        return found
+            policy = self.ros2.state.policy(self.runtime.policy, status.policy)
+            status = msgspec.structs.replace(status, domains=domains, policy=policy)
+        return status
 
     def _actions(self) -> dict[str, Action]:
-        """What posts at the admin endpoint do: in both parts where both know them."""
-        parts = [part.actions for part in (self.ros2, self.ros1) if part]
-        paths = {path for part in parts for path in part}
-        return {path: _together([part[path] for part in parts if path in part]) for path in paths}
+        """What posts at the admin endpoint do: in ROS 1 and ROS 2 where both know them."""
+        action_maps = [stack.actions for stack in (self.ros2, self.ros1) if stack]
+        paths = {path for actions in action_maps for path in actions}
+        return {path: _together([a[path] for a in action_maps if path in a]) for path in paths}
 
     def _unready(self) -> str | None:
         return self.ros1.unready() if self.ros1 else None
 
     def _bare_status(self, domains: tuple[DomainStatus, ...]) -> ProxyStatus:
-        """What there is to tell without ROS 1."""
+        """The state of a proxy without ROS 1."""
         runtime, settings = self.runtime, self.settings
         return ProxyStatus(
             version=__version__,
@@ -156,7 +156,7 @@ class App:
 
 
 def _together(actions: list[Action]) -> Action:
-    """Does several things one after the other; what they count is added up."""
+    """Does several actions one after the other; their counts are added up."""
     if len(actions) == 1:
         return actions[0]
 

@@ -152,12 +152,12 @@ class Ros1:
         await self.plane.start()
         master = self._make_master_api()
         context.tasks.spawn(self._callers.hold(), "waiting for an operator")
-        guard, what = self._callers.refusal, "ROS master API, proxied"
-        self._listen("--master-port", settings.master_port, master, what, guard)
+        guard, title = self._callers.refusal, "ROS master API, proxied"
+        self._listen("--master-port", settings.master_port, master, title, guard)
         if settings.publish_master is not None:
-            where = HostPort(settings.advertise_host, settings.publish_master)
-            published = PublishedMaster(context, str(where))
-            self._listen("--publish-master", where.port, published, "ROS master API")
+            advertised = HostPort(settings.advertise_host, settings.publish_master)
+            published = PublishedMaster(context, str(advertised))
+            self._listen("--publish-master", advertised.port, published, "ROS master API")
         context.metrics.registry.register(self._state)
         repeat = context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
@@ -219,14 +219,14 @@ class Ros1:
     async def _handle_news(self, body: Any) -> dict[str, Any]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
 
-        Who is selected is taken in at once: nodes wait for that, and it needs no master.
+        The selected addresses apply at once: nodes wait for that, and it needs no master.
         """
         news = read_body(body, ContainerNews)
         if news.selected is not None:
             self._callers.select(news.selected)
         if not news.tells_events:
             return {"moved": 0, "unregistered": 0, "adopted": 0}
-        arrived = [(one.address, one.names) for one in news.arrived]
+        arrived = [(container.address, container.names) for container in news.arrived]
         return {**await self._containers.handle(news.gone, news.moved, arrived)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
@@ -263,12 +263,12 @@ class Ros1:
         option: str,
         port: int,
         service: MasterApi | PublishedMaster,
-        what: str,
+        title: str,
         guard: Guard | None = None,
     ) -> None:
         with binding(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
-        context, greeting = self.context, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n"
+        context, greeting = self.context, f"rosproxy: {title}; nodes use it by ROS_MASTER_URI\n"
         server = XmlRpcServer(context, service, greeting, context.master_call, service, guard)
         self._servers.append(server)
         self._acceptors.append(Acceptor(context.tasks, sock, server.dispatch, context.gate))

@@ -55,13 +55,13 @@ class Ros2:
         self.plane = plane = KernelPlane(
             runtime.settings, leases, runtime.tasks, runtime.problems, runtime.now, table
         )
-        self._told_plane = DomainPlane(plane, leases)
-        self.state = Ros2State(self.servers, self._told_plane)
-        self._applied, self._awaited = runtime.policy.version, bool(self._settings.await_policy)
+        self._domain_plane = DomainPlane(plane, leases)
+        self.state = Ros2State(self.servers, self._domain_plane)
+        self._applied, self._awaiting = runtime.policy.version, bool(self._settings.await_policy)
         self.networks: tuple[Network, ...] = ()
         self._peers = self._settings.ros2_peer
         self._watch = DomainWatch(
-            Ros2State(self.servers, self._told_plane, with_names=False), runtime.problems
+            Ros2State(self.servers, self._domain_plane, with_names=False), runtime.problems
         )
 
     async def start(self) -> None:
@@ -72,11 +72,11 @@ class Ros2:
         self._leases.note_former(self.plane.forwards)
         self._start_servers()
         self._runtime.metrics.registry.register(self.state)
-        self._runtime.metrics.registry.register(self._told_plane)
+        self._runtime.metrics.registry.register(self._domain_plane)
         self.plane.recovered([])
         tasks.spawn(self._forget_former(), "waiting for participants of before the start")
         await self._refresh()
-        if self._awaited:
+        if self._awaiting:
             tasks.spawn(self._await_policy(), "waiting for an operator's policy")
         tasks.repeat(self._look_at_policy, POLICY_INTERVAL, "applying the policy")
         for server in self.servers:
@@ -89,8 +89,8 @@ class Ros2:
     def _start_servers(self) -> None:
         """Serve all domains. Raises SettingError."""
         settings, taken = self._settings, list[int]()
-        for number, ports in zip(settings.domains, self._parts(), strict=True):
-            told = DomainSettings(
+        for number, ports in zip(settings.domains, self._domain_ports(), strict=True):
+            domain_settings = DomainSettings(
                 number=number,
                 hosts=self._hosts,
                 ports=ports,
@@ -101,7 +101,7 @@ class Ros2:
                 ear=settings.ros2_ear,
             )
             server = DomainServer(
-                told,
+                domain_settings,
                 settings.bind,
                 self._runtime.now,
                 self._is_inside,
@@ -111,22 +111,22 @@ class Ros2:
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
             self._leases.domains.append(server.domain.inside)
-            others = signs.others("2", 1, 65535, settings.admin)
-            with binding("--ros2-domain", f"a port of domain {number}", others):
+            other_proxies = signs.others("2", 1, 65535, settings.admin)
+            with binding("--ros2-domain", f"a port of domain {number}", other_proxies):
                 taken += server.start()
         tell_taken("2", settings, taken, self._runtime.problems)
 
     async def probe(self) -> tuple[PortProbe, ...]:
-        """Whether the port of each domain where outside finds it is reached there by UDP."""
+        """Whether the discovery port of each domain is reached by UDP where outside finds it."""
         return tuple([await self._probe(server) for server in self.servers])
 
     async def _probe(self, server: DomainServer) -> PortProbe:
-        told, secret = server.domain.settings, secrets.token_bytes(16)
-        port = told.ports.advertised(told.discovery_port)
-        where = HostPort(self._hosts[0], port)
-        outcome = await server.hears(secret, lambda heard: try_udp(where, secret, heard))
+        settings, secret = server.domain.settings, secrets.token_bytes(16)
+        port = settings.ports.advertised(settings.discovery_port)
+        target = HostPort(self._hosts[0], port)
+        outcome = await server.hears(secret, lambda heard: try_udp(target, secret, heard))
         advertised = str(HostPort(self._settings.advertise_host, port))
-        return PortProbe(told.discovery_port, advertised, outcome, "unknown", "udp")
+        return PortProbe(settings.discovery_port, advertised, outcome, "unknown", "udp")
 
     async def stop(self) -> None:
         """End everything; no task may run any more."""
@@ -145,7 +145,7 @@ class Ros2:
         One whose container has moved is ended as well: at its new address it is heard by itself.
         """
         news = read_body(body, ContainerNews)
-        self._look_at_networks()  # it may have been connected to that of new containers just now
+        self._look_at_networks()  # the proxy may have just joined that of new containers
         for server in self.servers:
             server.note_former(news.former_ports)
         if news.selected is not None:
@@ -154,8 +154,8 @@ class Ros2:
         if (peers := news.ros2_peers) is not None and peers != self._peers:
             self._peers = peers
             await self._find_peers()
-        left = {*news.gone, *news.moved}
-        return {"unregistered": sum(server.end(left) for server in self.servers)}
+        former_addresses = {*news.gone, *news.moved}
+        return {"unregistered": sum(server.end(former_addresses) for server in self.servers)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
         """``POST /retire``: how many participants were ended."""
@@ -163,8 +163,8 @@ class Ros2:
         ended = 0
         for server in self.servers:
             server.select(())
-            everybody = server.domain.inside.by_prefix.values()
-            ended += server.end({one.address for one in everybody})
+            participants = server.domain.inside.by_prefix.values()
+            ended += server.end({p.address for p in participants})
         return {"unregistered": ended}
 
     @property
@@ -177,22 +177,22 @@ class Ros2:
         )
 
     async def _forget_former(self) -> None:
-        """Stop what the kernel was told before the start, where nobody has claimed it since."""
+        """Stop the forwards of before the start that no participant has claimed since."""
         await asyncio.sleep(REMEMBERED)
         self._leases.note_former({})
         self.plane.syncer.note_change()
 
-    def _parts(self) -> list[PortMap]:
+    def _domain_ports(self) -> list[PortMap]:
         """The range, shared out among the domains."""
         ports, count = self._settings.ports, len(self._settings.domains)
         size = len(ports.listen) // count
 
-        def part(whole: PortRange, index: int) -> PortRange:
+        def share(whole: PortRange, index: int) -> PortRange:
             first = whole.first + index * size
             return PortRange(first, first + size - 1)
 
         return [
-            PortMap(part(ports.listen, index), part(ports.advertise, index))
+            PortMap(share(ports.listen, index), share(ports.advertise, index))
             for index in range(count)
         ]
 
@@ -202,12 +202,12 @@ class Ros2:
     def _is_allowed(self, kind: RuleKind, name: str, address: str) -> bool:
         """Whether the policy allows something to a participant inside; nodes have no names here.
 
-        Nothing is, before an operator has told the policy that is waited for.
+        Nothing is, before an operator has sent the policy that is waited for.
         """
-        return not self._awaited and self._runtime.policy.ask(kind, name, (), address).allowed
+        return not self._awaiting and self._runtime.policy.ask(kind, name, (), address).allowed
 
     async def apply_policy(self) -> None:
-        """Have participants meet anew of whom the policy says something else than before."""
+        """Match participants anew of whom the policy says something else than before."""
         self._applied = self._runtime.policy.version
         for server in self.servers:
             server.apply_policy()
@@ -218,7 +218,7 @@ class Ros2:
 
     async def _await_policy(self) -> None:
         await self._runtime.policy.wait_for_operator(self._settings.await_policy)
-        self._awaited = False
+        self._awaiting = False
         await self.apply_policy()
 
     async def _advertised_addresses(self) -> tuple[str, ...]:
@@ -227,13 +227,13 @@ class Ros2:
         Of a family that the ports are not bound for only if there is no other. Raises SettingError.
         """
         host, bind = self._settings.advertise_host, self._settings.bind
-        found = await resolve(host)
-        if not found:
+        resolved = await resolve(host)
+        if not resolved:
             text = f"{host} can't be resolved; ROS 2 needs its address: give that instead"
             raise SettingError("--advertise-host", text)
-        served = [one for one in found if bind == "::" or (":" in one) == (":" in bind)]
-        first = {":" in one: one for one in reversed(served or found)}
-        return tuple(sorted(first.values(), key=found.index))
+        served = [a for a in resolved if bind == "::" or (":" in a) == (":" in bind)]
+        by_family = {":" in a: a for a in reversed(served or resolved)}
+        return tuple(sorted(by_family.values(), key=resolved.index))
 
     async def _refresh(self) -> None:
         """Take in the networks that there are now, and where the peers are."""
@@ -241,15 +241,15 @@ class Ros2:
         await self._find_peers()
 
     async def _find_peers(self) -> None:
-        peers = await asyncio.gather(*(self._peer(peer) for peer in self._peers))
+        peers = await asyncio.gather(*(self._resolve_peer(peer) for peer in self._peers))
         for server in self.servers:
-            server.ask_outside(tuple(peer for found in peers for peer in found))
+            server.ask_outside(tuple(peer for resolved in peers for peer in resolved))
 
     def _look_at_networks(self) -> None:
         self.networks = self._settings.inside_networks or interface_networks()
-        own = {address_into(network) for network in self.networks}
+        own_addresses = {address_into(network) for network in self.networks}
         for server in self.servers:
-            server.join(address for address in own if self._is_inside(address))
+            server.join(address for address in own_addresses if self._is_inside(address))
 
     async def _sample_rates(self) -> None:
         now = self._runtime.now()
@@ -257,10 +257,10 @@ class Ros2:
             for _, lease in server.domain.inside.leases.values():
                 lease.sample(now)
 
-    async def _peer(self, peer: HostPort) -> list[HostPort]:
-        subject, found = f"peer {peer.host}", await resolve(peer.host)
+    async def _resolve_peer(self, peer: HostPort) -> list[HostPort]:
+        subject, resolved = f"peer {peer.host}", await resolve(peer.host)
         self._runtime.problems.solved(subject)
-        if not found:
+        if not resolved:
             text = "its name can't be resolved: participants there are not told of those inside"
             self._runtime.problems.add(subject, text)
-        return [HostPort(address, peer.port) for address in found]
+        return [HostPort(address, peer.port) for address in resolved]

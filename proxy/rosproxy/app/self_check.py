@@ -25,9 +25,9 @@ from rosproxy.runtime import Runtime
 
 log = logging.getLogger(__name__)
 
-SETTLED = 3.0
+SETTLE_TIME = 3.0
 """Seconds after which the range is tried at the earliest: nodes that come back go first."""
-AGAIN = 300.0
+RETRY_INTERVAL = 300.0
 """Seconds between tries while something is wrong. A master that does not get through holds one of
 its three threads for two minutes."""
 
@@ -37,14 +37,14 @@ class SelfCheck:
 
     def __init__(self, runtime: Runtime, ros1: Ros1 | None, ros2: Ros2 | None) -> None:
         self._runtime, self._ros1, self._ros2 = runtime, ros1, ros2
-        self._told: dict[str, list[DoctorFinding]] = {}
+        self._findings: dict[str, list[DoctorFinding]] = {}
         self._probing = asyncio.Lock()
         self._addresses: list[str] = []
 
     @property
     def findings(self) -> list[DoctorFinding]:
         """What is wrong, as far as is known."""
-        return [finding for found in self._told.values() for finding in found]
+        return [finding for findings in self._findings.values() for finding in findings]
 
     async def start(self) -> None:
         """Look at the advertised host, and try the range in a moment."""
@@ -56,19 +56,19 @@ class SelfCheck:
         return to_json(await self._try_range(or_fast=True))
 
     async def _keep_trying(self) -> None:
-        await asyncio.sleep(SETTLED)
-        if self._ros1:  # it can try from where it is; while it is away, that is the first cause
+        await asyncio.sleep(SETTLE_TIME)
+        if self._ros1:  # the master tries it; while that is away, it is the first cause
             await self._ros1.master_monitor.answered.wait()
         while not (self._ros1 and self._ros1.context.retired):
             try:
                 await self._try_range(or_fast=False)
             except OSError as error:  # a port that was free a moment ago
                 log.debug("the range could not be tried: %s", error)
-                await asyncio.sleep(AGAIN)
+                await asyncio.sleep(RETRY_INTERVAL)
                 continue
-            if not any(self._told.values()):
+            if not any(self._findings.values()):
                 return
-            await asyncio.sleep(AGAIN)
+            await asyncio.sleep(RETRY_INTERVAL)
             await self._look_at_host()
 
     async def _look_at_host(self) -> None:
@@ -78,42 +78,42 @@ class SelfCheck:
         self._note(HOST, advertised_host(host, self._addresses, all_here))
 
     async def _all_here(self) -> bool:
-        """Whether the proxy is told of nobody outside but on loopback: a trial on one machine."""
+        """Whether the proxy knows of nobody outside but on loopback: a trial on one machine."""
         settings = self._runtime.settings
-        outside = [peer.host for peer in settings.ros2_peer] if settings.for_ros2 else []
+        hosts = [peer.host for peer in settings.ros2_peer] if settings.for_ros2 else []
         if settings.for_ros1:
             master = parse_authority(settings.master_uri)
-            outside += [settings.master_address or (master.host if master else "")]
-        found = [await resolve(host) or [host] for host in outside]
-        return bool(found) and all(any(map(is_loopback, each)) for each in found)
+            hosts += [settings.master_address or (master.host if master else "")]
+        resolved = [await resolve(host) or [host] for host in hosts]
+        return bool(resolved) and all(any(map(is_loopback, addresses)) for addresses in resolved)
 
     async def _try_range(self, or_fast: bool) -> RangeProbe:
         """Try ports of the range, and note what is wrong. Raises OSError if one was just taken."""
         async with self._probing:
             ros1, ros2 = self._ros1, self._ros2
-            found = RangeProbe()
+            probed = RangeProbe()
             if ros1:
-                found = await probe_range(ros1.context, ros1.leases, or_fast)
+                probed = await probe_range(ros1.context, ros1.leases, or_fast)
             if ros2:
-                found = RangeProbe((*found.probes, *await ros2.probe()))
+                probed = RangeProbe((*probed.probes, *await ros2.probe()))
         settings = self._runtime.settings
         ports = PortsStatus(str(settings.ports.listen), str(settings.ports.advertise))
-        if self._addresses:  # else it is told that the host's name leads nowhere
-            self._note(RANGE, published_range(found, settings.advertise_host, ports))
-        return found
+        if self._addresses:  # else the host's name is reported, which leads nowhere
+            self._note(RANGE, published_range(probed, settings.advertise_host, ports))
+        return probed
 
-    def _note(self, subject: str, found: Iterable[DoctorFinding]) -> None:
-        """Tell what is wrong, once for as long as it is."""
-        wrong = [one for one in found if one.severity >= Severity.WARNING]
-        before = self._told.get(subject, [])
-        self._told[subject] = wrong
-        self._runtime.metrics.setup_faults.set(sum(map(len, self._told.values())))
-        if wrong == before:
+    def _note(self, subject: str, findings: Iterable[DoctorFinding]) -> None:
+        """Report what is wrong, once for as long as it is."""
+        wrong = [f for f in findings if f.severity >= Severity.WARNING]
+        previous = self._findings.get(subject, [])
+        self._findings[subject] = wrong
+        self._runtime.metrics.setup_faults.set(sum(map(len, self._findings.values())))
+        if wrong == previous:
             return
         self._runtime.problems.solved(subject)
-        for one in wrong:
-            self._runtime.problems.add(subject, f"{one.text}: {one.fix}")
-            level = logging.ERROR if one.severity is Severity.ERROR else logging.WARNING
-            log.log(level, "%s: %s; %s", subject, one.text, one.fix)
-        if before and not wrong:
+        for finding in wrong:
+            self._runtime.problems.add(subject, f"{finding.text}: {finding.fix}")
+            level = logging.ERROR if finding.severity is Severity.ERROR else logging.WARNING
+            log.log(level, "%s: %s; %s", subject, finding.text, finding.fix)
+        if previous and not wrong:
             log.info("%s: nothing is wrong any more", subject)

@@ -15,7 +15,7 @@ import click
 
 LONGEST_FILE = 1024 * 1024
 """Bytes of the file that are read at most."""
-_NOT_THERE = frozenset({"config", "check", "deep", "once", "help", "version"})
+_COMMAND_LINE_ONLY = frozenset({"config", "check", "deep", "once", "help", "version"})
 """Options that say what is to be done now."""
 
 
@@ -29,42 +29,42 @@ def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any
             text = file.read(LONGEST_FILE + 1)
         if len(text) > LONGEST_FILE:
             raise ValueError(f"{path} is longer than {LONGEST_FILE} bytes")
-        given = tomllib.loads(text.decode())
+        table = tomllib.loads(text.decode())
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ValueError(f"{path} is no UTF-8 text") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ValueError(f'{path} is no TOML: {error}; write as port-range = "A-B"') from None
-    found = {}
-    for key, value in given.items():
+    values = {}
+    for key, value in table.items():
         option = options.get(key)
-        if option is None or key in _NOT_THERE:
+        if option is None or key in _COMMAND_LINE_ONLY:
             raise ValueError(f"{path}: {_unknown(key, options)}")
-        found[str(option.name)] = _value(f"{path}: {key}", value, option)
-    return found
+        values[str(option.name)] = _value(f"{path}: {key}", value, option)
+    return values
 
 
 def _unknown(key: str, options: Mapping[str, click.Option]) -> str:
-    near = difflib.get_close_matches(key.lower(), sorted({*options} - _NOT_THERE), 1)
+    near = difflib.get_close_matches(key.lower(), sorted({*options} - _COMMAND_LINE_ONLY), 1)
     hint = f"did you mean {near[0]}?" if near else "it takes the names of options, without --"
     return f"unknown key {key[:40]!r}; {hint}"
 
 
-def _value(what: str, value: Any, option: click.Option) -> Any:
+def _value(label: str, value: Any, option: click.Option) -> Any:
     """A value as the option takes it. Raises ValueError."""
     if option.is_flag:
         if not isinstance(value, bool):
-            raise ValueError(f"{what} must be true or false")
+            raise ValueError(f"{label} must be true or false")
         return value
     if isinstance(value, list):
         if not option.multiple:
-            raise ValueError(f"{what} takes one value, not a list")
-        return [_text(what, each) for each in value]
-    return [_text(what, value)] if option.multiple else _text(what, value)
+            raise ValueError(f"{label} takes one value, not a list")
+        return [_text(label, v) for v in value]
+    return [_text(label, value)] if option.multiple else _text(label, value)
 
 
-def _text(what: str, value: Any) -> str:
+def _text(label: str, value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise ValueError(f"{what} must be a text in quotes, or a number")
+        raise ValueError(f"{label} must be a text in quotes, or a number")
     return str(value)

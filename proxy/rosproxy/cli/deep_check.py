@@ -56,10 +56,10 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
         facts = replace(facts, master=master)
     try:
         facts = replace(facts, probe=await _try_ports(runtime, facts.advertised_addresses))
-    except SettingError as wrong:
+    except SettingError as failure:
         facts = replace(facts, probe=RangeProbe())
-        found = [one for one in rules.setup(facts) if one.check != "ports"]
-        return [*found, error("ports", "ports", str(wrong))]
+        findings = [f for f in rules.setup(facts) if f.check != "ports"]
+        return [*findings, error("ports", "ports", str(failure))]
     finally:
         await runtime.tasks.cancel()
     return list(rules.setup(facts))
@@ -72,8 +72,8 @@ async def _try_ports(runtime: Runtime, addresses: tuple[str, ...]) -> RangeProbe
         probes += await _try_tcp(runtime)
     if settings.for_ros2:
         probes += await _try_udp(runtime, addresses)
-    wanted = {"--master-port": settings.master_port, "--publish-master": settings.publish_master}
-    for option, port in wanted.items():
+    ports = {"--master-port": settings.master_port, "--publish-master": settings.publish_master}
+    for option, port in ports.items():
         if port and settings.for_ros1:
             with binding(option, f"port {port}"):
                 sockets.listen(settings.bind, port).close()
@@ -84,10 +84,10 @@ async def _try_ports(runtime: Runtime, addresses: tuple[str, ...]) -> RangeProbe
 
 async def _own_address(host: str) -> str:
     """Where to listen. Raises SettingError for a name that leads nowhere."""
-    found = await resolve(host)
-    if not found:
+    addresses = await resolve(host)
+    if not addresses:
         raise SettingError("--admin-bind", f"{host} can't be resolved here")
-    return found[0]
+    return addresses[0]
 
 
 async def _try_tcp(runtime: Runtime) -> tuple[PortProbe, ...]:
@@ -104,11 +104,11 @@ async def _try_udp(runtime: Runtime, addresses: tuple[str, ...]) -> tuple[PortPr
     """The first port of the range, where outside finds the domain."""
     settings = runtime.settings
     ports, taken = settings.ports, list[int]()
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         bound: dict[int, socket.socket] = {}
         for port in ports.listen.ports():
             try:
-                bound[port] = held.enter_context(datagrams.bind(settings.bind, port))
+                bound[port] = stack.enter_context(datagrams.bind(settings.bind, port))
             except OSError:
                 taken.append(port)
         tell_taken("2", settings, taken, runtime.problems)
@@ -122,8 +122,8 @@ async def _try_udp(runtime: Runtime, addresses: tuple[str, ...]) -> tuple[PortPr
             outcome = await try_udp(HostPort(addresses[0], ports.advertise.first), secret, heard)
         finally:
             loop.remove_reader(bound[first])
-    at = str(HostPort(settings.advertise_host, ports.advertise.first))
-    return (PortProbe(first, at, outcome, "unknown", "udp"),)
+    advertised = str(HostPort(settings.advertise_host, ports.advertise.first))
+    return (PortProbe(first, advertised, outcome, "unknown", "udp"),)
 
 
 def _listen_for(sock: socket.socket, secret: bytes, heard: asyncio.Event) -> None:

@@ -17,29 +17,29 @@ def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
     """A domain and its participants, with what they publish and serve."""
     yield ""
     yield from wrap(_summary(domain), columns, INDENT)
-    everybody = [*domain.inside, *domain.outside]
-    if not everybody:
+    participants = [*domain.inside, *domain.outside]
+    if not participants:
         yield "No participant has been heard yet."
         return
     sides = ["inside"] * len(domain.inside) + ["outside"] * len(domain.outside)
-    rows = [HEADING, *(_row(one, side) for one, side in zip(everybody, sides, strict=True))]
+    rows = [HEADING, *(_row(p, side) for p, side in zip(participants, sides, strict=True))]
     heading, *lines = table(rows, 4, max(columns - besides_first(rows), len(HEADING[0])))
     yield heading
-    for one, line in zip(everybody, lines, strict=True):
+    for participant, line in zip(participants, lines, strict=True):
         yield line
-        yield from _details(one, columns, domain.data_plane)
+        yield from _details(participant, columns, domain.data_plane)
 
 
 def _summary(domain: document.DomainStatus) -> str:
-    told = [f"peers {listed(map(clean, domain.peers))}"] if domain.peers else []
-    told += [f"ear {clean(domain.ear)}"] if domain.ear else []
-    found = "; ".join(told) or "neither peers nor an ear: outside is told of nobody"
+    targets = [f"peers {listed(map(clean, domain.peers))}"] if domain.peers else []
+    targets += [f"ear {clean(domain.ear)}"] if domain.ear else []
+    announced_to = "; ".join(targets) or "neither peers nor an ear: outside is told of nobody"
     ports = f"{domain.ports_used} ports used, {domain.ports_free} free"
     lost = f"; {domain.dropped} datagrams refused, {domain.lost} lost"
     trouble = lost if domain.dropped or domain.lost else ""
     plane = f"; user data {_plane(domain.data_plane)}" if domain.data_plane else ""
-    at = clean(domain.discovery)
-    return f"domain {domain.domain}: {found}; found at {at}; {ports}{plane}{trouble}"
+    discovery = clean(domain.discovery)
+    return f"domain {domain.domain}: {announced_to}; found at {discovery}; {ports}{plane}{trouble}"
 
 
 def _plane(plane: document.DataPlaneStatus) -> str:
@@ -48,47 +48,54 @@ def _plane(plane: document.DataPlaneStatus) -> str:
     return f"relayed by the proxy ({clean(plane.reason)})"
 
 
-def _row(one: document.ParticipantStatus, side: str) -> tuple[str, ...]:
+def _row(participant: document.ParticipantStatus, side: str) -> tuple[str, ...]:
     return (
-        clean(one.guid_prefix),
-        side if one.proven else f"{side}?",
-        clean(one.address),
-        clean(one.vendor),
-        *(str(len(names)) for names in (one.publishes, one.subscribes, one.services)),
-        str(len(one.leases)) if one.leases else "-",
-        size(sum(lease.bytes + lease.kernel_bytes for lease in one.leases)) if one.leases else "-",
-        f"{size(sum(lease.rate for lease in one.leases))}/s" if one.leases else "-",
+        clean(participant.guid_prefix),
+        side if participant.proven else f"{side}?",
+        clean(participant.address),
+        clean(participant.vendor),
+        *(
+            str(len(names))
+            for names in (participant.publishes, participant.subscribes, participant.services)
+        ),
+        str(len(participant.leases)) if participant.leases else "-",
+        size(sum(lease.bytes + lease.kernel_bytes for lease in participant.leases))
+        if participant.leases
+        else "-",
+        f"{size(sum(lease.rate for lease in participant.leases))}/s" if participant.leases else "-",
     )
 
 
 def _details(
-    one: document.ParticipantStatus, columns: int, plane: document.DataPlaneStatus | None
+    participant: document.ParticipantStatus, columns: int, plane: document.DataPlaneStatus | None
 ) -> Iterator[str]:
-    types = {each.name: each.type for each in one.types}
+    types = {t.name: t.type for t in participant.types}
 
     def typed(names: tuple[str, ...]) -> str:
         return GAP.join(clean(f"{name} {types.get(name, '')}".strip()) for name in names)
 
-    ports = (f"{lease.port} to {clean(lease.where)}" for lease in one.leases)
-    for word, text in (
-        ("publishes", typed(one.publishes)),
-        ("subscribes", typed(one.subscribes)),
-        ("services", GAP.join(map(clean, one.services))),
+    ports = (f"{lease.port} to {clean(lease.where)}" for lease in participant.leases)
+    for label, text in (
+        ("publishes", typed(participant.publishes)),
+        ("subscribes", typed(participant.subscribes)),
+        ("services", GAP.join(map(clean, participant.services))),
         ("ports", GAP.join(ports)),
-        ("kernel", _kernel(one) if plane and plane.plane == KERNEL else ""),
-        ("not shown", plural(one.left_out, "name") if one.left_out else ""),
+        ("kernel", _kernel(participant) if plane and plane.plane == KERNEL else ""),
+        ("not shown", plural(participant.left_out, "name") if participant.left_out else ""),
     ):
-        lead = f"{INDENT}{word:<11}"
+        lead = f"{INDENT}{label:<11}"
         yield from wrap(text, columns, " " * len(lead), lead, MOST_LINES)
 
 
-def _kernel(one: document.ParticipantStatus) -> str:
+def _kernel(participant: document.ParticipantStatus) -> str:
     """What the kernel forwards to a participant; which user data it does not, and why."""
-    forwarded = [lease for lease in one.leases if lease.plane == KERNEL]
+    forwarded = [lease for lease in participant.leases if lease.plane == KERNEL]
     ports = listed(str(lease.port) for lease in forwarded)
     datagrams = plural(sum(lease.kernel_datagrams for lease in forwarded), "datagram")
-    moved = f"{datagrams}, {size(sum(lease.kernel_bytes for lease in forwarded))} as IP packets"
-    kept = [lease for lease in one.leases if lease.kind == "data" and lease.plane != KERNEL]
-    told = [f"{moved}, to {ports}"] if forwarded else []
-    told += [f"{lease.port} not used: {clean(lease.reason)}" for lease in kept]
-    return "; ".join(told)
+    traffic = f"{datagrams}, {size(sum(lease.kernel_bytes for lease in forwarded))} as IP packets"
+    relayed = [
+        lease for lease in participant.leases if lease.kind == "data" and lease.plane != KERNEL
+    ]
+    notes = [f"{traffic}, to {ports}"] if forwarded else []
+    notes += [f"{lease.port} not used: {clean(lease.reason)}" for lease in relayed]
+    return "; ".join(notes)

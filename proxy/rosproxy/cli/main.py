@@ -250,11 +250,11 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **values: Any)
     with options.setting_errors():
         settings = make_settings(**values)
         logs.set_up(log_format, log_level)
-        remarks = options.unknown_variables(main)
+        unknown = options.unknown_variables(main)
         if not check:
             from rosproxy.app import proxy
 
-            proxy.run(settings, {one.name: one.text for one in remarks})
+            proxy.run(settings, {variable.name: variable.text for variable in unknown})
         else:
             _check(settings, deep)
 

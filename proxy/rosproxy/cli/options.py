@@ -98,7 +98,7 @@ class OneLineError(click.ClickException):
     exit_code = 2
 
     def __init__(self, error: click.UsageError, program: str) -> None:
-        super().__init__(_told(error))
+        super().__init__(_usage_text(error))
         self.program = program
 
     def show(self, file: Any = None) -> None:
@@ -111,20 +111,20 @@ class Shown(click.Command):
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Its options and arguments."""
-        found = super().get_params(ctx)
-        for each in found:
-            if isinstance(each, click.Option) and variables_of(each, ctx.auto_envvar_prefix):
-                each.show_envvar = True
-        return found
+        params = super().get_params(ctx)
+        for param in params:
+            if isinstance(param, click.Option) and variables_of(param, ctx.auto_envvar_prefix):
+                param.show_envvar = True
+        return params
 
 
 def variables_of(option: click.Option, prefix: str | None) -> list[str]:
     """The variables that an option is read from, of a command whose own begin with ``prefix``."""
     if option.envvar:
         return [option.envvar] if isinstance(option.envvar, str) else list(option.envvar)
-    told = prefix and option.allow_from_autoenv and option.expose_value
-    told = told or (prefix and option.name == "config")
-    return [f"{prefix}_{option.name}".upper().replace("-", "_")] if told else []
+    automatic = prefix and option.allow_from_autoenv and option.expose_value
+    automatic = automatic or (prefix and option.name == "config")
+    return [f"{prefix}_{option.name}".upper().replace("-", "_")] if automatic else []
 
 
 class Commands(Shown, click.Group):
@@ -180,32 +180,32 @@ def config_option(command: Command) -> Command:
 def _use_config(context: click.Context, option: click.Parameter, path: str | None) -> None:
     if path is None:
         return
-    known = [each for each in context.command.params if isinstance(each, click.Option)]
-    names = {name.removeprefix("--"): each for each in known for name in each.opts[:1]}
+    options = [o for o in context.command.params if isinstance(o, click.Option)]
+    option_by_name = {name.removeprefix("--"): o for o in options for name in o.opts[:1]}
     try:
-        context.default_map = read_config(path, names)
+        context.default_map = read_config(path, option_by_name)
     except ValueError as error:
         raise click.BadParameter(str(error), context, option) from None
 
 
 def unknown_variables(*groups: click.Command, log: bool = True) -> list[UnknownVariable]:
-    """The variables of this environment that no option of some programs reads; ``log``: tell."""
-    known = {name for group in groups for name in _known(group, None)}
-    found = variables.unknown(os.environ, known)
-    for one in found if log else ():
-        logging.getLogger(__name__).warning("%s %s", one.name, one.text)
-    return found
+    """The variables of this environment that no option of some programs reads; may log them."""
+    known_names = {name for group in groups for name in _variable_names(group, None)}
+    unknown = variables.unknown(os.environ, known_names)
+    for variable in unknown if log else ():
+        logging.getLogger(__name__).warning("%s %s", variable.name, variable.text)
+    return unknown
 
 
-def _known(command: click.Command, prefix: str | None) -> Iterator[str]:
+def _variable_names(command: click.Command, prefix: str | None) -> Iterator[str]:
     """The variables of a command and of those below it."""
     prefix = command.context_settings.get("auto_envvar_prefix", prefix)
-    for each in command.params:
-        if isinstance(each, click.Option):
-            yield from variables_of(each, prefix)
+    for param in command.params:
+        if isinstance(param, click.Option):
+            yield from variables_of(param, prefix)
     if isinstance(command, click.Group):
-        for name, below in command.commands.items():
-            yield from _known(below, f"{prefix}_{name}".upper() if prefix else None)
+        for name, subcommand in command.commands.items():
+            yield from _variable_names(subcommand, f"{prefix}_{name}".upper() if prefix else None)
 
 
 @contextlib.contextmanager
@@ -227,7 +227,7 @@ def _in_one_line(program: str) -> Iterator[None]:
         raise OneLineError(error, program) from None
 
 
-def _told(error: click.UsageError) -> str:
+def _usage_text(error: click.UsageError) -> str:
     """What is wrong, led by the option; an example if the option has a default."""
     option = error.param if isinstance(error, click.BadParameter) else None
     if not isinstance(option, click.Option):
@@ -237,5 +237,5 @@ def _told(error: click.UsageError) -> str:
         prefix = error.ctx.auto_envvar_prefix if error.ctx else None
         variable = option.envvar or f"{prefix}_{str(option.name).upper()}"
         return f"{name}: missing; give {option.help} ({variable})"
-    given = isinstance(option.default, int | float) and not isinstance(option.default, bool)
-    return f"{name}: {message}" + (f"; for example {option.default:g}" if given else "")
+    has_example = isinstance(option.default, int | float) and not isinstance(option.default, bool)
+    return f"{name}: {message}" + (f"; for example {option.default:g}" if has_example else "")

@@ -91,9 +91,9 @@ def _open_page(admin: Any) -> None:
     """Print where the live page is, and have a browser show it if there is one."""
     import webbrowser
 
-    where = admin.page()
-    click.echo(where)
-    webbrowser.open(where)
+    url = admin.page()
+    click.echo(url)
+    webbrowser.open(url)
 
 
 def _why_not_ready(admin: Any) -> str:
@@ -167,19 +167,19 @@ def doctor(
 
     if outside and not master_uri:
         raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
-    asked = collect(
+    collecting = collect(
         None if outside else admin,
         master_uri or "",
         advertise_host or "",
         tuple(f"/{name.strip('/')}" for name in names),
         master_address,
     )
-    remarks = options.unknown_variables(click.get_current_context().find_root().command, log=False)
-    found = rules.diagnose(asyncio.run(asked))
-    tell([*found, *(rules.unknown_variable(one.name, one.text) for one in remarks)], as_json)
+    unknown = options.unknown_variables(click.get_current_context().find_root().command, log=False)
+    findings = rules.diagnose(asyncio.run(collecting))
+    tell([*findings, *(rules.unknown_variable(v.name, v.text) for v in unknown)], as_json)
 
 
-def tell(found: Any, as_json: bool) -> NoReturn:
+def tell(diagnosis: Any, as_json: bool) -> NoReturn:
     """Print findings, and exit with 1 if something is wrong."""
     import json
 
@@ -188,10 +188,10 @@ def tell(found: Any, as_json: bool) -> NoReturn:
     from rosproxy.doctor import findings
 
     if as_json:
-        terminal.write(json.dumps(findings.as_json(found), indent=2))
+        terminal.write(json.dumps(findings.as_json(diagnosis), indent=2))
     else:
-        terminal.write(findings.render(found, terminal.size()[0]))
-    sys.exit(1 if failed(found) else 0)
+        terminal.write(findings.render(diagnosis, terminal.size()[0]))
+    sys.exit(1 if failed(diagnosis) else 0)
 
 
 def _or_exit(ask: Callable[[], object]) -> None:

@@ -55,11 +55,11 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     networks = listed(map(clean, settings.inside_networks)) or "none"
     inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
     if not settings.for_ros1:
-        inside = f"ROS 2, domain {listed(str(one.domain) for one in status.domains)}"
+        inside = f"ROS 2, domain {listed(str(domain.domain) for domain in status.domains)}"
     selected = f", {settings.selected} addresses selected" if settings.selected is not None else ""
     yield f"inside   {inside}, networks {networks}{selected}"
-    if ports := status.stand_ins:
-        yield f"outside  {_stand_ins(ports)}"
+    if stand_ins := status.stand_ins:
+        yield f"outside  {_stand_ins(stand_ins)}"
     if settings.publish_master:
         host = clean(settings.advertise_host)
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
@@ -79,8 +79,8 @@ def _ports(status: document.ProxyStatus) -> str:
     ports, host = status.ports, clean(status.settings.advertise_host)
     listen, advertise = clean(ports.listen), clean(ports.advertise)
     mapped = "" if advertise == listen else f", here {listen}"
-    by = "; ".join(map(clean, ports.held_by)) or "other programs"
-    blocked = f", {ports.blocked} held by {by}" if ports.blocked else ""
+    holders = "; ".join(map(clean, ports.held_by)) or "other programs"
+    blocked = f", {ports.blocked} held by {holders}" if ports.blocked else ""
     return f"{host}:{advertise}{mapped}: {ports.used} used, {ports.free} free{blocked}"
 
 
@@ -100,12 +100,12 @@ def _plane(plane: document.DataPlaneStatus) -> str:
     return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 
-def _stand_ins(ports: Sequence[document.StandInStatus]) -> str:
-    open_ones = plural(sum(port.connections for port in ports), "connection")
-    into = size(sum(port.received_rate for port in ports))
-    named = listed(f"{port.port} for {clean(port.uri)}" for port in ports)
-    count = plural(len(ports), "port")
-    return f"reached from inside at {count} ({open_ones}, {into}/s in): {named}"
+def _stand_ins(stand_ins: Sequence[document.StandInStatus]) -> str:
+    connections = plural(sum(stand_in.connections for stand_in in stand_ins), "connection")
+    into = size(sum(stand_in.received_rate for stand_in in stand_ins))
+    targets = listed(f"{stand_in.port} for {clean(stand_in.uri)}" for stand_in in stand_ins)
+    count = plural(len(stand_ins), "port")
+    return f"reached from inside at {count} ({connections}, {into}/s in): {targets}"
 
 
 def _nodes(status: document.ProxyStatus, columns: int, details: bool) -> Iterator[str]:
@@ -142,7 +142,7 @@ def _row(node: document.EndpointStatus) -> tuple[str, ...]:
         clean(node.address),
         _outside(node),
         clean(node.state),
-        *(str(len(each)) for each in (node.publishes, node.subscribes, node.services)),
+        *(str(len(registered)) for registered in (node.publishes, node.subscribes, node.services)),
         str(count),
         out,
         into,
@@ -154,16 +154,16 @@ def _outside(node: document.EndpointStatus) -> str:
 
 
 def _details(
-    node: document.EndpointStatus, whole: document.DataPlaneStatus | None, columns: int
+    node: document.EndpointStatus, data_plane: document.DataPlaneStatus | None, columns: int
 ) -> Iterator[str]:
-    for word, names in (
+    for label, names in (
         ("also", node.nodes[1:]),
         ("publishes", node.publishes),
         ("subscribes", node.subscribes),
         ("services", node.services),
         ("parameters", node.parameters),
     ):
-        yield from _detail(word, GAP.join(map(clean, names)), columns)
+        yield from _detail(label, GAP.join(map(clean, names)), columns)
     connections = node.connections
     for connection in connections[:MOST_CONNECTIONS]:
         yield from _detail("connected", _connection(connection), columns)
@@ -171,42 +171,44 @@ def _details(
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
     if node.left_out:
         yield from _detail("not shown", f"{node.left_out} more names and connections", columns)
-    yield from _detail("kernel", _kernel(node, whole), columns)
+    yield from _detail("kernel", _kernel(node, data_plane), columns)
 
 
-def _kernel(node: document.EndpointStatus, whole: document.DataPlaneStatus | None) -> str:
+def _kernel(node: document.EndpointStatus, data_plane: document.DataPlaneStatus | None) -> str:
     """What the kernel forwards for a node; why nothing, where it does for others."""
     plane = node.data_plane
-    if plane is None or whole is None or whole.plane != "kernel":
+    if plane is None or data_plane is None or data_plane.plane != "kernel":
         return ""
-    used = f"{plural(plane.connections, 'connection')} through port {plane.port}"
-    moved = f"{size(plane.sent)} out, {size(plane.received)} in as IP packets"
+    connections = f"{plural(plane.connections, 'connection')} through port {plane.port}"
+    traffic = f"{size(plane.sent)} out, {size(plane.received)} in as IP packets"
     if plane.plane == "kernel":
-        return f"{used}: {moved}"
+        return f"{connections}: {traffic}"
     return f"not used: {clean(plane.reason)}"
 
 
-def _detail(word: str, text: str, columns: int) -> list[str]:
-    lead = f"{INDENT}{word:<11}"
+def _detail(label: str, text: str, columns: int) -> list[str]:
+    lead = f"{INDENT}{label:<11}"
     return wrap(text, columns, " " * len(lead), lead, MOST_LINES)
 
 
 def _connection(connection: document.ConnectionStatus) -> str:
-    what = f"{clean(connection.kind)} {clean(connection.name)}"
-    who = f"{clean(connection.caller_id) or '?'} at {clean(connection.peer)}"
-    return f"{what} with {who}: {size(connection.sent)} out, {size(connection.received)} in"
+    subject = f"{clean(connection.kind)} {clean(connection.name)}"
+    peer = f"{clean(connection.caller_id) or '?'} at {clean(connection.peer)}"
+    return f"{subject} with {peer}: {size(connection.sent)} out, {size(connection.received)} in"
 
 
 def _hidden(status: document.ProxyStatus, columns: int) -> Iterator[str]:
     """What outside does not see, and by which rule."""
-    found = status.policy.hidden if status.policy else ()
-    if found:
+    hidden = status.policy.hidden if status.policy else ()
+    if hidden:
         yield from ("", "hidden from outside:")
-    for one in found[:MOST_HIDDEN]:
-        what = f"{clean(one.kind)} {clean(one.name)} of {clean(one.node)}"
-        yield from wrap(f"{what}  {clean(one.reason)}", columns, INDENT, "  ")
-    if len(found) > MOST_HIDDEN:
-        yield f"{INDENT}… {plural(len(found) - MOST_HIDDEN, 'name')} more: rosproxy status --json"
+    for registration in hidden[:MOST_HIDDEN]:
+        label = (
+            f"{clean(registration.kind)} {clean(registration.name)} of {clean(registration.node)}"
+        )
+        yield from wrap(f"{label}  {clean(registration.reason)}", columns, INDENT, "  ")
+    if len(hidden) > MOST_HIDDEN:
+        yield f"{INDENT}… {plural(len(hidden) - MOST_HIDDEN, 'name')} more: rosproxy status --json"
 
 
 def _problems(status: document.ProxyStatus, columns: int) -> Iterator[str]:

@@ -25,8 +25,8 @@ WATCH_INTERVAL = 2.0
 WIDTH_WITHOUT_TERMINAL = 120
 
 
-class _Words(RegexHighlighter):
-    """The words of our own that say how things are; groups are named for their looks."""
+class _StatusHighlighter(RegexHighlighter):
+    """Highlights words that say how things are; groups are named for their style."""
 
     highlights = (
         r"(?m)^(?P<bold>(NODE|PROXY|CONTAINER) .*)$",
@@ -84,4 +84,4 @@ def size() -> tuple[int, int | None]:
 def _console() -> Console:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    return Console(highlighter=_Words(), markup=False, emoji=False)
+    return Console(highlighter=_StatusHighlighter(), markup=False, emoji=False)

@@ -8,7 +8,7 @@ import msgspec
 
 _PREFIX = "ROSPROXY_"
 _NEAR, _VERY_NEAR = 0.5, 0.85
-"""How alike a name has to be: one that begins as ours do, and any other one of ROS's."""
+"""How alike a name has to be: one that begins as ours do, and any other that begins with ROS."""
 _SERVICE_LINK = re.compile(r"_SERVICE_(HOST|PORT(_\w+)?)$|_PORT_\d+_(TCP|UDP|SCTP)(_\w+)?$")
 """What Kubernetes and Docker set for a service of the name rosproxy, or one that begins so."""
 
@@ -26,24 +26,24 @@ class UnknownVariable(msgspec.Struct, frozen=True):
         return f"is no variable of rosproxy's and is ignored{hint}"
 
 
-def unknown(environment: Mapping[str, str], known: Collection[str]) -> list[UnknownVariable]:
+def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> list[UnknownVariable]:
     """The variables of an environment that look as if they were meant for an option."""
-    found = []
+    variables = []
     for name, value in sorted(environment.items()):
         upper, prefixed = name.upper(), name.upper().startswith(_PREFIX)
         linked = _SERVICE_LINK.search(upper) or (upper.endswith("_PORT") and "://" in value)
-        if name in known or linked or not upper.startswith("ROS"):
+        if name in known_names or linked or not upper.startswith("ROS"):
             continue
-        meant = _nearest(upper, known)
+        meant = _nearest(upper, known_names)
         if prefixed or meant:
-            found.append(UnknownVariable(name, meant))
-    return found
+            variables.append(UnknownVariable(name, meant))
+    return variables
 
 
-def _nearest(name: str, known: Collection[str]) -> str:
-    """The variable that is most like a name; what both begin with makes no names alike."""
+def _nearest(name: str, known_names: Collection[str]) -> str:
+    """The variable that is most like a name; that both begin with our prefix does not count."""
     if not name.startswith(_PREFIX):
-        return next(iter(difflib.get_close_matches(name, known, 1, _VERY_NEAR)), "")
-    own = {one.removeprefix(_PREFIX): one for one in known if one.startswith(_PREFIX)}
-    near = difflib.get_close_matches(name.removeprefix(_PREFIX), own, 1, _NEAR)
-    return own[near[0]] if near else ""
+        return next(iter(difflib.get_close_matches(name, known_names, 1, _VERY_NEAR)), "")
+    name_by_suffix = {n.removeprefix(_PREFIX): n for n in known_names if n.startswith(_PREFIX)}
+    matches = difflib.get_close_matches(name.removeprefix(_PREFIX), name_by_suffix, 1, _NEAR)
+    return name_by_suffix[matches[0]] if matches else ""

@@ -46,9 +46,9 @@ from rosproxy.ros1.registry.memory import NAMESPACE, lease_at
 from rosproxy.telemetry.metrics import Metrics
 
 PARALLEL = 32
-"""Questions under way at once; fewer than the look-ups of names that may be."""
+"""Questions under way at once; fewer than the look-ups of names that are allowed."""
 FEW_PARALLEL = 4
-"""The same where it goes on for as long as somebody looks."""
+"""The same for questions that are asked again and again."""
 WITHIN = 3.0
 """Seconds that a node has to answer."""
 
@@ -65,24 +65,24 @@ async def collect(
 ) -> DoctorFacts:
     """Ask everybody, and change nothing.
 
-    Without ``admin`` no proxy is asked: the look of an outside machine. What follows it is for the
-    case that it doesn't answer; ``master_address`` is the IP address at which the master's host is
-    reached whatever its name leads to.
+    Without ``admin`` no proxy is asked, as from an outside machine. ``master_uri``,
+    ``advertise_host`` and ``master_address`` count where the proxy doesn't answer; the last is the
+    IP address at which the master's host is reached, whatever its name leads to.
     """
-    found = await resolve(advertise_host) if advertise_host else ()
+    addresses = await resolve(advertise_host) if advertise_host else ()
     facts = DoctorFacts(
-        advertise_host=advertise_host, advertised_addresses=tuple(found), names=names
+        advertise_host=advertise_host, advertised_addresses=tuple(addresses), names=names
     )
     if admin is None:
-        return await _look_beyond(facts, master_uri)
+        return await _ask_graph(facts, master_uri)
     try:
-        return await _with_proxy(facts, admin)
+        return await _ask_proxy(facts, admin)
     except AdminError as error:
         facts = replace(facts, admin_error=str(error))
-        return await _look_beyond(facts, master_uri, master_address)
+        return await _ask_graph(facts, master_uri, master_address)
 
 
-async def _with_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
+async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     status = await asyncio.to_thread(admin.status)
     host, master = status.settings.advertise_host, status.master
     addresses = tuple(await resolve(host)) if host else ()
@@ -95,25 +95,25 @@ async def _with_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     )
     if status.domains:
         heard = await _survey(status)
-        status = await asyncio.to_thread(admin.status)  # who has started meanwhile is known now
+        status = await asyncio.to_thread(admin.status)  # by now it has heard those just started
         facts = replace(facts, heard=heard, status=status)
     address = master.address if master.pinned else None
     uri = master.uri if status.settings.for_ros1 else ""
-    beyond = asyncio.create_task(_look_beyond(facts, uri, address))
+    graph_task = asyncio.create_task(_ask_graph(facts, uri, address))
     probe, reason = None, ""
     try:
         probe = await asyncio.to_thread(admin.probe)
     except AdminError as error:
         reason = str(error)
-    return replace(await beyond, probe=probe, probe_error=reason, all_here=_all_here(status))
+    return replace(await graph_task, probe=probe, probe_error=reason, all_here=_all_here(status))
 
 
 def _all_here(status: ProxyStatus) -> bool:
     """Whether a proxy for ROS 2 alone has nobody outside but peers on loopback."""
-    told = [peer for domain in status.domains for peer in domain.peers]
-    peers = [where.host if (where := parse_host_port(peer)) else peer for peer in told]
+    peers = [peer for domain in status.domains for peer in domain.peers]
+    hosts = [target.host if (target := parse_host_port(peer)) else peer for peer in peers]
     ears = [domain.ear for domain in status.domains if domain.ear]
-    return not status.settings.for_ros1 and not ears and all(map(is_loopback, peers))
+    return not status.settings.for_ros1 and not ears and all(map(is_loopback, hosts))
 
 
 async def collect_running(
@@ -121,7 +121,7 @@ async def collect_running(
 ) -> DoctorFacts:
     """What may be asked again and again: the master, all nodes, and those that have the names.
 
-    ``choose`` tells the names from what the master knows. Nobody is asked to try the range, and few
+    ``choose`` picks the names from what the master knows. Nobody is asked to try the range, and few
     are asked at once. Nodes say, too, how much they have counted (``getBusStats``).
     """
     host, master = status.settings.advertise_host, status.master
@@ -132,7 +132,7 @@ async def collect_running(
         advertised_addresses=tuple(await resolve(host)),
     )
     uri = master.uri if status.settings.for_ros1 else ""
-    return await _look_beyond(facts, uri, master.address if master.pinned else None, choose)
+    return await _ask_graph(facts, uri, master.address if master.pinned else None, choose)
 
 
 async def look_at_master(uri: str, name: str, address: str | None) -> MasterFacts:
@@ -148,12 +148,12 @@ async def _survey(status: ProxyStatus) -> tuple[HeardParticipant, ...]:
     """Who is on the networks inside, each participant once."""
     domains = [domain.domain for domain in status.domains]
     networks = status.settings.inside_networks
-    asked = (asyncio.to_thread(ask_participants, network, domains) for network in networks)
-    found = {one.guid_prefix: one for answers in await asyncio.gather(*asked) for one in answers}
-    return tuple(found.values())
+    surveys = (asyncio.to_thread(ask_participants, network, domains) for network in networks)
+    by_prefix = {p.guid_prefix: p for answers in await asyncio.gather(*surveys) for p in answers}
+    return tuple(by_prefix.values())
 
 
-async def _look_beyond(
+async def _ask_graph(
     facts: DoctorFacts,
     uri: str,
     address: str | None = None,
@@ -200,15 +200,15 @@ class _Collector:
         if not addresses:
             return MasterFacts(uri, Attempt(Reach.UNRESOLVABLE))
         started = time.monotonic()
-        attempt, _ = await _tried(self._master.call_master("getPid"))
+        attempt, _ = await _attempt(self._master.call_master("getPid"))
         trip = time.monotonic() - started
         looped = "leads back to the proxy itself" in attempt.reason
-        found = MasterFacts(uri, attempt, addresses, looped=looped, round_trip=trip)
+        master = MasterFacts(uri, attempt, addresses, looped=looped, round_trip=trip)
         root = parse_slave_uri(uri)
         if attempt.reach is Reach.STRANGER and root and urlsplit(uri).path not in ("", "/"):
             at_root = await self._ask_pid(root)
-            found = replace(found, at_root=at_root.reach is Reach.ANSWERED)
-        return found
+            master = replace(master, at_root=at_root.reach is Reach.ANSWERED)
+        return master
 
     async def published_master(self, facts: DoctorFacts) -> Attempt:
         """Try the master as outside is offered it (``--publish-master``)."""
@@ -220,7 +220,7 @@ class _Collector:
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
-        _, leases = await _tried(self._master.call_master("getParam", NAMESPACE))
+        _, leases = await _attempt(self._master.call_master("getParam", NAMESPACE))
         nodes = {name: _node_facts(name, uris.get(name, ""), leases) for name in names}
         facts = replace(
             facts,
@@ -228,8 +228,8 @@ class _Collector:
             clock=await self._simulated_time(),
             service_uris=await self._master.look_up("lookupService", graph.services),
         )
-        tried = facts.scope.nodes if facts.names else names
-        nodes |= await _gather(tried, lambda name: self._try_node(facts, nodes[name]))
+        to_try = facts.scope.nodes if facts.names else names
+        nodes |= await _gather(to_try, lambda name: self._try_node(facts, nodes[name]))
         facts = replace(facts, nodes=nodes)
         if self._choose:
             facts = replace(facts, names=self._choose(graph))
@@ -238,75 +238,75 @@ class _Collector:
     async def _examine_named(self, facts: DoctorFacts) -> DoctorFacts:
         """Ask the nodes and services that the user named."""
         scope, nodes = facts.scope, facts.nodes
-        asked = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
-        facts = replace(facts, nodes={**nodes, **asked})
-        apart = {
-            (giver, topic)
-            for topic, giver, taker in scope.pairs
-            if not connected(topic, facts.nodes[giver], facts.nodes[taker])
+        asked_nodes = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
+        facts = replace(facts, nodes={**nodes, **asked_nodes})
+        unconnected = {
+            (publisher, topic)
+            for topic, publisher, subscriber in scope.pairs
+            if not connected(topic, facts.nodes[publisher], facts.nodes[subscriber])
         }
         return replace(
             facts,
-            data_ports=await _gather(apart, lambda one: self._try_data_port(facts, *one)),
+            data_ports=await _gather(unconnected, lambda pair: self._try_data_port(facts, *pair)),
             services=await _gather(scope.services, lambda name: self._try_service(facts, name)),
         )
 
     async def _simulated_time(self) -> bool:
-        _, said = await _tried(self._master.call_master("getParam", "/use_sim_time"))
-        return said in ("1", "true", 1)
+        _, answer = await _attempt(self._master.call_master("getParam", "/use_sim_time"))
+        return answer in ("1", "true", 1)
 
     async def _try_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """Try a node at its address; one behind this proxy is the proxy's to judge.
 
-        One at a port of this proxy's which nobody here holds may be behind another proxy that
-        advertises the same: it is tried there, and where it says that it is inside.
+        A node at a port of this proxy that no node here holds may be behind another proxy that
+        advertises the same: it is tried at that port, and at its address inside.
         """
-        where = node.where
-        if where is None or facts.lease(where):
+        slave = node.where
+        if slave is None or facts.lease(slave):
             return node
-        if facts.ours(where):
-            places = [where, *([node.inside] if node.inside else [])]
+        if facts.ours(slave):
+            targets = [slave, *([node.inside] if node.inside else [])]
             async with self._limit:
-                tries = [await self._ask_pid(place) for place in places]
-            found = next((one for one in tries if one.reach is Reach.ANSWERED), None)
-            return replace(node, attempt=found) if found else node
+                attempts = [await self._ask_pid(target) for target in targets]
+            answered = next((a for a in attempts if a.reach is Reach.ANSWERED), None)
+            return replace(node, attempt=answered) if answered else node
         async with self._limit:
-            addresses = tuple(await resolve(self._nodes.reach(where).host))
-            attempt = await self._ask_pid(where) if addresses else Attempt(Reach.UNRESOLVABLE)
+            addresses = tuple(await resolve(self._nodes.reach(slave).host))
+            attempt = await self._ask_pid(slave) if addresses else Attempt(Reach.UNRESOLVABLE)
         return replace(node, addresses=addresses, attempt=attempt)
 
-    async def _ask_pid(self, where: HostPort) -> Attempt:
-        attempt, pid = await _tried(self._nodes.call_node(where, WITHIN, "getPid"))
+    async def _ask_pid(self, target: HostPort) -> Attempt:
+        attempt, pid = await _attempt(self._nodes.call_node(target, WITHIN, "getPid"))
         if attempt.failed or isinstance(pid, int):
             return attempt
         return Attempt(Reach.STRANGER, "its answer is not a node's")
 
     async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """What a node says of itself, asked through the proxy if it is behind it."""
-        where, ask = _reached_at(facts, node.where), self._nodes.call_node
-        if where is None or node.attempt.failed:
+        slave, ask = _reached_at(facts, node.where), self._nodes.call_node
+        if slave is None or node.attempt.failed:
             return node
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
         try:
             async with self._limit:
-                topics, wanted, bus = [await ask(where, WITHIN, method) for method in methods]
+                pubs, subs, bus = [await ask(slave, WITHIN, method) for method in methods]
                 at = time.monotonic()
                 # Not every library counts; who does not is asked for nothing else.
-                _, stats = await _tried(ask(where, WITHIN, "getBusStats"))
+                _, stats = await _attempt(ask(slave, WITHIN, "getBusStats"))
         except (Unreachable, MasterError):
             return node
-        return replace(node, report=slave_report(topics, wanted, bus, stats, at))
+        return replace(node, report=slave_report(pubs, subs, bus, stats, at))
 
     async def _try_data_port(
         self, facts: DoctorFacts, publisher: str, topic: str
     ) -> tuple[str, Attempt]:
         """Where a publisher serves a topic, and whether a subscriber gets through to there."""
         node = facts.nodes[publisher]
-        where = _reached_at(facts, node.where)
-        if where is None or node.report is None:
+        slave = _reached_at(facts, node.where)
+        if slave is None or node.report is None:
             return "", Attempt()
-        attempt, answer = await _tried(
-            self._nodes.call_node(where, WITHIN, "requestTopic", topic, [["TCPROS"]])
+        attempt, answer = await _attempt(
+            self._nodes.call_node(slave, WITHIN, "requestTopic", topic, [["TCPROS"]])
         )
         target = data_port(answer)
         if attempt.failed:
@@ -320,38 +320,38 @@ class _Collector:
 
     async def _try_service(self, facts: DoctorFacts, service: str) -> Attempt:
         """Ask a service for its type, as rosservice does."""
-        named = parse_service_uri(facts.service_uris.get(service, ""))
-        if named is None:
+        provider = parse_service_uri(facts.service_uris.get(service, ""))
+        if provider is None:
             return Attempt(Reach.STRANGER, "no address")
-        where = _reached_at(facts, named)
-        if where is None:
+        target = _reached_at(facts, provider)
+        if target is None:
             return Attempt(Reach.REFUSED, "its port is not held by a node")
         header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
-        return await _shake_hands(self._nodes.reach(where), header)
+        return await _shake_hands(self._nodes.reach(target), header)
 
 
-def _reached_at(facts: DoctorFacts, where: HostPort | None) -> HostPort | None:
-    """Where to ask: behind this proxy at its own port, as that is reached without the host's NAT.
+def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
+    """Where to ask a target; one behind this proxy at the proxy's own port, past the host's NAT.
 
     None if no node holds that port.
     """
-    if not facts.ours(where):
-        return where
-    lease, admin = facts.lease(where), parse_host_port(facts.admin.removeprefix("http://"))
+    if not facts.ours(target):
+        return target
+    lease, admin = facts.lease(target), parse_host_port(facts.admin.removeprefix("http://"))
     if lease is None or admin is None:
         return None
     bound = facts.proxy.settings.bind
     return HostPort(admin.host if bound in ("0.0.0.0", "::") else bound, lease.port)
 
 
-async def _shake_hands(where: HostPort, header: Mapping[str, str]) -> Attempt:
+async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
     """Exchange TCPROS connection headers."""
-    addresses = await resolve(where.host)
+    addresses = await resolve(target.host)
     if not addresses:
         return Attempt(Reach.UNRESOLVABLE)
     try:
         async with asyncio.timeout(WITHIN):
-            reply = await _exchange(HostPort(addresses[0], where.port), header)
+            reply = await _exchange(HostPort(addresses[0], target.port), header)
     except (ConnectionError, EOFError):
         return Attempt(Reach.REFUSED)
     except OSError:
@@ -361,8 +361,8 @@ async def _shake_hands(where: HostPort, header: Mapping[str, str]) -> Attempt:
     return Attempt(Reach.STRANGER, reply["error"]) if "error" in reply else Attempt(Reach.ANSWERED)
 
 
-async def _exchange(where: HostPort, header: Mapping[str, str]) -> dict[str, str]:
-    reader, writer = await asyncio.open_connection(where.host, where.port)
+async def _exchange(target: HostPort, header: Mapping[str, str]) -> dict[str, str]:
+    reader, writer = await asyncio.open_connection(target.host, target.port)
     try:
         writer.write(encode_header(header))
         length = header_length(await reader.readexactly(4))
@@ -373,14 +373,14 @@ async def _exchange(where: HostPort, header: Mapping[str, str]) -> dict[str, str
 
 def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
     """A node as the master tells of it; ``leases`` is what all proxies remember there."""
-    where = parse_slave_uri(uri)
-    lease = lease_at(leases, where) if where else None
+    slave = parse_slave_uri(uri)
+    lease = lease_at(leases, slave) if slave else None
     inside = parse_inside_path(uri) or (lease.node if lease else None)
     return NodeFacts(name, uri, inside.slave if inside else None)
 
 
-async def _tried(question: Awaitable[Any]) -> tuple[Attempt, Any]:
-    """How a question ended: with a value, with nobody, or with who is no node or master."""
+async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
+    """How a question ended, and the answer, None unless a node or master gave one."""
     try:
         return Attempt(Reach.ANSWERED), await question
     except (Unreachable, MasterError) as error:

@@ -45,75 +45,75 @@ MOST_HEARD = 200
 def ask_participants(network: str, domains: Collection[int]) -> list[HeardParticipant]:
     """Who answers on a network, given as CIDR, if this machine is in it; takes WITHIN.
 
-    ``domains`` are those in which also they are asked who don't hear the group.
+    ``domains``: in these, participants that don't hear the group are asked as well.
     """
     with contextlib.suppress(ValueError, OSError):  # no network; gone, or without multicast
-        there = ip_network(network)
-        own = address_into(there)
-        if is_inside(own, (there,)):
-            return _ask(own, domains)
+        inside_network = ip_network(network)
+        own_address = address_into(inside_network)
+        if is_inside(own_address, (inside_network,)):
+            return _ask(own_address, domains)
     return []
 
 
 def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
-    """Who announces itself in a datagram; None if nobody does, or of no domain that can be told."""
+    """The participant that announces itself in a datagram; None without one or its domain."""
     try:
         message = read_discovery(datagram)
-        prefix, told = message.prefix, message.of_participant
+        prefix, announced = message.prefix, message.of_participant
         vendor = source_vendor(datagram)
     except RtpsError:
         return None
-    domain = _domain(told, datagram, source) if told and not told.ended else None
+    domain = _domain(announced, datagram, source) if announced and not announced.ended else None
     if domain is None:
         return None
-    one = Participant(prefix, source, vendor, 0.0)
-    return HeardParticipant(domain, one.guid_prefix, source, one.vendor_name)
+    participant = Participant(prefix, source, vendor, 0.0)
+    return HeardParticipant(domain, participant.guid_prefix, source, participant.vendor_name)
 
 
-def _ask(own: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """Those that answer on the network where this machine has an address. Raises OSError."""
-    found: dict[str, HeardParticipant] = {}
-    with contextlib.closing(datagrams.bind(own, 0)) as sock:
-        send_through(sock, own, loop=False)
-        prefix, targets = os.urandom(PREFIX), list(_targets(own, domains))
-        here = HostPort(own, sock.getsockname()[1])
-        _tell(sock, announcement(prefix, [here], LEASE, ANNOUNCES), targets)
-        ends = time.monotonic() + WITHIN
-        while len(found) < MOST_HEARD and (left := ends - time.monotonic()) > 0:
-            sock.settimeout(left)
+def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
+    """Who answers on the network where this machine has this address. Raises OSError."""
+    by_prefix: dict[str, HeardParticipant] = {}
+    with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
+        send_through(sock, own_address, loop=False)
+        prefix, targets = os.urandom(PREFIX), list(_targets(own_address, domains))
+        own_locator = HostPort(own_address, sock.getsockname()[1])
+        _send(sock, announcement(prefix, [own_locator], LEASE, ANNOUNCES), targets)
+        deadline = time.monotonic() + WITHIN
+        while len(by_prefix) < MOST_HEARD and (remaining := deadline - time.monotonic()) > 0:
+            sock.settimeout(remaining)
             with contextlib.suppress(TimeoutError):
                 datagram, sender = sock.recvfrom(datagrams.LARGEST)
-                one = heard_participant(datagram, plain_address(sender[0]))
-                found |= {one.guid_prefix: one} if one else {}
-        _tell(sock, farewell(prefix), targets)
-    return list(found.values())
+                participant = heard_participant(datagram, plain_address(sender[0]))
+                by_prefix |= {participant.guid_prefix: participant} if participant else {}
+        _send(sock, farewell(prefix), targets)
+    return list(by_prefix.values())
 
 
-def _targets(own: str, domains: Collection[int]) -> Iterator[tuple[str, int]]:
+def _targets(own_address: str, domains: Collection[int]) -> Iterator[tuple[str, int]]:
     for domain in range(DOMAINS):
-        for group in groups_of(own):
+        for group in groups_of(own_address):
             yield group, SPDP_MULTICAST + PORTS_PER_DOMAIN * domain
     for domain in domains:
         first = SPDP_UNICAST + PORTS_PER_DOMAIN * domain
         for port in range(first, min(first + 2 * PARTICIPANTS_TRIED, 65536), 2):
-            yield ALL_HOSTS[family_of(own)], port
+            yield ALL_HOSTS[family_of(own_address)], port
 
 
-def _tell(sock: socket.socket, datagram: bytes, targets: Iterable[tuple[str, int]]) -> None:
+def _send(sock: socket.socket, datagram: bytes, targets: Iterable[tuple[str, int]]) -> None:
     sock.settimeout(None)
     for target in targets:
         sock.sendto(datagram, target)
 
 
-def _domain(told: Announcement, datagram: bytes, source: str) -> int | None:
+def _domain(announced: Announcement, datagram: bytes, source: str) -> int | None:
     """The domain that a participant says it is in, or else that of its well-known port."""
-    said = traits(told, datagram, source).domain
-    if said is not None:
-        return said
+    domain = traits(announced, datagram, source).domain
+    if domain is not None:
+        return domain
     ports = (
-        where.port
-        for pid, where in told.reached_at(datagram)
-        if pid == Pid.METATRAFFIC_UNICAST_LOCATOR and where.port >= SPDP_MULTICAST
+        locator.port
+        for pid, locator in announced.reached_at(datagram)
+        if pid == Pid.METATRAFFIC_UNICAST_LOCATOR and locator.port >= SPDP_MULTICAST
     )
     port = next(ports, None)
     return None if port is None else (port - SPDP_MULTICAST) // PORTS_PER_DOMAIN

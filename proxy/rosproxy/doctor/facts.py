@@ -101,14 +101,14 @@ def _bus_counts(stats: Any) -> dict[tuple[str, str], dict[int, tuple[int, int]]]
     publications rospy has ``[id, bytes, messages, connected]``, roscpp ``[id, bytes, bytes of
     messages, messages, connected]`` (``Publication::getStats``).
     """
-    found: dict[tuple[str, str], dict[int, tuple[int, int]]] = {}
+    by_topic: dict[tuple[str, str], dict[int, tuple[int, int]]] = {}
     for direction, rows in zip("oi", _items(stats)[:2], strict=False):
         for row in _items(rows):
             match row:
                 case [str(topic), *_, list(connections)]:
-                    counts = found.setdefault((direction, topic), {})
-                    counts.update(filter(None, (_counts(one, direction) for one in connections)))
-    return found
+                    counts = by_topic.setdefault((direction, topic), {})
+                    counts.update(filter(None, (_counts(c, direction) for c in connections)))
+    return by_topic
 
 
 def _counts(row: Any, direction: str) -> tuple[int, tuple[int, int]] | None:
@@ -178,14 +178,14 @@ class SystemState(msgspec.Struct, frozen=True):
 
 def system_state(state: Any) -> SystemState:
     """The reply to ``getSystemState``: publishers, subscribers, services."""
-    found = SystemState()
-    tables = (found.publishers, found.subscribers, found.services)
+    system = SystemState()
+    tables = (system.publishers, system.subscribers, system.services)
     for table, rows in zip(tables, _items(state), strict=False):
         for row in _items(rows):
             match row:
                 case [str(name), list(nodes)]:
                     table[name] = [str(node) for node in nodes]
-    return found
+    return system
 
 
 class Scope(msgspec.Struct, frozen=True):
@@ -220,7 +220,7 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
         for topic in candidates
         for publisher in graph.publishers.get(topic, ())
         for subscriber in graph.subscribers.get(topic, ())
-        if _asked_for({publisher, subscriber}, {*nodes})
+        if _is_asked_for({publisher, subscriber}, {*nodes})
     ]
     lonely = [
         topic
@@ -228,16 +228,16 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
         if not (graph.publishers.get(topic) and graph.subscribers.get(topic))
         and (topics or {*nodes} & {*graph.sides(topic)})
     ]
-    known = {*nodes, *topics, *services}
-    unknown = [name for name in names if name not in known]
-    asked = {*nodes, *(node for name in services for node in graph.services[name])}
-    sides = {node for _, *both in pairs for node in both}
+    matched = {*nodes, *topics, *services}
+    unknown = [name for name in names if name not in matched]
+    asked_nodes = {*nodes, *(node for name in services for node in graph.services[name])}
+    sides = {node for _, *ends in pairs for node in ends}
     sides |= {node for topic in topics for node in graph.sides(topic)}
-    return Scope(nodes, pairs, lonely, services, unknown, frozenset(asked | sides))
+    return Scope(nodes, pairs, lonely, services, unknown, frozenset(asked_nodes | sides))
 
 
-def _asked_for(pair: set[str], nodes: set[str]) -> bool:
-    """Whether a publisher and a subscriber are among the nodes asked for; one will do for one."""
+def _is_asked_for(pair: set[str], nodes: set[str]) -> bool:
+    """Whether a pair is asked for: both its ends, or one of them if only one node is named."""
     return pair <= nodes if len(nodes) > 1 else nodes <= pair
 
 
@@ -299,16 +299,16 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def leases(self) -> dict[int, EndpointStatus]:
         """The nodes of ``status`` by the port that outside sees."""
-        found = ((parse_slave_uri(n.advertised_uri), n) for n in self.proxy.nodes)
-        return {where.port: node for where, node in found if where}
+        slaves = ((parse_slave_uri(n.advertised_uri), n) for n in self.proxy.nodes)
+        return {slave.port: node for slave, node in slaves if slave}
 
-    def lease(self, where: HostPort | None) -> EndpointStatus | None:
-        """Who is behind an address from the master, if this proxy gave it."""
-        return self.leases.get(where.port) if where and self.ours(where) else None
+    def lease(self, host_port: HostPort | None) -> EndpointStatus | None:
+        """The node behind an address from the master, if this proxy gave that address."""
+        return self.leases.get(host_port.port) if host_port and self.ours(host_port) else None
 
-    def ours(self, where: HostPort | None) -> bool:
+    def ours(self, host_port: HostPort | None) -> bool:
         """Whether an address from the master is one that this proxy gives to inside nodes."""
         first, _, last = self.proxy.ports.advertise.partition("-")
-        if where is None or not (first.isdecimal() and last.isdecimal()):
+        if host_port is None or not (first.isdecimal() and last.isdecimal()):
             return False
-        return where.host == self.advertise_host and int(first) <= where.port <= int(last)
+        return host_port.host == self.advertise_host and int(first) <= host_port.port <= int(last)

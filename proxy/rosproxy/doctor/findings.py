@@ -55,9 +55,9 @@ def _summary(findings: Sequence[DoctorFinding]) -> str:
     errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
     if not errors and not warnings:
         return "Nothing wrong was found."
-    told = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
-    worst = [one for one in findings if one.severity is max(severities)]
-    if len({one.fix for one in findings if one.severity >= Severity.WARNING}) == 1:
-        return told
+    counts = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
+    worst = [f for f in findings if f.severity is max(severities)]
+    if len({f.fix for f in findings if f.severity >= Severity.WARNING}) == 1:
+        return counts
     first = clean(worst[0].subject or worst[0].check)
-    return f"{told} Begin with {first}: the others may follow from it."
+    return f"{counts} Begin with {first}: the others may follow from it."

@@ -63,7 +63,7 @@ class DatagramRelay:
             raise
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._in, self._pass_on)
-        self._loop.add_reader(self._out, self._hear)
+        self._loop.add_reader(self._out, self._read_error)
 
     def close(self) -> None:
         """Stop, and let the port refuse."""
@@ -84,18 +84,18 @@ class DatagramRelay:
         except BlockingIOError:
             return
         except OSError as error:
-            self._note(error)
+            self._note_error(error)
 
-    def _hear(self) -> None:
+    def _read_error(self) -> None:
         """A target says nothing, except that it refuses."""
         try:
             self._out.recv(LARGEST)
         except BlockingIOError:
             return
         except OSError as error:
-            self._note(error)
+            self._note_error(error)
 
-    def _note(self, error: OSError) -> None:
+    def _note_error(self, error: OSError) -> None:
         """End if the target has refused; any other trouble of a network may pass."""
         log.debug("datagrams at port %d: %s", self.port, error)
         if isinstance(error, ConnectionRefusedError):

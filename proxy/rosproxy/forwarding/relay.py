@@ -90,12 +90,12 @@ class Relay:
         for sock in (self.outside, self.inside):
             _prepare(sock)
         client = self.inside if self.inside_asks else self.outside
-        asked, answer = (0, 1) if self.inside_asks else (1, 0)
-        if self._start_direction(answer, finished):
+        request, reply = (0, 1) if self.inside_asks else (1, 0)
+        if self._start_direction(reply, finished):
             if self.kind == "topic":
-                when_readable(client, lambda: self._start_direction(asked, finished, second=True))
+                when_readable(client, lambda: self._start_direction(request, finished, second=True))
             else:
-                self._start_direction(asked, finished, second=True)
+                self._start_direction(request, finished, second=True)
 
     def end(self) -> None:
         """End both directions; ``finished`` is called when that is done."""
@@ -105,12 +105,12 @@ class Relay:
 
     def sample(self, now: float) -> None:
         """Compute the rates since the last sample; ``now`` is in seconds."""
-        before, sent, received = self._sampled
+        sampled_at, sent, received = self._sampled
         self._sampled = (now, self.sent, self.received)
-        if before and now > before:
-            passed = now - before
-            self.sent_rate = round((self.sent - sent) / passed, 1)
-            self.received_rate = round((self.received - received) / passed, 1)
+        if sampled_at and now > sampled_at:
+            elapsed = now - sampled_at
+            self.sent_rate = round((self.sent - sent) / elapsed, 1)
+            self.received_rate = round((self.received - received) / elapsed, 1)
 
     def _start_direction(self, index: int, finished: Finished, second: bool = False) -> bool:
         """Whether the direction could be started; if not, both sides are reset.
@@ -127,8 +127,8 @@ class Relay:
             self.failed = True
             if second:
                 self._pass_reset_on(index)
-            for left in (index,) if second else (0, 1):
-                self._finish(left, finished)
+            for direction in (index,) if second else (0, 1):
+                self._finish(direction, finished)
             return False
         return True
 
@@ -238,9 +238,9 @@ class _Pump:
         source, target = self._source.fileno(), self._target.fileno()
         splice, count = os.splice, self._count
         while True:
-            size = left = splice(source, write_end, PIPE_SIZE)
-            while left:
-                left -= splice(read_end, target, left)
+            size = remaining = splice(source, write_end, PIPE_SIZE)
+            while remaining:
+                remaining -= splice(read_end, target, remaining)
             count(size)
             if size < COPY_SIZE:
                 return size > 0
@@ -291,10 +291,10 @@ class _Crowd:
             self._pumps.add(pump)
             size = len(self._pumps)
             # All have to share when the crowd comes about, then each new one.
-            sharing = list(self._pumps) if size == CROWD + 1 else [pump] * (size > CROWD)
+            sharers = list(self._pumps) if size == CROWD + 1 else [pump] * (size > CROWD)
         try:
-            for one in sharing:
-                one.share_memory()
+            for sharer in sharers:
+                sharer.share_memory()
             yield size
         finally:
             with self._lock:

@@ -22,9 +22,9 @@ class OpenRelays:
 
     def __init__(self) -> None:
         self._open: set[Relay] = set()
-        self._quiet: _Quiet | None = None
-        self._none = asyncio.Event()
-        self._none.set()
+        self._quiet_sockets: _QuietSockets | None = None
+        self._none_open = asyncio.Event()
+        self._none_open.set()
 
     def __iter__(self) -> Iterator[Relay]:
         """All open relays; safe against changes while iterating."""
@@ -37,18 +37,18 @@ class OpenRelays:
     def start(self, relay: Relay, ended: Callable[[Relay], None]) -> None:
         """Start a relay; ``ended`` is called in the event loop when it has ended."""
         loop = asyncio.get_running_loop()
-        if self._quiet is None:
-            self._quiet = _Quiet(loop)
+        if self._quiet_sockets is None:
+            self._quiet_sockets = _QuietSockets(loop)
         self._open.add(relay)
-        self._none.clear()
+        self._none_open.clear()
 
-        def finished(done: Relay) -> None:
+        def finished(ended_relay: Relay) -> None:
             try:
-                loop.call_soon_threadsafe(self._finish, done, ended)
+                loop.call_soon_threadsafe(self._finish, ended_relay, ended)
             except RuntimeError:
                 log.debug("the event loop has ended before a relay")
 
-        relay.start(finished, self._quiet.when_readable)
+        relay.start(finished, self._quiet_sockets.when_readable)
 
     async def stop(self) -> None:
         """End all of them."""
@@ -56,19 +56,19 @@ class OpenRelays:
             relay.end()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STOP_TIMEOUT):
-                await self._none.wait()
-        if self._quiet is not None:
-            self._quiet.close()
-            self._quiet = None
+                await self._none_open.wait()
+        if self._quiet_sockets is not None:
+            self._quiet_sockets.close()
+            self._quiet_sockets = None
 
     def _finish(self, relay: Relay, ended: Callable[[Relay], None]) -> None:
         self._open.discard(relay)
         if not self._open:
-            self._none.set()
+            self._none_open.set()
         ended(relay)
 
 
-class _Quiet:
+class _QuietSockets:
     """Sockets that have nothing to say yet.
 
     The loop sees one descriptor for all of them: libuv makes non-blocking what it watches, and

@@ -139,12 +139,12 @@ def give_back(pool: PortPool, endpoint: LeaseHolder, blocked: bool = False) -> N
 
 
 def to_give_back(holders: Iterable[_H]) -> _H | None:
-    """Whose fast port goes first when the range is short: where the fewest connections are.
+    """The holder that loses its fast port first when the range is short: with fewest connections.
 
     Those go on all the same: the kernel keeps forwarding what it has begun to forward.
     """
-    found = [endpoint for endpoint in holders if endpoint.fast_port is not None]
-    return min(found, key=lambda e: e.fast_connections, default=None)
+    candidates = [endpoint for endpoint in holders if endpoint.fast_port is not None]
+    return min(candidates, key=lambda e: e.fast_connections, default=None)
 
 
 def why_none(pool: PortPool, endpoint: LeaseHolder) -> str:

@@ -107,11 +107,11 @@ class Leases(Generic[_H]):
     async def retry_blocked(self) -> None:
         """Take in ports of the range that other programs have let go."""
         pool = self._holders.pool
-        before = sorted(pool.blocked)
-        for port in filter(self._reserve, before):
+        blocked = sorted(pool.blocked)
+        for port in filter(self._reserve, blocked):
             pool.unblock(port)
             log.info("port %d of the range is free now", port)
-        if before and not pool.blocked:
+        if blocked and not pool.blocked:
             self._problems.solved(RANGE_OPTION)
 
     def is_open(self, endpoint: _H) -> bool:
@@ -133,7 +133,7 @@ class Leases(Generic[_H]):
     def close(self, endpoint: _H) -> None:
         """Let an endpoint's ports refuse, if it still holds the lease; open connections stay.
 
-        What somebody waited for may tell of a node whose port is another's by now.
+        The port may be another node's by now: callers may have waited for something meanwhile.
         """
         if self._holders.by_port.get(endpoint.port) is not endpoint:
             return
@@ -203,9 +203,9 @@ class Leases(Generic[_H]):
     ) -> AsyncIterator[int | None]:
         """A port that no node needs meanwhile, on which a handler serves; None if there is none.
 
-        It is the first in an order that is free, ``or_fast`` else a fast port: whose that was gets
-        it again when a subscriber next asks. It is taken back where a node needs it (`is_lent`).
-        Raises OSError if another program took it meanwhile.
+        It is the first in an order that is free, with ``or_fast`` else a fast port, whose holder
+        gets it again when a subscriber next asks. It is taken back where a node needs it
+        (`is_lent`). Raises OSError if another program took it meanwhile.
         """
         pool = self._holders.pool
         port = next(filter(pool.claim, order), None)

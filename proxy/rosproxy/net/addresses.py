@@ -20,14 +20,14 @@ _HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
 
 
 def cached(read: Callable[[str], _T]) -> Callable[[str], _T]:
-    """Remember what short texts mean: those of a graph come with every call, and anybody's too."""
+    """Cache how short texts are read: those of a graph come with every call, and anybody's, too."""
     remembered = lru_cache(_MOST_CACHED)(read)
 
     @wraps(read)
-    def reading(text: str) -> _T:
+    def cached_read(text: str) -> _T:
         return remembered(text) if len(text) <= _LONGEST_CACHED else read(text)
 
-    return reading
+    return cached_read
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +104,11 @@ def parse_address(text: str) -> str | None:
 def parse_authority(uri: str) -> HostPort | None:
     """Host and port of a URI of any scheme, or None if it has no valid port or no host."""
     try:
-        parts = urlsplit(uri)
-        port = parts.port
+        split_uri = urlsplit(uri)
+        port = split_uri.port
     except ValueError:
         return None
-    host = parts.netloc.rpartition(":")[0].removeprefix("[").removesuffix("]")
+    host = split_uri.netloc.rpartition(":")[0].removeprefix("[").removesuffix("]")
     return HostPort(host, port) if port and _HOST.fullmatch(host) else None
 
 

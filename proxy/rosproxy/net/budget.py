@@ -13,29 +13,29 @@ class OverBudget(Exception):
 
 
 class Budget:
-    """At most ``most`` at once, of which a source has at most ``share``; ``what`` names it."""
+    """At most ``most`` at once, of which a source has at most ``share``; ``unit`` names them."""
 
-    def __init__(self, most: int, share: int, what: str) -> None:
-        self.most, self._share, self._what = most, share, what
+    def __init__(self, most: int, share: int, unit: str) -> None:
+        self.most, self._share, self._unit = most, share, unit
         self._held: dict[str, int] = {}
         self.used = 0
 
     def take(self, source: str, size: int) -> None:
         """Take so much for a source. Raises OverBudget, and takes nothing."""
         if self.used + size > self.most:
-            raise OverBudget(f"more than {self.most} {self._what} at once; try again")
-        held = self._held.get(source, 0) + size
-        if held > self._share:
-            raise OverBudget(f"more than {self._share} {self._what} at once from {source}")
+            raise OverBudget(f"more than {self.most} {self._unit} at once; try again")
+        total = self._held.get(source, 0) + size
+        if total > self._share:
+            raise OverBudget(f"more than {self._share} {self._unit} at once from {source}")
         self.used += size
-        self._held[source] = held
+        self._held[source] = total
 
     def give(self, source: str, size: int) -> None:
         """Give back what was taken."""
         self.used -= size
-        left = self._held.get(source, 0) - size
-        if left:
-            self._held[source] = left
+        remaining = self._held.get(source, 0) - size
+        if remaining:
+            self._held[source] = remaining
         else:
             self._held.pop(source, None)
 

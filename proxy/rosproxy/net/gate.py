@@ -19,15 +19,15 @@ SHARE = 4
 """Of the file descriptors that the process may open a source gets one in so many connections: a
 connection that is relayed takes two, and up to four more while bulk flows."""
 
-Told = Callable[[str, str, str], None]
-"""Told of each refusal: its reason in one word, the source, and a text."""
+NoteRefusal = Callable[[str, str, str], None]
+"""Gets the reason of each refusal in one word, the source, and a text."""
 
 
 class Gate:
     """Counts connections and says which are too many."""
 
-    def __init__(self, per_source: int, per_port: int, told: Told) -> None:
-        self.per_source, self._per_port, self._told = per_source, per_port, told
+    def __init__(self, per_source: int, per_port: int, note_refusal: NoteRefusal) -> None:
+        self.per_source, self._per_port, self._note_refusal = per_source, per_port, note_refusal
         self._by_source: Counter[str] = Counter()
         self._by_port: Counter[int] = Counter()
         self._waiting: dict[str, dict[int, Callable[[], None]]] = {}
@@ -41,12 +41,12 @@ class Gate:
         """Whether another connection may come in; makes room if one of the source waits."""
         if self._by_port[port] >= self._per_port:
             text = f"port {port} has {self._per_port} connections (--max-connections-per-lease)"
-            self._told("connections_per_lease", source, text)
+            self._note_refusal("connections_per_lease", source, text)
             return False
         if self._by_source[source] < self.per_source:
             return True
         text = f"{self.per_source} connections from one source (--max-connections-per-source)"
-        self._told("connections_per_source", source, text)
+        self._note_refusal("connections_per_source", source, text)
         return self._end_oldest(source)
 
     def enter(self, source: str, port: int) -> None:
@@ -64,14 +64,14 @@ class Gate:
             del self._by_port[port]
 
     def wait(self, source: str, end: Callable[[], None]) -> Callable[[], None]:
-        """Note a connection that has said nothing yet and can be ended so.
+        """Note a connection that has said nothing yet; ``end`` ends it.
 
         Returns what is to be called when it has spoken, or is gone.
         """
-        number, others = next(self._numbers), self._waiting.setdefault(source, {})
-        if len(others) >= WAITING:
+        number, connections = next(self._numbers), self._waiting.setdefault(source, {})
+        if len(connections) >= WAITING:
             text = f"{WAITING} connections from one source that say nothing"
-            self._told("silent_connections", source, text)
+            self._note_refusal("silent_connections", source, text)
             self._end_oldest(source)
         self._waiting.setdefault(source, {})[number] = end
 

@@ -52,8 +52,8 @@ class LongBody(Protocol):
 class LongReply:
     """A reply's body that is passed on piece by piece; `close` it in any case."""
 
-    def __init__(self, size: int, stream: aiohttp.StreamReader, done: Callable[[], None]) -> None:
-        self.size, self._stream, self._done = size, stream, done
+    def __init__(self, size: int, stream: aiohttp.StreamReader, finish: Callable[[], None]) -> None:
+        self.size, self._stream, self._finish = size, stream, finish
 
     async def pieces(self) -> AsyncIterator[bytes]:
         """The pieces, once. Raises aiohttp.ClientError, TimeoutError."""
@@ -66,7 +66,7 @@ class LongReply:
 
     def close(self) -> None:
         """Let the connection go: it is kept if all was read."""
-        self._done()
+        self._finish()
 
 
 class HttpClient:
@@ -100,7 +100,7 @@ class HttpClient:
 
     async def post(
         self,
-        where: HostPort,
+        peer: HostPort,
         path: str,
         host: str,
         body: bytes,
@@ -115,11 +115,11 @@ class HttpClient:
         """
         head = self._head(path, host, len(body))
         async with asyncio.timeout(within), self._limit:
-            handler, stream, _ = await self._ask(where, head, body)
-            return await self._whole(where, handler, stream, longest or self._longest)
+            handler, stream, _ = await self._ask(peer, head, body)
+            return await self._read_whole(peer, handler, stream, longest or self._longest)
 
     async def pass_on(
-        self, where: HostPort, path: str, host: str, body: bytes | LongBody, within: float
+        self, peer: HostPort, path: str, host: str, body: bytes | LongBody, within: float
     ) -> bytes | LongReply:
         """The same for a reply that nobody here reads: if it is long, it comes piece by piece.
 
@@ -130,16 +130,16 @@ class HttpClient:
         if isinstance(body, bytes):
             head = self._head(path, host, len(body))
             async with asyncio.timeout(within), self._limit:
-                return await self._passing(where, *await self._ask(where, head, body))
+                return await self._pass_reply(peer, *await self._ask(peer, head, body))
         head = self._head(path, host, body.size)
         async with asyncio.timeout(within):
-            handler = await self._connect(where)
+            handler = await self._connect(peer)
         self._used.add(handler)
         try:
             async with asyncio.timeout(LONG_TIMEOUT):
                 await _upload(handler, head, body)
             async with asyncio.timeout(within):
-                return await self._passing(where, handler, *await _answer(handler))
+                return await self._pass_reply(peer, handler, *await _answer(handler))
         except BaseException:
             self._drop(handler)
             raise
@@ -153,7 +153,7 @@ class HttpClient:
         self._closed = True
         if self._sweeper is not None:
             self._sweeper.cancel()
-        for handler in [*self._used, *(one for idle in self._idle.values() for _, one in idle)]:
+        for handler in [*self._used, *(h for idle in self._idle.values() for _, h in idle)]:
             handler.close()
         self._idle.clear()
         await self.late.end()
@@ -161,26 +161,26 @@ class HttpClient:
 
     def leave(self, sock: socket.socket) -> None:
         """Close a connection that is not of this client once it has its answer."""
-        self.late.wait(partial(_rest, sock), sock.close)
+        self.late.wait(partial(_drain, sock), sock.close)
 
     def _head(self, path: str, host: str, size: int) -> bytes:
         if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
             raise ValueError(f"{host}{path} can't be asked for")
-        first = f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
-        return f"{first}{self._headers}Content-Length: {size}\r\n\r\n".encode()
+        start = f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
+        return f"{start}{self._headers}Content-Length: {size}\r\n\r\n".encode()
 
     async def _ask(
-        self, where: HostPort, head: bytes, body: bytes
+        self, peer: HostPort, head: bytes, body: bytes
     ) -> tuple[ResponseHandler, aiohttp.StreamReader, int | None]:
         """Send a request and wait for a response: its connection, body and length."""
-        kept = self._take(where)
+        kept = self._take(peer)
         if kept is not None:
             try:
                 return kept, *await self._exchange(kept, head, body)
             except (aiohttp.ClientError, ConnectionError) as error:
                 if not _was_closed(error):
                     raise
-        handler = await self._connect(where)
+        handler = await self._connect(peer)
         return handler, *await self._exchange(handler, head, body)
 
     async def _exchange(
@@ -196,54 +196,54 @@ class HttpClient:
             return await _answer(handler)
         except asyncio.CancelledError:  # too late, or nobody wants it any more
             self._used.discard(handler)
-            self.late.wait(partial(_late_answer, handler), handler.close)
+            self.late.wait(partial(_drain_answer, handler), handler.close)
             raise
         except BaseException:
             self._drop(handler)
             raise
 
-    async def _whole(
-        self, where: HostPort, handler: ResponseHandler, stream: aiohttp.StreamReader, longest: int
+    async def _read_whole(
+        self, peer: HostPort, handler: ResponseHandler, stream: aiohttp.StreamReader, longest: int
     ) -> bytes:
         try:
             reply = await read_bounded(stream, longest)
         except BaseException:
             self._drop(handler)
             raise
-        self._finish(where, handler)
+        self._finish(peer, handler)
         return reply
 
-    async def _passing(
+    async def _pass_reply(
         self,
-        where: HostPort,
+        peer: HostPort,
         handler: ResponseHandler,
         stream: aiohttp.StreamReader,
         size: int | None,
     ) -> bytes | LongReply:
         if size is None or size <= LONG:
-            return await self._whole(where, handler, stream, self._longest)
+            return await self._read_whole(peer, handler, stream, self._longest)
         if size > self._longest:
             self._drop(handler)
             raise TooLong(self._longest)
-        return LongReply(size, stream, partial(self._finish, where, handler))
+        return LongReply(size, stream, partial(self._finish, peer, handler))
 
     def _drop(self, handler: ResponseHandler) -> None:
         self._used.discard(handler)
         handler.close()
 
-    def _finish(self, where: HostPort, handler: ResponseHandler) -> None:
+    def _finish(self, peer: HostPort, handler: ResponseHandler) -> None:
         self._used.discard(handler)
-        self._keep(where, handler)
+        self._keep(peer, handler)
 
-    async def _connect(self, where: HostPort) -> ResponseHandler:
-        """A new connection; never redirected or led elsewhere than to ``where``."""
+    async def _connect(self, peer: HostPort) -> ResponseHandler:
+        """A new connection; never redirected or led elsewhere than to ``peer``."""
         if self._closed:
             raise ConnectionAbortedError("the proxy is stopping")
         loop = asyncio.get_running_loop()
-        failure = OSError(None, f"host name {where.host} can't be resolved")
-        for address in await resolver.resolve(where.host, self._source):
+        failure = OSError(None, f"host name {peer.host} can't be resolved")
+        for address in await resolver.resolve(peer.host, self._source):
             try:
-                sock = await dial(HostPort(address, where.port), CONNECT_TIMEOUT)
+                sock = await dial(HostPort(address, peer.port), CONNECT_TIMEOUT)
             except OSError as error:
                 failure = error
                 continue
@@ -252,9 +252,9 @@ class HttpClient:
             return handler
         raise failure
 
-    def _take(self, where: HostPort) -> ResponseHandler | None:
+    def _take(self, peer: HostPort) -> ResponseHandler | None:
         """The connection that was used last, if one is left that can still be used."""
-        idle = self._idle.get(where, [])
+        idle = self._idle.get(peer, [])
         while idle:
             _, handler = idle.pop()
             if handler.is_connected() and not handler.should_close:
@@ -262,24 +262,24 @@ class HttpClient:
             handler.close()
         return None
 
-    def _keep(self, where: HostPort, handler: ResponseHandler) -> None:
+    def _keep(self, peer: HostPort, handler: ResponseHandler) -> None:
         if handler.should_close or not handler.is_connected() or self._closed:
             handler.close()
             return
         loop = asyncio.get_running_loop()
-        self._idle.setdefault(where, []).append((loop.time(), handler))
+        self._idle.setdefault(peer, []).append((loop.time(), handler))
         if self._sweeper is None:
             self._sweeper = loop.call_later(self._keepalive, self._sweep)
 
     def _sweep(self) -> None:
         """Close what was not used for long."""
         loop = asyncio.get_running_loop()
-        before, self._sweeper = loop.time() - self._keepalive, None
-        for where, idle in self._idle.items():
-            for _, handler in (old for old in idle if old[0] <= before):
+        expiry, self._sweeper = loop.time() - self._keepalive, None
+        for peer, idle in self._idle.items():
+            for _, handler in (pair for pair in idle if pair[0] <= expiry):
                 handler.close()
-            self._idle[where] = [one for one in idle if one[0] > before]
-        self._idle = {where: idle for where, idle in self._idle.items() if idle}
+            self._idle[peer] = [pair for pair in idle if pair[0] > expiry]
+        self._idle = {peer: idle for peer, idle in self._idle.items() if idle}
         if self._idle:
             self._sweeper = loop.call_later(self._keepalive / 2, self._sweep)
 
@@ -307,16 +307,16 @@ async def read_bounded(
 
     Raises TooLong, and what ``hold`` raises.
     """
-    parts, size = list[bytes](), 0
+    chunks, size = list[bytes](), 0
     while not stream.at_eof():
-        part = stream.read_nowait() if stream.is_eof() else await stream.readany()
-        size += len(part)
+        chunk = stream.read_nowait() if stream.is_eof() else await stream.readany()
+        size += len(chunk)
         if size > longest:
             raise TooLong(longest)
         if hold is not None:
-            hold(len(part))
-        parts.append(part)
-    return parts[0] if len(parts) == 1 else b"".join(parts)
+            hold(len(chunk))
+        chunks.append(chunk)
+    return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
 
 def _expect(handler: ResponseHandler) -> None:
@@ -349,13 +349,13 @@ async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int |
     return payload, int(length) if length else None
 
 
-async def _late_answer(handler: ResponseHandler) -> None:
+async def _drain_answer(handler: ResponseHandler) -> None:
     stream, _ = await _answer(handler)
     while not stream.at_eof():
         await stream.readany()
 
 
-async def _rest(sock: socket.socket) -> None:
+async def _drain(sock: socket.socket) -> None:
     """Take all that comes on a connection until it is ended."""
     while await asyncio.get_running_loop().sock_recv(sock, LONG):
         pass

@@ -50,7 +50,7 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
 
     ``without_uplink``: nor those of the interface with the default route, if there are others.
     """
-    found: dict[str, list[Network]] = {}
+    by_interface: dict[str, list[Network]] = {}
     uplink = ""
     for line in _lines("/proc/net/route")[1:]:
         interface, target, gateway, *_, mask = line.split()[:8]
@@ -58,16 +58,16 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
             uplink = interface
         elif interface != "lo" and gateway == "00000000":
             network = ip_network(f"{_quad(target)}/{_quad(mask)}", strict=False)
-            found.setdefault(interface, []).append(network)
+            by_interface.setdefault(interface, []).append(network)
     for line in _lines("/proc/net/if_inet6"):
         digits, _, prefix, _, _, interface = line.split()
         address = ip_address(bytes.fromhex(digits))
         if interface != "lo" and not address.is_link_local:
             network = ip_network(f"{address}/{int(prefix, 16)}", strict=False)
-            found.setdefault(interface, []).append(network)
-    if without_uplink and found.keys() - {uplink}:
-        found.pop(uplink, None)
-    return tuple(network for networks in found.values() for network in networks)
+            by_interface.setdefault(interface, []).append(network)
+    if without_uplink and by_interface.keys() - {uplink}:
+        by_interface.pop(uplink, None)
+    return tuple(network for networks in by_interface.values() for network in networks)
 
 
 def _quad(digits: str) -> str:

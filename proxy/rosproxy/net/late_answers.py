@@ -36,7 +36,7 @@ class LateAnswers:
             self._waiting.pop(task, None)
             close()
 
-        task = asyncio.get_running_loop().create_task(_outwait(answer))
+        task = asyncio.get_running_loop().create_task(_await_late(answer))
         self._waiting[task] = None
         task.add_done_callback(done)
         if len(self._waiting) > MOST_LATE:
@@ -53,7 +53,7 @@ class LateAnswers:
         await asyncio.gather(*waiting, return_exceptions=True)
 
 
-async def _outwait(answer: Callable[[], Awaitable[object]]) -> None:
+async def _await_late(answer: Callable[[], Awaitable[object]]) -> None:
     with contextlib.suppress(Exception):  # whatever it is, nobody wants it
         async with asyncio.timeout(LATE_TIMEOUT):
             await answer()

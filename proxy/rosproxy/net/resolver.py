@@ -23,7 +23,7 @@ RESOLVE_TIMEOUT = 1.0
 MOST_LOOKUPS = 64
 """Look-ups that may be under way at once; beyond that names count as unresolvable."""
 MOST_FOR_OTHERS, MOST_FOR_ONE = 56, 8
-"""Of these, how many of names that others gave, and that one of them gave: the nodes of one machine
+"""Of these, how many for names that others gave, and that one other gave: the nodes of one machine
 give its name."""
 NODES, MOST_FOR_NODES = "nodes", 32
 """The source of names that the master has of nodes, since it does not say who gave them; and how
@@ -51,8 +51,8 @@ async def resolve(host: str, source: str = "") -> list[str]:
 def _start(host: str, source: str) -> Future[list[str]]:
     lookup: Future[list[str]] = Future()
     if not _may_start(source):
-        who = source or "the proxy"
-        log.warning("%s has too many look-ups under way; %s counts as unresolvable", who, host)
+        label = source or "the proxy"
+        log.warning("%s has too many look-ups under way; %s counts as unresolvable", label, host)
         lookup.set_result([])
         return lookup
     _running[host] = source, lookup
@@ -69,15 +69,15 @@ def _may_start(source: str) -> bool:
     sources = [source for source, _ in list(_running.values())]  # threads end at any time
     if not source:
         return len(sources) < MOST_LOOKUPS
-    most = MOST_FOR_NODES if source == NODES else MOST_FOR_ONE
-    return sum(map(bool, sources)) < MOST_FOR_OTHERS and sources.count(source) < most
+    limit = MOST_FOR_NODES if source == NODES else MOST_FOR_ONE
+    return sum(map(bool, sources)) < MOST_FOR_OTHERS and sources.count(source) < limit
 
 
 def _look_up(host: str, lookup: "Future[list[str]]") -> None:
     addresses: list[str] = []
     try:
-        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-        addresses = list(dict.fromkeys(plain_address(str(info[4][0])) for info in found))
+        infos = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        addresses = list(dict.fromkeys(plain_address(str(info[4][0])) for info in infos))
     except (OSError, ValueError):  # not to be found; nothing that could be (UnicodeError is one)
         pass
     finally:

@@ -61,7 +61,7 @@ def put_up(ros: Collection[str], first: int, last: int, admin: object) -> socket
 
 
 def others(ros: str, first: int, last: int, admin: object) -> list[Sign]:
-    """The proxies that are here, for a version of ROS, and have some of these ports.
+    """The other proxies on this machine, for a version of ROS, that have some of these ports.
 
     ``admin`` is the own admin endpoint, which no other can have. MOST at most, and none whose admin
     endpoint is not at an address: people are told to ask there.
@@ -70,16 +70,16 @@ def others(ros: str, first: int, last: int, admin: object) -> list[Sign]:
         lines = _LISTED.read_text("utf-8", "replace").splitlines()
     except OSError:
         return []
-    read = filter(None, map(_SIGN.search, lines))
-    signs = (Sign(one[1], int(one[2]), int(one[3]), one[4]) for one in read)
-    found = (
-        one
-        for one in signs
-        if ros in one.ros and one.first <= last and first <= one.last and one.admin != str(admin)
+    matches = filter(None, map(_SIGN.search, lines))
+    signs = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in matches)
+    overlapping = (
+        s
+        for s in signs
+        if ros in s.ros and s.first <= last and first <= s.last and s.admin != str(admin)
     )
-    return list(islice(dict.fromkeys(one for one in found if _is_at_address(one.admin)), MOST))
+    return list(islice(dict.fromkeys(s for s in overlapping if _is_at_address(s.admin)), MOST))
 
 
 def _is_at_address(admin: str) -> bool:
-    where = parse_host_port(admin)
-    return where is not None and is_address(where.host)
+    host_port = parse_host_port(admin)
+    return host_port is not None and is_address(host_port.host)

@@ -160,29 +160,29 @@ def _leave(gate: Gate, source: str, port: int, _: asyncio.Task[None]) -> None:
     gate.leave(source, port)
 
 
-def begin_to_dial(where: HostPort) -> socket.socket:
+def begin_to_dial(target: HostPort) -> socket.socket:
     """A non-blocking connection to an IP address and port, under way. Raises OSError.
 
     What is sent before it is made raises BlockingIOError, or what has become of it.
     """
-    sock = socket.socket(_family(where.host), socket.SOCK_STREAM)
+    sock = socket.socket(_family(target.host), socket.SOCK_STREAM)
     sock.setblocking(False)
     try:
         with contextlib.suppress(BlockingIOError):
-            sock.connect((where.host, where.port))
+            sock.connect((target.host, target.port))
     except BaseException:
         sock.close()
         raise
     return sock
 
 
-async def dial(where: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:
+async def dial(target: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:
     """A non-blocking connection to an IP address and port. Raises OSError, TimeoutError."""
-    sock = socket.socket(_family(where.host), socket.SOCK_STREAM)
+    sock = socket.socket(_family(target.host), socket.SOCK_STREAM)
     sock.setblocking(False)
     try:
         async with asyncio.timeout(within):
-            await asyncio.get_running_loop().sock_connect(sock, (where.host, where.port))
+            await asyncio.get_running_loop().sock_connect(sock, (target.host, target.port))
     except BaseException:
         sock.close()
         raise
@@ -205,14 +205,14 @@ async def peek(conn: socket.socket, size: int) -> bytes:
 
 async def read_exactly(conn: socket.socket, size: int) -> bytes:
     """So many bytes, taken off a connection. Raises EOFError if it ends before, OSError."""
-    loop, parts = asyncio.get_running_loop(), []
+    loop, chunks = asyncio.get_running_loop(), []
     while size:
-        part = await loop.sock_recv(conn, min(size, 65536))
-        if not part:
+        chunk = await loop.sock_recv(conn, min(size, 65536))
+        if not chunk:
             raise EOFError("the connection ended too early")
-        parts.append(part)
-        size -= len(part)
-    return b"".join(parts)
+        chunks.append(chunk)
+        size -= len(chunk)
+    return b"".join(chunks)
 
 
 def has_ended(conn: socket.socket) -> bool:

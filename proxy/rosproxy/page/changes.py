@@ -7,27 +7,27 @@ _TABLES = ("nodes", "links")
 
 
 def changes(before: Json, after: Json) -> Json:
-    """What makes ``after`` of ``before``; empty if nothing does.
+    """What turns ``before`` into ``after``; empty if they are equal.
 
-    Of nodes and links those that are new or others, and None for those that are gone; of the rest
+    Of nodes and links those that are new or differ, and None for those that are gone; of the rest
     all that differs.
     """
-    found: Json = {}
+    news: Json = {}
     for table in _TABLES:
         old, new = before[table], after[table]
         rows = {key: row for key, row in new.items() if old.get(key) != row}
         rows |= dict.fromkeys(old.keys() - new.keys())
         if rows:
-            found[table] = rows
-    rest = before.keys() | after.keys()
-    found |= {
-        key: after.get(key) for key in rest.difference(_TABLES) if before.get(key) != after.get(key)
+            news[table] = rows
+    keys = before.keys() | after.keys()
+    news |= {
+        key: after.get(key) for key in keys.difference(_TABLES) if before.get(key) != after.get(key)
     }
-    return found
+    return news
 
 
 def changed(before: Json, news: Json) -> Json:
-    """The document that has these changes."""
+    """The document with these changes."""
     after = {**before, **news}
     for table in _TABLES:
         rows = {**before[table], **news.get(table, {})}

@@ -90,8 +90,8 @@ def document(
     ``left_out``: how many links are not even among these.
     """
     order = sorted(links, key=lambda link: (link.state != BROKEN, link.quiet, link.key))
-    told = [one for one in findings if one.severity >= Severity.WARNING]
-    told.sort(key=lambda one: -one.severity)
+    worst = [f for f in findings if f.severity >= Severity.WARNING]
+    worst.sort(key=lambda f: -f.severity)
     shown_nodes = dict(list(nodes.items())[:MOST_NODES])
     shown = [
         link
@@ -102,7 +102,7 @@ def document(
         "proxy": proxy,
         "nodes": {key: _plain(node) for key, node in shown_nodes.items()},
         "links": {link.key: _plain(link) for link in shown},
-        "findings": [_finding(one) for one in told[:MOST_FINDINGS]],
+        "findings": [_finding(f) for f in worst[:MOST_FINDINGS]],
         "left_out": left_out + len(nodes) - len(shown_nodes) + len(order) - len(shown),
     }
 
@@ -117,7 +117,7 @@ class Told(msgspec.Struct, frozen=True):
 
 
 class About(msgspec.Struct, frozen=True):
-    """What of a proxy's own is needed by who shows several."""
+    """What of a proxy's own is needed to show it among several."""
 
     host: str = ""
     master: str = ""
@@ -153,13 +153,18 @@ def told(text: str) -> str:
     return brief(text, LONGEST_TEXT)
 
 
-def _plain(one: PageNode | PageLink) -> Json:
-    plain: Json = msgspec.to_builtins(one)
+def _plain(struct: PageNode | PageLink) -> Json:
+    plain: Json = msgspec.to_builtins(struct)
     return plain
 
 
-def _finding(one: DoctorFinding) -> Json:
-    found: Json = msgspec.to_builtins(
-        Told(one.severity.name.lower(), short(one.subject), told(one.text), told(one.fix))
+def _finding(finding: DoctorFinding) -> Json:
+    plain: Json = msgspec.to_builtins(
+        Told(
+            finding.severity.name.lower(),
+            short(finding.subject),
+            told(finding.text),
+            told(finding.fix),
+        )
     )
-    return found
+    return plain

@@ -41,37 +41,41 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
     nodes: dict[str, PageNode] = {}
     links: list[PageLink] = []
     for domain in status.domains:
-        problems = {one.subject: one for one in domain_problems(domain)}
+        problems = {problem.subject: problem for problem in domain_problems(domain)}
         for side in (domain.inside, domain.outside):
-            for one in side:
-                node = _node(one, side is domain.inside, problems.get(one.guid_prefix))
-                nodes[_key(domain, one)] = node
+            for participant in side:
+                node = _node(
+                    participant, side is domain.inside, problems.get(participant.guid_prefix)
+                )
+                nodes[_key(domain, participant)] = node
         links += _links(domain, problems)
     return nodes, links
 
 
 def findings(status: ProxyStatus) -> list[DoctorFinding]:
-    """What the doctor says of the domains and is shown at no participant."""
-    shown = {one.guid_prefix for each in status.domains for one in (*each.inside, *each.outside)}
-    return [one for one in check(DoctorFacts(status=status)) if one.subject not in shown]
+    """What the doctor says of the domains, but for what is shown at participants."""
+    shown = {p.guid_prefix for domain in status.domains for p in (*domain.inside, *domain.outside)}
+    return [f for f in check(DoctorFacts(status=status)) if f.subject not in shown]
 
 
-def _key(domain: DomainStatus, one: ParticipantStatus) -> str:
-    return f"{domain.domain} {one.guid_prefix}"
+def _key(domain: DomainStatus, participant: ParticipantStatus) -> str:
+    return f"{domain.domain} {participant.guid_prefix}"
 
 
-def _node(one: ParticipantStatus, inside: bool, problem: DomainProblem | None) -> PageNode:
-    data = [lease for lease in one.leases if lease.kind == LeaseKind.DATA.value]
-    outside = HOST if is_loopback(one.address) else ROBOT
+def _node(
+    participant: ParticipantStatus, is_inside: bool, problem: DomainProblem | None
+) -> PageNode:
+    data = [lease for lease in participant.leases if lease.kind == LeaseKind.DATA.value]
+    outside_lane = HOST if is_loopback(participant.address) else ROBOT
     return PageNode(
-        CONTAINER if inside else outside,
+        CONTAINER if is_inside else outside_lane,
         "participant",
-        short(f"{one.address} {one.guid_prefix[-11:]}"),
+        short(f"{participant.address} {participant.guid_prefix[-11:]}"),
         _state(problem),
         told(problem.text) if problem else "",
         told(problem.fix) if problem else "",
-        short(f"{one.address}, {one.vendor}"),
-        ", ".join(str(lease.port) for lease in one.leases),
+        short(f"{participant.address}, {participant.vendor}"),
+        ", ".join(str(lease.port) for lease in participant.leases),
         rounded(sum(lease.rate for lease in data)) if data else None,
     )
 
@@ -85,49 +89,53 @@ def _state(problem: DomainProblem | None) -> str:
 def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator[PageLink]:
     yield from _crossing(domain, domain.inside, domain.outside, problems)
     yield from _crossing(domain, domain.outside, domain.inside, problems)
-    for one in domain.inside:
-        for service in one.services:
+    for participant in domain.inside:
+        for service in participant.services:
             quiet = is_quiet_service(service) or service.endswith(_QUIET_ENDINGS)
-            problem = problems.get(one.guid_prefix)
+            problem = problems.get(participant.guid_prefix)
             yield PageLink(
-                "service", short(service), _key(domain, one), state=_state(problem), quiet=quiet
+                "service",
+                short(service),
+                _key(domain, participant),
+                state=_state(problem),
+                quiet=quiet,
             )
 
 
 def _crossing(
     domain: DomainStatus,
-    givers: tuple[ParticipantStatus, ...],
-    takers: tuple[ParticipantStatus, ...],
+    writers: tuple[ParticipantStatus, ...],
+    readers: tuple[ParticipantStatus, ...],
     problems: dict[str, DomainProblem],
 ) -> Iterator[PageLink]:
     """The topics that cross the boundary in one direction."""
-    takers_of: dict[str, list[ParticipantStatus]] = {}
-    for taker in takers:
-        for topic in taker.subscribes:
-            takers_of.setdefault(topic, []).append(taker)
-    apart = {(one.name, one.writer, one.reader): why for one, why in mismatch_problems(domain)}
-    for giver in givers:
-        for topic in giver.publishes:
-            for taker in takers_of.get(topic, ()):
-                problem = problems.get(giver.guid_prefix) or problems.get(taker.guid_prefix)
-                problem = problem or apart.get((topic, giver.guid_prefix, taker.guid_prefix))
-                yield _link(domain, topic, giver, taker, problem)
+    readers_by_topic: dict[str, list[ParticipantStatus]] = {}
+    for reader in readers:
+        for topic in reader.subscribes:
+            readers_by_topic.setdefault(topic, []).append(reader)
+    mismatched = {(m.name, m.writer, m.reader): p for m, p in mismatch_problems(domain)}
+    for writer in writers:
+        for topic in writer.publishes:
+            for reader in readers_by_topic.get(topic, ()):
+                problem = problems.get(writer.guid_prefix) or problems.get(reader.guid_prefix)
+                problem = problem or mismatched.get((topic, writer.guid_prefix, reader.guid_prefix))
+                yield _link(domain, topic, writer, reader, problem)
 
 
 def _link(
     domain: DomainStatus,
     topic: str,
-    giver: ParticipantStatus,
-    taker: ParticipantStatus,
+    writer: ParticipantStatus,
+    reader: ParticipantStatus,
     problem: DomainProblem | None,
 ) -> PageLink:
     state = _state(problem)
-    data = [lease for lease in taker.leases if lease.kind == LeaseKind.DATA.value]
+    data = [lease for lease in reader.leases if lease.kind == LeaseKind.DATA.value]
     return PageLink(
         "topic",
         short(topic),
-        _key(domain, giver),
-        _key(domain, taker),
+        _key(domain, writer),
+        _key(domain, reader),
         carried=data[0].plane if data and state != BROKEN else "",
         port=data[0].port if data else None,
         state=state,

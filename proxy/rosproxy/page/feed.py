@@ -3,7 +3,7 @@
 While there is a watcher, two things go on. The status is read each `TICK` seconds, later where that
 takes long, so that the page never costs more than a share of the proxy's time. And the master and
 the nodes are asked (`rosproxy.doctor.collect.collect_running`), so many questions a second at most.
-Nobody looks: nobody is asked, and what was counted is forgotten.
+When nobody looks, nobody is asked, and what was counted is forgotten.
 
 A watcher waits for another document than the one that it has. One that is slow thereby skips those
 between, and nothing queues up for it.
@@ -61,7 +61,7 @@ class Feed:
         self._tasks, self._make = tasks, make
         self.watchers = 0
         self._newest: Json | None = None
-        self._made = asyncio.Condition()
+        self._renewed = asyncio.Condition()
         self._making: asyncio.Task[None] | None = None
         self._ending: asyncio.TimerHandle | None = None
         self._closed = False
@@ -84,17 +84,17 @@ class Feed:
         finally:
             self._leave()
 
-    async def after(self, seen: Json | None, within: float) -> Json | None:
-        """Another document than the one ``seen``; None if none comes in so many seconds.
+    async def after(self, former: Json | None, within: float) -> Json | None:
+        """Another document than the ``former``; None if none comes ``within`` these seconds.
 
         Raises Ended.
         """
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(within), self._made:
-                await self._made.wait_for(lambda: self._closed or self._is_news(seen))
+            async with asyncio.timeout(within), self._renewed:
+                await self._renewed.wait_for(lambda: self._closed or self._is_news(former))
         if self._closed:
             raise Ended
-        return self._newest if self._is_news(seen) else None
+        return self._newest if self._is_news(former) else None
 
     async def close(self) -> None:
         """Let everybody go."""
@@ -102,11 +102,11 @@ class Feed:
         if self._ending:
             self._ending.cancel()
         self._end()
-        async with self._made:
-            self._made.notify_all()
+        async with self._renewed:
+            self._renewed.notify_all()
 
-    def _is_news(self, seen: Json | None) -> bool:
-        return self._newest is not None and self._newest is not seen
+    def _is_news(self, former: Json | None) -> bool:
+        return self._newest is not None and self._newest is not former
 
     def _enter(self) -> None:
         self.watchers += 1
@@ -130,29 +130,29 @@ class Feed:
         while True:
             try:
                 async with contextlib.aclosing(self._make()) as documents:
-                    async for made in documents:
-                        await self._publish(made)
+                    async for document in documents:
+                        await self._publish(document)
             except Exception:
                 log.exception("the live page failed; going on")
             await asyncio.sleep(TICK)
 
-    async def _publish(self, made: Json) -> None:
-        if made != self._newest:
-            async with self._made:
-                self._newest = made
-                self._made.notify_all()
+    async def _publish(self, document: Json) -> None:
+        if document != self._newest:
+            async with self._renewed:
+                self._newest = document
+                self._renewed.notify_all()
 
 
 class Look:
-    """One time of looking at a proxy: what was counted and found out since somebody looks."""
+    """What was counted and found out of a proxy since somebody began to look at its page."""
 
     def __init__(
         self,
         status: Callable[[], ProxyStatus],
-        own: Callable[[], Sequence[DoctorFinding]],
+        own_findings: Callable[[], Sequence[DoctorFinding]],
         admin: str,
     ) -> None:
-        self._status, self._own, self._admin = status, own, admin
+        self._status, self._own_findings, self._admin = status, own_findings, admin
         self._measures = Measures()
         self._judged: Judged | None = None
         self._epoch = time.time() - time.monotonic()
@@ -171,13 +171,13 @@ class Look:
             asking.cancel()
 
     async def _document(self, now: float) -> Json:
-        status, own, judged = self._status(), tuple(self._own()), self._judged
+        status, own_findings, judged = self._status(), tuple(self._own_findings()), self._judged
         async with self._counting:
             if judged:
                 self._measures.read_relays(relayed(status, judged.facts.system), now)
             # In a thread, so that calls of nodes are not kept waiting by a large graph.
             return await asyncio.to_thread(
-                graph_document, status, judged, self._measures, own, now, self._epoch
+                graph_document, status, judged, self._measures, own_findings, now, self._epoch
             )
 
     async def _ask(self) -> float:
@@ -186,8 +186,8 @@ class Look:
         facts = await collect_running(status, self._admin, partial(chosen, status))
         judged = await asyncio.to_thread(judge, facts, self._judged)
         async with self._counting:
-            also = relayed(status, facts.system)
-            self._measures.read_nodes(facts, judged.pairs.keys() | also.keys())
+            relayed_links = relayed(status, facts.system)
+            self._measures.read_nodes(facts, judged.pairs.keys() | relayed_links.keys())
             self._judged = judged
         questions = PER_NODE * len(facts.nodes)
         return max(LOOK_AGAIN, questions / PER_SECOND - (time.monotonic() - began))

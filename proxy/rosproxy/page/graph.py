@@ -44,44 +44,44 @@ _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
 
 
 class Judged(msgspec.Struct, frozen=True):
-    """The ``facts`` with the doctor's word on them: of nodes, of pairs, and of the rest.
+    """The ``facts`` with the doctor's findings: on nodes, on pairs, and on the rest.
 
-    ``apart`` are all pairs that are not connected; ``pairs`` has those that were so before.
+    ``apart`` are all pairs that are not connected; of them ``pairs`` has those that were so before.
     """
 
     facts: DoctorFacts
     nodes: dict[str, DoctorFinding] = {}
     pairs: dict[Key, DoctorFinding] = {}
-    others: tuple[DoctorFinding, ...] = ()
+    rest: tuple[DoctorFinding, ...] = ()
     apart: frozenset[Key] = frozenset()
 
 
 def chosen(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
     """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
     inside = inside_nodes(status)
-    found, left = [], MOST_LINKS
+    topics, remaining = [], MOST_LINKS
     for topic in sorted(graph.topics - QUIET):
         if not inside.keys() & {*graph.sides(topic)}:
             continue
-        left -= len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
-        if left < 0:
+        remaining -= len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
+        if remaining < 0:
             break
-        found.append(topic)
-    return tuple(found)
+        topics.append(topic)
+    return tuple(topics)
 
 
-def judge(facts: DoctorFacts, before: Judged | None = None) -> Judged:
-    """Have the doctor judge what was found out, ``before`` it as well.
+def judge(facts: DoctorFacts, previous: Judged | None = None) -> Judged:
+    """Have the doctor judge what was found out; ``previous`` is its judgement before this one.
 
     A pair is said to be apart once it is found so twice: nodes that start need a moment to meet.
     """
     nodes: dict[str, DoctorFinding] = {}
-    others, inside = [], inside_nodes(facts.proxy)
+    rest, inside = [], inside_nodes(facts.proxy)
     for finding in diagnose_running(msgspec.structs.replace(facts, names=())):
         if finding.severity < Severity.WARNING:
             continue
         if finding.subject not in facts.nodes and finding.subject not in inside:
-            others.append(finding)
+            rest.append(finding)
         elif finding.subject not in nodes or nodes[finding.subject].severity < finding.severity:
             nodes[finding.subject] = finding
     pairs = {
@@ -89,38 +89,38 @@ def judge(facts: DoctorFacts, before: Judged | None = None) -> Judged:
         for pair in facts.scope.pairs
         if inside.keys() & {pair[1], pair[2]}
     }
-    apart = frozenset(key for key, one in pairs.items() if one.severity is Severity.ERROR)
-    for key in apart - (before.apart if before else frozenset()):
+    apart = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
+    for key in apart - (previous.apart if previous else frozenset()):
         del pairs[key]
-    return Judged(facts, nodes, pairs, tuple(others), apart)
+    return Judged(facts, nodes, pairs, tuple(rest), apart)
 
 
 def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
     """The nodes inside, by their names."""
-    return {name: one for one in status.nodes for name in one.nodes}
+    return {name: endpoint for endpoint in status.nodes for name in endpoint.nodes}
 
 
 def relayed(status: ProxyStatus, graph: SystemState) -> dict[Key, int]:
     """The bytes that the proxy has relayed of each link of a topic."""
-    found: dict[Key, int] = {}
+    sizes: dict[Key, int] = {}
     for endpoint in status.nodes:
-        for one in endpoint.connections:
-            if one.kind == "topic":
-                publisher = _owner(endpoint, graph.publishers.get(one.name, ()))
-                key = one.name, publisher, one.caller_id
-                found[key] = found.get(key, 0) + one.sent
-    return found
+        for connection in endpoint.connections:
+            if connection.kind == "topic":
+                publisher = _owner(endpoint, graph.publishers.get(connection.name, ()))
+                key = connection.name, publisher, connection.caller_id
+                sizes[key] = sizes.get(key, 0) + connection.sent
+    return sizes
 
 
 def graph_document(
     status: ProxyStatus,
     judged: Judged | None,
     measures: Measures,
-    own: Sequence[DoctorFinding],
+    own_findings: Sequence[DoctorFinding],
     now: float,
     epoch: float,
 ) -> Json:
-    """The document; ``own`` is what the proxy has found out about its own setting-up.
+    """The document; ``own_findings`` are the proxy's about its own setting-up.
 
     ``now`` is in monotonic seconds, as the counters' times, and ``epoch`` when those began, in
     seconds since the epoch.
@@ -133,7 +133,7 @@ def graph_document(
         ros1 = _Ros1Links(status, judged, measures, now, epoch)
         links += ros1.all()
         left_out = ros1.left_out
-    findings = [*own, *judged.others, *domain_graph.findings(status)]
+    findings = [*own_findings, *judged.rest, *domain_graph.findings(status)]
     nodes = {PROXY: _proxy_node(status), **nodes}
     return document(_about(status), nodes, links, findings, left_out)
 
@@ -171,39 +171,39 @@ class _Ros1Graph:
         master = self._status.master
         state = OK if master.up else BROKEN if master.error else UNKNOWN
         text = "" if master.up else told(master.error)
-        found = {MASTER: PageNode(ROBOT, "master", "master", state, text, "", short(master.uri))}
-        found |= {name: self._one_inside(name, one) for name, one in self._inside.items()}
+        nodes = {MASTER: PageNode(ROBOT, "master", "master", state, text, "", short(master.uri))}
+        nodes |= {name: self._inside_node(name, e) for name, e in self._inside.items()}
         # Who is connected though the master does not know it, or has not been asked yet.
-        found |= {
-            one.caller_id: PageNode(ROBOT, address=short(one.peer))
+        nodes |= {
+            c.caller_id: PageNode(ROBOT, address=short(c.peer))
             for endpoint in self._status.nodes
-            for one in endpoint.connections
+            for c in endpoint.connections
             # Whoever connects names himself; what is no node on this page has no slash.
-            if one.caller_id not in self._inside and one.caller_id.startswith("/")
+            if c.caller_id not in self._inside and c.caller_id.startswith("/")
         }
-        return found | {
-            name: self._one_outside(name, one)
-            for name, one in self._facts.nodes.items()
+        return nodes | {
+            name: self._outside_node(name, facts)
+            for name, facts in self._facts.nodes.items()
             if name not in self._inside
         }
 
-    def _one_inside(self, name: str, one: EndpointStatus) -> PageNode:
-        plane = one.data_plane
-        advertised = parse_slave_uri(one.advertised_uri)
-        ports = [advertised.port if advertised else one.port, plane.port if plane else None]
+    def _inside_node(self, name: str, endpoint: EndpointStatus) -> PageNode:
+        plane = endpoint.data_plane
+        advertised = parse_slave_uri(endpoint.advertised_uri)
+        ports = [advertised.port if advertised else endpoint.port, plane.port if plane else None]
         rate = plane.sent_rate + plane.received_rate if plane and plane.connections else None
         node = PageNode(
             CONTAINER,
-            address=short(one.address),
+            address=short(endpoint.address),
             ports=", ".join(str(port) for port in ports if port),
             rate=None if rate is None else rounded(rate),
         )
         return self._marked(name, node)
 
-    def _one_outside(self, name: str, one: NodeFacts) -> PageNode:
-        own = {*self._facts.advertised_addresses}
-        here = any(address in own or is_loopback(address) for address in one.addresses)
-        return self._marked(name, PageNode(HOST if here else ROBOT, address=short(one.uri)))
+    def _outside_node(self, name: str, facts: NodeFacts) -> PageNode:
+        own_addresses = {*self._facts.advertised_addresses}
+        is_here = any(a in own_addresses or is_loopback(a) for a in facts.addresses)
+        return self._marked(name, PageNode(HOST if is_here else ROBOT, address=short(facts.uri)))
 
     def _marked(self, name: str, node: PageNode) -> PageNode:
         finding = self._judged.nodes.get(name)
@@ -226,21 +226,21 @@ class _Ros1Links:
         self._inside = inside_nodes(status)
         self._graph = judged.facts.system
         self._relayed = relayed(status, self._graph)
-        self._stand_ins = {one.uri: one for one in status.stand_ins}
-        self._udpros = {(one.topic, one.caller_id): one.port for one in status.udpros}
+        self._stand_ins = {s.uri: s for s in status.stand_ins}
+        self._udpros = {(u.topic, u.caller_id): u.port for u in status.udpros}
         hidden = status.policy.hidden if status.policy else ()
-        self._hidden = {(one.name, one.node): one.reason for one in hidden}
+        self._hidden = {(h.name, h.node): h.reason for h in hidden}
 
     def all(self) -> list[PageLink]:
         return [*self._topics(), *self._services(), *self._parameters()]
 
     def _topics(self) -> Iterator[PageLink]:
-        seen = self._pairs()
-        yield from (self._topic(key) for key in seen if key[1])
-        with_both = {(topic, name) for topic, *both in seen for name in both}
-        for name, one in self._inside.items():
-            for topic in {*one.publishes, *one.subscribes}:
-                if (topic, name) not in with_both and self._is_of(name, one, topic):
+        pairs = self._pairs()
+        yield from (self._topic(key) for key in pairs if key[1])
+        paired = {(topic, name) for topic, *ends in pairs for name in ends}
+        for name, endpoint in self._inside.items():
+            for topic in {*endpoint.publishes, *endpoint.subscribes}:
+                if (topic, name) not in paired and self._has_topic(name, endpoint, topic):
                     yield self._alone(topic, name)
 
     def _alone(self, topic: str, name: str) -> PageLink:
@@ -251,27 +251,27 @@ class _Ros1Links:
 
     def _pairs(self) -> set[Key]:
         """Publishers and subscribers of which one is inside; of /tf there may be very many."""
-        found = {*self._relayed}
+        pairs = {*self._relayed}
         for topic in sorted(self._graph.topics, key=lambda topic: (topic in QUIET, topic)):
-            givers = self._graph.publishers.get(topic, ())
-            takers = self._graph.subscribers.get(topic, ())
-            if len(found) + len(givers) * len(takers) > 2 * MOST_LINKS:
-                self.left_out += len(givers) * len(takers)
+            publishers = self._graph.publishers.get(topic, ())
+            subscribers = self._graph.subscribers.get(topic, ())
+            if len(pairs) + len(publishers) * len(subscribers) > 2 * MOST_LINKS:
+                self.left_out += len(publishers) * len(subscribers)
                 continue
-            found |= {
-                (topic, giver, taker)
-                for giver in givers
-                for taker in takers
-                if giver in self._inside or taker in self._inside
+            pairs |= {
+                (topic, publisher, subscriber)
+                for publisher in publishers
+                for subscriber in subscribers
+                if publisher in self._inside or subscriber in self._inside
             }
-        return found
+        return pairs
 
-    def _is_of(self, name: str, one: EndpointStatus, topic: str) -> bool:
+    def _has_topic(self, name: str, endpoint: EndpointStatus, topic: str) -> bool:
         """Whether a node has a topic, as far as is known where several share an address."""
-        return len(one.nodes) == 1 or name in self._graph.sides(topic)
+        return len(endpoint.nodes) == 1 or name in self._graph.sides(topic)
 
     def _topic(self, key: Key) -> PageLink:
-        topic, giver, taker = key
+        topic, publisher, subscriber = key
         link = self._measures.get(key)
         finding = self._problem(key)
         carried, port = self._way(key)
@@ -282,8 +282,8 @@ class _Ros1Links:
         return PageLink(
             "topic",
             short(topic),
-            giver,
-            taker,
+            publisher,
+            subscriber,
             carried="" if state == BROKEN else carried,
             port=port,
             rate=None if link.rate is None else rounded(link.rate),
@@ -311,28 +311,38 @@ class _Ros1Links:
         return None
 
     def _stalled(self, key: Key) -> DoctorFinding:
-        topic, giver, taker = key
-        text = f"connected, but nothing of what {giver} publishes arrives at {taker}: packets are "
+        topic, publisher, subscriber = key
+        text = (
+            f"connected, but nothing of what {publisher} publishes arrives at {subscriber}: "
+            "packets are "
+        )
         text += "dropped on the way"
         _, port = self._way(key)
         host = self._status.settings.advertise_host
-        fix = f"restart {taker}" if taker in self._inside else f"look at the network of {taker}"
-        if port and taker not in self._inside:
-            fix = f"on the machine of {taker}: nc -vz {host} {port}; a firewall or a broken network"
-        return error("pair", f"{topic} from {giver} to {taker}", text, fix)
+        fix = (
+            f"restart {subscriber}"
+            if subscriber in self._inside
+            else f"look at the network of {subscriber}"
+        )
+        if port and subscriber not in self._inside:
+            fix = (
+                f"on the machine of {subscriber}: nc -vz {host} {port}; "
+                "a firewall or a broken network"
+            )
+        return error("pair", f"{topic} from {publisher} to {subscriber}", text, fix)
 
     def _way(self, key: Key) -> tuple[str, int | None]:
         """How a link is carried, and by which port of the proxy."""
-        topic, giver, taker = key
-        if (topic, taker) in self._udpros:
-            return "UDPROS", self._udpros[topic, taker]
-        endpoint, is_relayed = self._inside.get(giver), key in self._relayed
-        if endpoint and taker in self._inside and not is_relayed:
+        topic, publisher, subscriber = key
+        if (topic, subscriber) in self._udpros:
+            return "UDPROS", self._udpros[topic, subscriber]
+        endpoint, is_relayed = self._inside.get(publisher), key in self._relayed
+        if endpoint and subscriber in self._inside and not is_relayed:
             return "direct", None
         if endpoint:
-            where = parse_slave_uri(endpoint.advertised_uri)
-            return self._way_of(endpoint, where.port if where else endpoint.port, is_relayed)
-        outside = self._judged.facts.nodes.get(giver)
+            slave = parse_slave_uri(endpoint.advertised_uri)
+            return self._way_of(endpoint, slave.port if slave else endpoint.port, is_relayed)
+        outside = self._judged.facts.nodes.get(publisher)
         stand_in = self._stand_ins.get(outside.uri) if outside else None
         if stand_in:
             by_kernel = stand_in.data_plane.connections if stand_in.data_plane else 0
@@ -359,18 +369,16 @@ class _Ros1Links:
                 name = _owner(endpoint, graph.services.get(service, ()))
                 finding = self._judged.nodes.get(name)
                 state = _STATES[finding.severity] if finding else OK
-                where = parse_slave_uri(endpoint.advertised_uri)
+                slave = parse_slave_uri(endpoint.advertised_uri)
                 clients = [
-                    one
-                    for one in endpoint.connections
-                    if (one.kind, one.name) == ("service", service)
+                    c for c in endpoint.connections if (c.kind, c.name) == ("service", service)
                 ]
                 yield PageLink(
                     "service",
                     short(service),
                     name,
                     carried=self._user_plane() if clients else "",
-                    port=where.port if where else endpoint.port,
+                    port=slave.port if slave else endpoint.port,
                     rate=rounded(sum(c.sent_rate + c.received_rate for c in clients))
                     if clients
                     else None,
@@ -385,7 +393,7 @@ class _Ros1Links:
                     yield PageLink("parameter", short(name), MASTER, node, state=OK, quiet=True)
 
 
-def _owner(endpoint: EndpointStatus, named: Sequence[str]) -> str:
+def _owner(endpoint: EndpointStatus, holders: Sequence[str]) -> str:
     """Which node of an address has something, as the master tells; else the first."""
-    fitting = [name for name in endpoint.nodes if name in named]
-    return next(iter([*fitting, *endpoint.nodes]), "")
+    matches = [name for name in endpoint.nodes if name in holders]
+    return next(iter([*matches, *endpoint.nodes]), "")

@@ -78,24 +78,24 @@ class Link:
 
     def note_progress(self) -> None:
         """Remember how far the publisher was whenever the subscriber got something."""
-        given, taken = self.counters.get("given"), self.counters.get("taken")
-        if given is None or taken is None:
+        sent, arrived = self.counters.get("given"), self.counters.get("taken")
+        if sent is None or arrived is None:
             self.mark = None
-        elif self.mark is None or (taken.grew or 0.0) > self.mark[1] or given.value < self.mark[0]:
-            self.mark = given.value, max(given.at, taken.at)
+        elif self.mark is None or (arrived.grew or 0.0) > self.mark[1] or sent.value < self.mark[0]:
+            self.mark = sent.value, max(sent.at, arrived.at)
 
     def stalled(self, now: float) -> bool:
         """Whether messages are sent, and none arrives."""
         if self.mark is None:
             return False
-        sent, when = self.mark
+        sent, since = self.mark
         missed = self.counters["given"].value - sent
-        return missed >= MISSED and now - when >= STALLED
+        return missed >= MISSED and now - since >= STALLED
 
-    def _first(self, what: str, *names: str) -> float | None:
+    def _first(self, attribute: str, *names: str) -> float | None:
         counters = [self.counters[name] for name in names if name in self.counters]
-        found: float | None = getattr(counters[0], what) if counters else None
-        return found
+        number: float | None = getattr(counters[0], attribute) if counters else None
+        return number
 
 
 class Measures:
@@ -106,7 +106,7 @@ class Measures:
 
     def get(self, key: Key) -> Link:
         """What is known of a link."""
-        return self._links.get(key, _NOTHING)
+        return self._links.get(key, _EMPTY_LINK)
 
     def read_relays(self, relayed: Mapping[Key, int], now: float) -> None:
         """Take in the bytes that the proxy has relayed, by those links that it relays now."""
@@ -117,21 +117,21 @@ class Measures:
 
     def read_nodes(self, facts: DoctorFacts, pairs: Iterable[Key]) -> None:
         """Take in what nodes have counted of these links; what is known of others is dropped."""
-        known, seen = self._links, dict[str, Mapping[tuple[str, HostPort], str]]()
+        former, uris = self._links, dict[str, Mapping[tuple[str, HostPort], str]]()
         self._links = {}
         for key in pairs:
             topic, publisher, subscriber = key
-            link = self._links[key] = known.get(key, Link())
-            giver, taker = facts.nodes.get(publisher), facts.nodes.get(subscriber)
-            if giver and giver.report and taker:
-                _read(link, "given", giver.report, ("o", topic, taker.name))
-            if taker and taker.report and giver:
-                if subscriber not in seen:
-                    seen[subscriber] = _publishers(taker.report)
-                uri = giver.uri
-                if giver.where is not None:
-                    uri = seen[subscriber].get((topic, giver.where), uri)
-                _read(link, "taken", taker.report, ("i", topic, uri))
+            link = self._links[key] = former.get(key, Link())
+            source, target = facts.nodes.get(publisher), facts.nodes.get(subscriber)
+            if source and source.report and target:
+                _read(link, "given", source.report, ("o", topic, target.name))
+            if target and target.report and source:
+                if subscriber not in uris:
+                    uris[subscriber] = _publishers(target.report)
+                uri = source.uri
+                if source.where is not None:
+                    uri = uris[subscriber].get((topic, source.where), uri)
+                _read(link, "taken", target.report, ("i", topic, uri))
             link.note_progress()
 
 
@@ -147,12 +147,12 @@ def _read(link: Link, side: str, report: SlaveReport, connection: tuple[str, str
 
 def _publishers(report: SlaveReport) -> Mapping[tuple[str, HostPort], str]:
     """The URIs that a subscriber knows publishers by, which roscpp has without their paths."""
-    found: dict[tuple[str, HostPort], str] = {}
+    uris: dict[tuple[str, HostPort], str] = {}
     for direction, topic, peer in report.counts:
-        where = parse_slave_uri(peer) if direction == "i" else None
-        if where is not None:
-            found.setdefault((topic, where), peer)
-    return found
+        slave = parse_slave_uri(peer) if direction == "i" else None
+        if slave is not None:
+            uris.setdefault((topic, slave), peer)
+    return uris
 
 
-_NOTHING = Link()
+_EMPTY_LINK = Link()

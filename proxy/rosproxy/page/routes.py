@@ -61,13 +61,13 @@ class Page:
     @property
     def routes(self) -> Mapping[tuple[str, str], Handler]:
         """What is served, by method and path."""
-        own: dict[tuple[str, str], Handler] = {
+        handlers: dict[tuple[str, str], Handler] = {
             ("GET", "/"): self._show,
             ("POST", "/login"): self._log_in,
-            ("GET", "/graph"): self._tell,
+            ("GET", "/graph"): self._send_document,
             ("GET", "/events"): self._stream,
         }
-        return own | {("GET", path): _send_file for path in _FILES}
+        return handlers | {("GET", path): _send_file for path in _FILES}
 
     async def close(self) -> None:
         """End all streams."""
@@ -108,7 +108,7 @@ class Page:
         )
         return response
 
-    async def _tell(self, request: web.BaseRequest) -> web.StreamResponse:
+    async def _send_document(self, request: web.BaseRequest) -> web.StreamResponse:
         """The whole document, for programs."""
         if not self.visitors.may_look(request):
             return _refusal()
@@ -143,21 +143,21 @@ class Page:
         """Raises Ended, and ConnectionError once the browser has gone."""
         # The page tells how old something is, and the browser's clock may be another.
         await response.write(f"event: clock\ndata: {time.time():.3f}\n\n".encode())
-        seen: Json | None = None
+        former: Json | None = None
         while True:
-            newest = await self.feed.after(seen, HEARTBEAT)
-            await response.write(b":\n\n" if newest is None else self._event(seen, newest))
-            seen = newest or seen
+            newest = await self.feed.after(former, HEARTBEAT)
+            await response.write(b":\n\n" if newest is None else self._event(former, newest))
+            former = newest or former
 
-    def _event(self, seen: Json | None, newest: Json) -> bytes:
+    def _event(self, former: Json | None, newest: Json) -> bytes:
         """An event. Most watchers have seen the same, so that it is encoded once."""
-        kept = self._encoded
-        if kept is None or kept[0] is not seen or kept[1] is not newest:
-            news = newest if seen is None else changes(seen, newest)
-            kind = "all" if seen is None else "change"
+        cached = self._encoded
+        if cached is None or cached[0] is not former or cached[1] is not newest:
+            news = newest if former is None else changes(former, newest)
+            kind = "all" if former is None else "change"
             data = json.dumps(news, separators=(",", ":"))
-            self._encoded = kept = (seen, newest, f"event: {kind}\ndata: {data}\n\n".encode())
-        return kept[2]
+            self._encoded = cached = (former, newest, f"event: {kind}\ndata: {data}\n\n".encode())
+        return cached[2]
 
 
 async def _send_file(request: web.BaseRequest) -> web.StreamResponse:

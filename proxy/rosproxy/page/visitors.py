@@ -78,8 +78,8 @@ class Visitors:
         """Whether a request is of somebody who may."""
         if self._sessions.is_good(request.cookies.get(cookie_name(request), "")):
             return True
-        scheme, _, said = request.headers.get("Authorization", "").partition(" ")
-        if scheme == "Bearer" and self.knows_token(said):
+        scheme, _, token = request.headers.get("Authorization", "").partition(" ")
+        if scheme == "Bearer" and self.knows_token(token):
             return True
         open_to_all = self._token_hash is None and not self._local
         return (open_to_all or is_loopback(request.remote or "")) and names_us(
@@ -103,9 +103,9 @@ class Visitors:
         """Whether there is a token to be known."""
         return self._token_hash is not None
 
-    def knows_token(self, said: str) -> bool:
+    def knows_token(self, token: str) -> bool:
         """Whether this is the token."""
-        return self._token_hash is not None and hmac.compare_digest(_hash(said), self._token_hash)
+        return self._token_hash is not None and hmac.compare_digest(_hash(token), self._token_hash)
 
     def new_session(self) -> str:
         """What a cookie is to hold."""
@@ -129,8 +129,8 @@ def cookie_name(request: web.BaseRequest) -> str:
 
 def names_us(host: str) -> bool:
     """Whether the ``Host`` of a request is none that a stranger may have registered."""
-    where = parse_authority(f"//{host}")
-    name = (where.host if where else host.partition(":")[0]).lower().rstrip(".")
+    host_port = parse_authority(f"//{host}")
+    name = (host_port.host if host_port else host.partition(":")[0]).lower().rstrip(".")
     return is_address(name.strip("[]")) or "." not in name or name.endswith(LOCAL)
 
 

@@ -31,9 +31,9 @@ MANY_VALUES = 100
 MOST_PASSING = 256
 """Calls and replies that pass unread at once; each takes a thread of the master's."""
 MOST_CLIENTS = 4096
-"""Addresses whose kind is remembered."""
+"""Addresses whose `ClientKind` is remembered."""
 PASSING_SHARE = 64
-"""Those of them from one source."""
+"""How many of them may come from one source."""
 
 
 class Context:
@@ -59,8 +59,8 @@ class Context:
         )
         self.lease_call = limits.lease_call(settings.max_lease_call)
         self.master_call = limits.master_call(settings.max_master_call)
-        held = settings.max_buffered * MEBIBYTE
-        self.buffered = Budget(held, held // 2, "bytes of requests and replies")
+        capacity = settings.max_buffered * MEBIBYTE
+        self.buffered = Budget(capacity, capacity // 2, "bytes of requests and replies")
         self._turn = asyncio.Lock()
         self.passing = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
         self.registry = Registry(settings.ports.listen)
@@ -78,10 +78,10 @@ class Context:
         self.nodes = NodeClient(self.upstream, settings.probe_timeout)
         self.retired = False
         self._selected: frozenset[str] | None = None
-        self._towards: dict[str, str] = {}
+        self._proxy_addresses: dict[str, str] = {}
         self._client_kinds: dict[str, ClientKind] = {}
-        """Of addresses that have called since networks and selection were taken in."""
-        self._near: list[Network] | None = None
+        """By address; emptied when the networks or the selection are read again."""
+        self._client_networks: list[Network] | None = None
         self.read_networks()
 
     def now(self) -> float:
@@ -95,43 +95,43 @@ class Context:
     async def yield_to_others(self) -> None:
         """Wait for one's turn to read or rewrite a document of more than MANY_VALUES.
 
-        All connections are looked at in between. Else many large documents that come together
-        would hold everybody up.
+        All connections are served in between. Otherwise many large documents that come together
+        would hold up everybody else.
         """
         async with self._turn:
             await asyncio.sleep(0)
 
     @property
     def selected(self) -> frozenset[str] | None:
-        """The addresses that may use the proxy as their master; None: no operator has told."""
+        """The addresses that may use the proxy as their master; None: no operator has said."""
         return self._selected
 
     @selected.setter
     def selected(self, addresses: frozenset[str]) -> None:
         self._selected = addresses
         self._client_kinds.clear()
-        self._near = None
+        self._client_networks = None
 
     def client_kind(self, address: str) -> ClientKind:
         """Whether an address may use the proxy as its master, as far as is known now."""
-        known = self._client_kinds.get(address)
-        if known is None:
+        kind = self._client_kinds.get(address)
+        if kind is None:
             if len(self._client_kinds) >= MOST_CLIENTS:
                 self._client_kinds.clear()
-            known = client_kind(address, self.addressing.networks, self.selected)
-            self._client_kinds[address] = known
-        return known
+            kind = client_kind(address, self.addressing.networks, self.selected)
+            self._client_kinds[address] = kind
+        return kind
 
     def near(self) -> Sequence[Network]:
-        """Who may use the proxy as its master, as networks none of which overlaps another."""
-        if self._near is None:
-            found = self.addressing.networks
+        """The networks that may use the proxy as their master; none overlaps another."""
+        if self._client_networks is None:
+            networks = self.addressing.networks
             if self.selected is not None:
-                found = [ip_network(address) for address in self.selected]
-            ipv4 = collapse_addresses(one for one in found if isinstance(one, IPv4Network))
-            ipv6 = collapse_addresses(one for one in found if isinstance(one, IPv6Network))
-            self._near = [*ipv4, *ipv6]
-        return self._near
+                networks = [ip_network(address) for address in self.selected]
+            ipv4 = collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
+            ipv6 = collapse_addresses(n for n in networks if isinstance(n, IPv6Network))
+            self._client_networks = [*ipv4, *ipv6]
+        return self._client_networks
 
     async def after_registration(self, endpoint: Endpoint) -> None:
         """Let the reply to a registration that is under way reach a node first.
@@ -149,25 +149,25 @@ class Context:
         They are read every few seconds, and at once where a call comes from a ``source`` in none
         of them: containers join networks while they run.
         """
-        unknown = source and not is_inside(source, self.addressing.networks)
-        if unknown or self.now() - self._networks_read > NETWORKS_TTL:
+        is_unknown = source and not is_inside(source, self.addressing.networks)
+        if is_unknown or self.now() - self._networks_read > NETWORKS_TTL:
             self.read_networks()
 
     def read_networks(self) -> None:
-        """The same at once."""
-        self._towards.clear()
+        """Take in at once the networks that the proxy's interfaces are in."""
+        self._proxy_addresses.clear()
         self._client_kinds.clear()
-        self._near = None
+        self._client_networks = None
         self._networks_read = self.now()
-        given, both = self.settings.inside_networks, self.stand_ins.both
-        self.addressing.networks = given or interface_networks(without_uplink=both)
+        configured, both = self.settings.inside_networks, self.stand_ins.both
+        self.addressing.networks = configured or interface_networks(without_uplink=both)
 
     def caller_at(self, endpoint: Endpoint) -> Caller:
-        """The node of an endpoint as somebody who is given addresses.
+        """The node of an endpoint as a caller that is handed addresses.
 
-        The proxy's own address that it sees is looked up as often as the networks are.
+        The proxy's address as the node sees it is looked up as often as the networks are.
         """
         address, name = endpoint.location.address, min(endpoint.callers, default="")
-        if address not in self._towards:
-            self._towards[address] = address_towards(address)
-        return Caller(address, self._towards[address], name, "", endpoint)
+        if address not in self._proxy_addresses:
+            self._proxy_addresses[address] = address_towards(address)
+        return Caller(address, self._proxy_addresses[address], name, "", endpoint)

@@ -47,7 +47,7 @@ _NAMES = {"levelname": "level", "name": "logger", "exc_info": "error"}
 class _Bucket:
     """Messages that may still be written, as of ``since``, and how many were left out."""
 
-    left: float
+    remaining: float
     since: float
     left_out: int = 0
 
@@ -75,8 +75,8 @@ class LogRateLimit(logging.Filter):
         weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL
         with self._lock:
             if record.levelno >= logging.WARNING:
-                one = self._bucket((*kind, _subject(record)), BURST_OF_ONE, ONE_EVERY)
-                if not _take(one, record, weight):
+                bucket = self._bucket((*kind, _subject(record)), BURST_OF_ONE, ONE_EVERY)
+                if not _take(bucket, record, weight):
                     return False
             return _take(self._bucket(kind, BURST_OF_ALL, ALL_EVERY), record, weight)
 
@@ -87,17 +87,17 @@ class LogRateLimit(logging.Filter):
         if len(self._buckets) >= MOST_KNOWN:
             del self._buckets[next(iter(self._buckets))]
         self._buckets[key] = bucket  # the last, so that the first is unused for the longest time
-        bucket.left = min(bucket.left + (now - bucket.since) / every, burst)
+        bucket.remaining = min(bucket.remaining + (now - bucket.since) / every, burst)
         bucket.since = now
         return bucket
 
 
 def _take(bucket: _Bucket, record: logging.LogRecord, weight: int) -> bool:
     """Whether a bound allows one more record, which then tells what was left out before."""
-    if bucket.left < 1:
+    if bucket.remaining < 1:
         bucket.left_out += 1
         return False
-    bucket.left -= weight
+    bucket.remaining -= weight
     if bucket.left_out:
         record.left_out = getattr(record, "left_out", 0) + bucket.left_out
         bucket.left_out = 0
@@ -112,14 +112,14 @@ def _subject(record: logging.LogRecord) -> str:
 
 def harmless(record: logging.LogRecord) -> logging.LogRecord:
     """A copy of a record whose message and traceback may be written as they are."""
-    made = copy.copy(record)
-    made.msg, made.args = brief(record.getMessage(), LONGEST), None
+    safe = copy.copy(record)
+    safe.msg, safe.args = brief(record.getMessage(), LONGEST), None
     left_out = getattr(record, "left_out", 0)
     if left_out:
-        made.msg += f" ({left_out} more like it were left out)"
-    made.exc_text = _traceback(record)
-    made.exc_info = None
-    return made
+        safe.msg += f" ({left_out} more like it were left out)"
+    safe.exc_text = _traceback(record)
+    safe.exc_info = None
+    return safe
 
 
 class TextLines(logging.Formatter):
@@ -146,14 +146,14 @@ class JsonLines(JsonFormatter):
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
         """The fields, texts among them harmless, with the level in lower case."""
         fields = {
-            name: brief(held, LONGEST) if isinstance(held, str) and name not in _DONE else held
-            for name, held in log_data.items()
+            name: brief(field, LONGEST) if isinstance(field, str) and name not in _SAFE else field
+            for name, field in log_data.items()
         }
         return {**fields, "level": log_data["level"].lower()}
 
 
-_DONE = frozenset({"message", "error"})
-"""What `harmless` has seen to: a traceback has lines, and the message its last words."""
+_SAFE = frozenset({"message", "error"})
+"""What `harmless` has made safe: a traceback has lines, the message may tell what was left out."""
 
 
 def set_up(form: str, level: str) -> None:
@@ -172,18 +172,18 @@ def _traceback(record: logging.LogRecord) -> str | None:
         return None
     text = logging.Formatter().formatException(record.exc_info)
     for error in _chain(record.exc_info[1]):
-        said = ""
+        message = ""
         with contextlib.suppress(Exception):  # its own __str__ may fail; Python copes with that
-            said = str(error)
-        if said:
-            text = text.replace(said, brief(said, LONGEST))
+            message = str(error)
+        if message:
+            text = text.replace(message, brief(message, LONGEST))
     return "\n".join(map(clean, text.split("\n")))
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
     """An exception and all that led to it."""
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
+    visited: set[int] = set()
+    while error is not None and id(error) not in visited:
+        visited.add(id(error))
         yield error
         error = error.__cause__ or error.__context__

@@ -67,17 +67,17 @@ class NamedNodes:
     """Numbers of nodes by name, of which only the first MOST_NAMES are kept apart."""
 
     def __init__(self) -> None:
-        self._known: set[str] = set()
+        self._names: set[str] = set()
 
     def tally(self, names: Iterable[str]) -> Mapping[str, int]:
         """How often each name is there."""
-        found: dict[str, int] = {}
+        counts: dict[str, int] = {}
         for name in names:
-            if len(self._known) < MOST_NAMES:
-                self._known.add(name)
-            key = name if name in self._known else "other"
-            found[key] = found.get(key, 0) + 1
-        return found
+            if len(self._names) < MOST_NAMES:
+                self._names.add(name)
+            key = name if name in self._names else "other"
+            counts[key] = counts.get(key, 0) + 1
+        return counts
 
 
 class Metrics:
@@ -129,5 +129,5 @@ class Metrics:
 
     def count(self, api: str, method: str, outcome: str) -> None:
         """Count a call; method names that nobody defined share one label."""
-        known = method if method in self._known_methods else "other"
-        self._of_calls(api, known, outcome).inc()
+        label = method if method in self._known_methods else "other"
+        self._of_calls(api, label, outcome).inc()

@@ -33,27 +33,27 @@ class Problems:
     """The most recent problems, newest last; the same one again replaces the older entry."""
 
     def __init__(self) -> None:
-        self._items: list[NotedProblem] = []
+        self._problems: list[NotedProblem] = []
 
     def add(self, subject: str, text: str, port: int | None = None) -> None:
         """Note a problem."""
         subject, text = brief(subject, LONGEST_SUBJECT), brief(text, LONGEST_TEXT)
-        others = [p for p in self._items if (p.subject, p.text) != (subject, text)]
-        self._items = [*others, NotedProblem(time.time(), subject, text, port)][-MOST:]
+        remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]
+        self._problems = [*remaining, NotedProblem(time.time(), subject, text, port)][-MOST:]
 
     def solved(self, subject: str) -> None:
         """Forget what was noted about a subject."""
-        known = brief(subject, LONGEST_SUBJECT)
-        self._items = [p for p in self._items if p.subject != known]
+        noted_subject = brief(subject, LONGEST_SUBJECT)
+        self._problems = [p for p in self._problems if p.subject != noted_subject]
 
     def solved_at(self, port: int) -> None:
         """Forget what was noted about the node of a lease."""
-        self._items = [p for p in self._items if p.port != port]
+        self._problems = [p for p in self._problems if p.port != port]
 
     def all(self) -> list[NotedProblem]:
         """All problems."""
-        return self._items
+        return self._problems
 
     def at(self, port: int) -> list[NotedProblem]:
         """The problems of the node of a lease."""
-        return [p for p in self._items if p.port == port]
+        return [p for p in self._problems if p.port == port]

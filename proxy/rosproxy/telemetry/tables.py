@@ -30,8 +30,8 @@ def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
         grid.add_column(justify="left" if index < left else "right", no_wrap=True)
     for name, *cells in rows:
         grid.add_row(Text(shorten(name, room)), *map(Text, cells))
-    wide = _CONSOLE.options.update_width(room + besides_first(rows))
-    lines = _CONSOLE.render_lines(grid, wide)
+    options = _CONSOLE.options.update_width(room + besides_first(rows))
+    lines = _CONSOLE.render_lines(grid, options)
     return ["".join(segment.text for segment in line).rstrip() for line in lines]
 
 

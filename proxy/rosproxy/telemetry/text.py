@@ -92,16 +92,16 @@ def size(count: float) -> str:
     return f"{count:.{digits}f} {_UNITS[unit]}"
 
 
-def plural(count: int, word: str) -> str:
+def plural(count: int, noun: str) -> str:
     """``1 port``, ``2 ports``."""
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def listed(items: Iterable[str], most: int = 5) -> str:
     """The first few items, and how many more there are."""
-    every = list(items)
-    more = len(every) - most
-    return ", ".join(every[:most]) + (f" and {more} more" if more > 0 else "")
+    texts = list(items)
+    left_out = len(texts) - most
+    return ", ".join(texts[:most]) + (f" and {left_out} more" if left_out > 0 else "")
 
 
 def _head(text: str, room: int) -> str:

@@ -23,14 +23,14 @@ class Action(msgspec.Struct, frozen=True):
     name: str
 
     def __str__(self) -> str:
-        return clean(f"{self.does} {self.name}{self._more()}")
+        return clean(f"{self.does} {self.name}{self._details()}")
 
     @property
     def log_fields(self) -> dict[str, str]:
         """What a log entry about it has as fields: the container's name, or the network's."""
         return {self.does.rpartition(" ")[2]: self.name}
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         """The rest of the text."""
         return ""
 
@@ -40,7 +40,7 @@ class CreateNetwork(Action, frozen=True):
 
     does = "create network"
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         return ", a bridge: the uplink of all proxies"
 
 
@@ -63,7 +63,7 @@ class CreateSandbox(_CreateContainer, frozen=True):
     forwards: bool = False
     udp: bool = False
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         return f": it holds ports {self.range} for the proxy of the {self.key.graph}"
 
 
@@ -86,7 +86,7 @@ class Create(_CreateContainer, frozen=True):
     peers: tuple[str, ...] = ()
     ear: HostPort | None = None
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
         rights = ", with NET_ADMIN" if self.data_plane == "kernel" else ""
         return (
@@ -107,7 +107,7 @@ class CreateEar(_CreateContainer, frozen=True):
     proxy: HostPort
     fingerprint: str = ""
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         return (
             f": it carries announcements of the {self.key.graph} between the LAN at {self.lan} and "
             f"the proxy at {self.proxy}"
@@ -127,11 +127,11 @@ class CreateRedirect(_CreateContainer, frozen=True):
     proxy: HostPort | None = None
     fingerprint: str = ""
 
-    def _more(self) -> str:
-        where = f"in the network of container {self.target[:12]}"
+    def _details(self) -> str:
+        location = f"in the network of container {self.target[:12]}"
         if self.master is None:
-            return f": it takes the redirect of the {self.key.graph} away {where}"
-        return f": {where} it leads {self.master} to the proxy at {self.proxy}"
+            return f": it takes the redirect of the {self.key.graph} away {location}"
+        return f": {location} it leads {self.master} to the proxy at {self.proxy}"
 
 
 class Run(Action, frozen=True):
@@ -164,7 +164,7 @@ class Rename(Action, frozen=True):
     does = "rename container"
     to: str
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         return f" to {self.to}"
 
 
@@ -175,7 +175,7 @@ class Connect(Action, frozen=True):
     network: str
     aliases: tuple[str, ...]
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         names = f" as {', '.join(self.aliases)}" if self.aliases else ""
         return f" to network {self.network}{names}"
 
@@ -186,7 +186,7 @@ class Disconnect(Action, frozen=True):
     does = "disconnect container"
     network: str
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         return f" from network {self.network}"
 
 
@@ -203,6 +203,6 @@ class Remove(Action, frozen=True):
     retire: bool = False
     stop: bool = False
 
-    def _more(self) -> str:
+    def _details(self) -> str:
         after = ", after unregistering its nodes at the master" if self.retire else ""
         return f" ({self.why}){after}"

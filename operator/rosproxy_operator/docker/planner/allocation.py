@@ -32,7 +32,7 @@ from rosproxy_operator.docker.planner.state import DockerMemory, PortRefusal
 def refused(
     observed: HostState, live: Collection[Key], memory: DockerMemory, now: float
 ) -> DockerMemory:
-    """Draw the conclusions from the engine's refusals to start sandboxes.
+    """The memory after the engine's refusals to start sandboxes.
 
     A range that has never served is given up at once: its refused ports become ``taken``. One that
     has served is given up after `RETRY_FOR` seconds, since its ports may only be slow to be let go.
@@ -40,26 +40,26 @@ def refused(
     for sandbox in observed.sandboxes:
         refusal = memory.refusals.get(sandbox.container.name)
         if refusal is not None and sandbox.key in live:
-            memory = _concluded(memory, sandbox, refusal, now)
+            memory = _after_refusal(memory, sandbox, refusal, now)
     return memory
 
 
-def _concluded(
+def _after_refusal(
     memory: DockerMemory, sandbox: Sandbox, refusal: PortRefusal, now: float
 ) -> DockerMemory:
     served, moved = memory.served.get(sandbox.key), dict(memory.moved)
     port = refusal.port
-    hit = {port} if port and port in sandbox.range else set(sandbox.range.ports())
-    fresh = {port for port in hit if served is None or port not in served}
-    if served is not None and not fresh:
+    suspects = {port} if port and port in sandbox.range else set(sandbox.range.ports())
+    unserved = {port for port in suspects if served is None or port not in served}
+    if served is not None and not unserved:
         if now - refusal.since < RETRY_FOR:
             return memory
         moved[sandbox.key] = Move(served, now)
     name = sandbox.container.name
     return replace(
         memory,
-        refusals={other: said for other, said in memory.refusals.items() if other != name},
-        taken={**memory.taken, **dict.fromkeys(fresh or hit, now)},
+        refusals={n: r for n, r in memory.refusals.items() if n != name},
+        taken={**memory.taken, **dict.fromkeys(unserved or suspects, now)},
         moved=moved,
     )
 
@@ -78,7 +78,7 @@ class _Allocation:
         self.settings = settings
         self.memory = memory
         self.live = live
-        self.given: dict[Key, PortRange] = {}
+        self.allocated: dict[Key, PortRange] = {}
         self.problems: list[Problem] = []
         self.serving = {s.key for s in observed.sandboxes if s.container.state in SERVING}
         """The keys that have ports on which a proxy serves."""
@@ -88,70 +88,70 @@ class _Allocation:
         return self._published(self.observed.containers, key) | self.memory.taken.keys()
 
     def blocked(self, key: Key) -> frozenset[int]:
-        """These, and on which something listens."""
-        seen = self.observed
-        return self.claimed(key) | self._for(key, seen.listening, seen.listening_udp)
+        """The claimed ports, and those on which something listens."""
+        observed = self.observed
+        return self.claimed(key) | self._matching(key, observed.listening, observed.listening_udp)
 
     def order(self, key: Key) -> tuple[int, Key]:
-        """Who has ports comes before who had some, and that one before who wants some."""
-        ranks = [key in found for found in (self.serving, self.memory.served, self.memory.planned)]
+        """Keys with ports come first, then those that had some, then those that want some."""
+        ranks = [key in group for group in (self.serving, self.memory.served, self.memory.planned)]
         return [*ranks, True].index(True), key
 
-    def held(self, key: Key) -> list[PortRange]:
+    def blocked_ranges(self, key: Key) -> list[PortRange]:
         """The ranges that a key can't have: other proxies', and the kernel's."""
-        others = [sandbox.range for sandbox in self.observed.sandboxes if sandbox.key != key]
-        return [self.observed.ephemeral, *others, *self.given_to_others(key)]
+        occupied = [sandbox.range for sandbox in self.observed.sandboxes if sandbox.key != key]
+        return [self.observed.ephemeral, *occupied, *self.ranges_of_others(key)]
 
-    def given_to_others(self, key: Key) -> list[PortRange]:
-        """What other keys have got already."""
-        return [ports for other, ports in self.given.items() if other != key]
+    def ranges_of_others(self, key: Key) -> list[PortRange]:
+        """The ranges that other keys have been given."""
+        return [ports for owner, ports in self.allocated.items() if owner != key]
 
     def may_stay(self, key: Key, ports: PortRange) -> bool:
-        """Whether nobody else is seen to have ports on which this key's proxy has served.
+        """Whether no other container has ports on which this key's proxy has served.
 
         What listens there does not count: it may be what is left of that very proxy.
         """
-        others = [
-            one.range
-            for one in self.observed.sandboxes
-            if one.key != key and (one.key not in self.live or one.key in self.serving)
+        occupied = [
+            s.range
+            for s in self.observed.sandboxes
+            if s.key != key and (s.key not in self.live or s.key in self.serving)
         ]
-        started = [one for one in self.observed.containers if one.state in STARTED]
+        started = [c for c in self.observed.containers if c.state in STARTED]
         taken = self._published(started, key) | self.memory.taken.keys()
-        return is_free(ports, taken, [*others, *self.given_to_others(key)])
+        return is_free(ports, taken, [*occupied, *self.ranges_of_others(key)])
 
-    def _for(self, key: Key, tcp: frozenset[int], udp: frozenset[int]) -> frozenset[int]:
-        """Those of some TCP ports and UDP ports that a key's proxy publishes as well."""
+    def _matching(self, key: Key, tcp: frozenset[int], udp: frozenset[int]) -> frozenset[int]:
+        """Those of these ports whose protocol a key's proxy publishes."""
         if key.is_ros2:
             return udp
         return tcp | udp if self.live[key].udp else tcp
 
     def _published(self, containers: Collection[Container], key: Key) -> frozenset[int]:
         """The ports that containers publish by the protocols of a key's proxy."""
-        tcp = frozenset(port for one in containers for port in one.host_ports)
-        return self._for(key, tcp, frozenset(port for one in containers for port in one.udp_ports))
+        tcp = frozenset(port for c in containers for port in c.host_ports)
+        return self._matching(key, tcp, frozenset(port for c in containers for port in c.udp_ports))
 
     def keep(self, key: Key) -> None:
         """Give a key the range where its proxy serves, has served, or is being made."""
         ports = self.memory.served.get(key)
         if ports is not None and (key in self.serving or self.may_stay(key, ports)):
-            self.given[key] = ports
+            self.allocated[key] = ports
             return
-        created = [one.range for one in self.observed.sandboxes_of(key)]
+        created = [sandbox.range for sandbox in self.observed.sandboxes_of(key)]
         ports = self.memory.planned.get(key) or (created[0] if created else None)
         # What listens on ports of a sandbox that is there may be the engine, which is starting it.
         blocked = self.claimed(key) if ports in created else self.blocked(key)
-        if ports and is_free(ports, blocked | reserved_ports(key), self.held(key)):
-            self.given[key] = ports
+        if ports and is_free(ports, blocked | reserved_ports(key), self.blocked_ranges(key)):
+            self.allocated[key] = ports
 
     def fill(self, desired: Desired, frozen: bool) -> None:
         """Give a key more ports if it has too few, or a range if it has none."""
         key, count, window = desired.key, desired.ports, self.settings.port_window
-        blocked, held = self.blocked(key) | reserved_ports(key), self.held(key)
-        kept = self.given.get(key)
+        blocked, ranges = self.blocked(key) | reserved_ports(key), self.blocked_ranges(key)
+        kept = self.allocated.get(key)
         if kept is None:
             try:
-                self.given[key] = negotiate(count, window, blocked, held)
+                self.allocated[key] = negotiate(count, window, blocked, ranges)
             except PortsExhausted as error:
                 text = (
                     f"{error}: lower --ports or the label rosproxy.ports ({count}), widen "
@@ -159,12 +159,12 @@ class _Allocation:
                 )
                 self.problems.append(_problem(key, text, fatal=True))
         elif not frozen:
-            self.given[key] = extended(kept, count, window, blocked, held) or kept
-            if len(self.given[key]) < count:
-                more = PortRange(kept.last + 1, kept.first + count - 1)
+            self.allocated[key] = extended(kept, count, window, blocked, ranges) or kept
+            if len(self.allocated[key]) < count:
+                missing = PortRange(kept.last + 1, kept.first + count - 1)
                 text = (
                     f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps "
-                    f"its {len(kept)} at {kept}, since {more} are not free or beyond "
+                    f"its {len(kept)} at {kept}, since {missing} are not free or beyond "
                     "--port-window: stop what holds them"
                 )
                 self.problems.append(_problem(key, text))
@@ -184,24 +184,24 @@ def allocate(
     One that has served and does not is only moved if others are seen on its ports. With ``frozen``
     no range gets longer: nothing can be created.
     """
-    live = {one.key: one for one in desired if one.live}
+    live = {d.key: d for d in desired if d.live}
     allocation = _Allocation(observed, settings, memory, live)
     order = sorted(live, key=allocation.order)
     for key in order:
         allocation.keep(key)
     for key in order:
         allocation.fill(live[key], frozen)
-    given, served = allocation.given, dict(memory.served)
-    left = [key for key in given if key in served and not within(served[key], given[key])]
-    moved = {key: Move(served.pop(key), now) for key in left} | dict(memory.moved)
-    for key, ports in sorted(given.items(), key=lambda item: item[0]):
+    ranges, served = allocation.allocated, dict(memory.served)
+    leaving = [key for key in ranges if key in served and not within(served[key], ranges[key])]
+    moved = {key: Move(served.pop(key), now) for key in leaving} | dict(memory.moved)
+    for key, ports in sorted(ranges.items(), key=lambda item: item[0]):
         if key in moved and not within(moved[key].ports, ports):
             text = (
                 f"HAS LEFT ITS PORTS {moved[key].ports} for {ports}, since something else has "
                 f"taken them: {after_move(not key.is_ros2, key.is_ros2)}"
             )
             allocation.problems.append(_problem(key, text))
-    memory = replace(memory, served=served, planned=given, moved=moved)
+    memory = replace(memory, served=served, planned=ranges, moved=moved)
     return memory, allocation.problems
 
 

@@ -1,7 +1,7 @@
 """From members to the proxies that there ought to be, and the names under which nodes find them.
 
 An engine answers with all containers that have a name, in any order. So no name is taken that
-another one holds: nodes would reach now this, now that.
+another one holds: nodes would reach now one, now the other.
 """
 
 from collections import defaultdict
@@ -33,7 +33,7 @@ from rosproxy_operator.docker.planner.specs import master, proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 
 _PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
-"""Who asks for what the proxy can't do by itself goes first."""
+"""In order of precedence: first what the proxy can't do by itself."""
 Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
 """For a key and a network, the names of the key's proxy there."""
 _GONE = frozenset({"dead", "removing"})
@@ -64,11 +64,11 @@ def desire(
     desired: list[Desired] = []
     for key in sorted({member.key for member in members} | observed.keys):
         own = tuple(member for member in alive if member.key == key and member.networks & usable)
-        left = [member for member in recent if member.key == key]
-        there = {name for box in observed.sandboxes_of(key) for name in box.container.networks}
-        networks = _networks(own) | (_networks(left) & there)
+        exited = [member for member in recent if member.key == key]
+        joined = {name for s in observed.sandboxes_of(key) for name in s.container.networks}
+        networks = _networks(own) | (_networks(exited) & joined)
         ports = max([settings.ports, *(member.ports for member in own)])
-        every = [*own, *left]
+        considered = [*own, *exited]
         desired.append(
             Desired(
                 key,
@@ -76,21 +76,21 @@ def desire(
                 max(ports, LEAST_PORTS) if key.is_ros2 else ports,
                 networks & usable,
                 own,
-                chosen_plane(every, settings.data_plane),
-                "any" if key.is_ros2 else chosen_control(every, settings.slave_control),
-                chosen_direction(every, settings.direction),
-                not key.is_ros2 and chosen_udp(every, settings),
-                _peers(every, settings) if key.is_ros2 else (),
+                chosen_plane(considered, settings.data_plane),
+                "any" if key.is_ros2 else chosen_control(considered, settings.slave_control),
+                chosen_direction(considered, settings.direction),
+                not key.is_ros2 and chosen_udp(considered, settings),
+                _peers(considered, settings) if key.is_ros2 else (),
             )
         )
-    told = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
-    return tuple(desired), (*told, *_outvoted(desired))
+    bad_networks = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
+    return tuple(desired), (*bad_networks, *_outvoted(desired))
 
 
 def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
     """The data plane of a proxy with these containers; ``default`` if none asks for one."""
-    asked = {member.data_plane for member in members}
-    return next((plane for plane in _PLANES if plane in asked), default)
+    planes = {member.data_plane for member in members}
+    return next((plane for plane in _PLANES if plane in planes), default)
 
 
 def chosen_control(members: Iterable[Member], default: SlaveControl) -> SlaveControl:
@@ -98,8 +98,8 @@ def chosen_control(members: Iterable[Member], default: SlaveControl) -> SlaveCon
 
     A node is not to be open to all because of a neighbour; who asks for more only gets less.
     """
-    asked = {default, *(member.slave_control for member in members)}
-    return "master" if "master" in asked else "any"
+    controls = {default, *(member.slave_control for member in members)}
+    return "master" if "master" in controls else "any"
 
 
 def chosen_direction(members: Iterable[Member], default: Direction) -> Direction:
@@ -107,8 +107,8 @@ def chosen_direction(members: Iterable[Member], default: Direction) -> Direction
 
     Who has a route outwards loses nothing by going through the proxy.
     """
-    asked = {member.direction or default for member in members} or {default}
-    return "both" if "both" in asked else "out"
+    directions = {member.direction or default for member in members} or {default}
+    return "both" if "both" in directions else "out"
 
 
 def chosen_udp(members: Collection[Member], settings: PlanSettings) -> bool:
@@ -116,13 +116,13 @@ def chosen_udp(members: Collection[Member], settings: PlanSettings) -> bool:
 
     That is of no use without the other direction: datagrams outwards need no port.
     """
-    both = chosen_direction(members, settings.direction) == "both"
-    return both and any(settings.udp if one.udp is None else one.udp for one in members)
+    is_both_ways = chosen_direction(members, settings.direction) == "both"
+    return is_both_ways and any(settings.udp if m.udp is None else m.udp for m in members)
 
 
 def _peers(members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
-    """Whom a proxy for ROS 2 tells of participants: whom the operator says, and each container."""
-    return tuple(sorted({*settings.ros2_peer, *(peer for each in members for peer in each.peers)}))
+    """The peers a proxy for ROS 2 tells of participants: the operator's and its containers'."""
+    return tuple(sorted({*settings.ros2_peer, *(peer for m in members for peer in m.peers)}))
 
 
 def _networks(members: Iterable[Member]) -> frozenset[str]:
@@ -152,35 +152,35 @@ def _bad_network(name: str, uplink: str) -> Problem:
 
 
 def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
-    """Tell the containers what their proxy is not that they ask for."""
-    for one in desired:
-        winners = [m.container.name for m in one.members if m.data_plane == one.data_plane]
-        for member in one.members:
-            if member.udp and one.direction == "out":
+    """Warn the containers whose proxy is not as their labels ask."""
+    for wanted in desired:
+        winners = [m.container.name for m in wanted.members if m.data_plane == wanted.data_plane]
+        for member in wanted.members:
+            if member.udp and wanted.direction == "out":
                 yield Problem(
                     f"container {member.container.name}",
                     f"label {UDP}=true is ignored: datagrams get in with both directions alone; "
                     f"add the label {DIRECTION}=both, or take this one off",
                     fatal=False,
                 )
-            if member.data_plane not in (None, one.data_plane):
+            if member.data_plane not in (None, wanted.data_plane):
                 yield Problem(
                     f"container {member.container.name}",
                     f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves "
-                    f"{next(iter(winners), 'another one')}, which asks for {one.data_plane}; give "
-                    "both the same",
+                    f"{next(iter(winners), 'another one')}, which asks for {wanted.data_plane}; "
+                    "give both the same",
                     fatal=False,
                 )
 
 
 @dataclass(frozen=True, slots=True)
 class _Claim:
-    """A name on a network, who wants it, and who has it already."""
+    """A name on a network, the proxies that want it, and the containers and proxies with it."""
 
     network: str
     alias: str
     claimants: tuple[Desired, ...]
-    others: tuple[str, ...]
+    containers: tuple[str, ...]
     holders: tuple[Key, ...]
 
     @property
@@ -191,12 +191,12 @@ class _Claim:
         to the first one whose containers look for it, else to the first that would have it. One
         that shares its name with another container loses it when it joins the network anew.
         """
-        if self.others:
+        if self.containers:
             return None
         if self.holders:
             return self.holders[0]
-        needed = [one.key for one in self.claimants if needed_by(one, self.network, self.alias)]
-        return (needed or [one.key for one in self.claimants])[0]
+        needed = [d.key for d in self.claimants if needed_by(d, self.network, self.alias)]
+        return (needed or [d.key for d in self.claimants])[0]
 
 
 def assign(desired: Collection[Desired], observed: HostState) -> tuple[Aliases, list[Problem]]:
@@ -204,21 +204,21 @@ def assign(desired: Collection[Desired], observed: HostState) -> tuple[Aliases, 
 
     ``desired`` is sorted by key.
     """
-    given: dict[Key, dict[str, tuple[str, ...]]] = {}
+    aliases: dict[Key, dict[str, tuple[str, ...]]] = {}
     problems: list[Problem] = []
     neighbours: dict[str, list[Container]] = defaultdict(list)
     for container in observed.containers:
         for network in container.networks:
             neighbours[network].append(container)
-    for network in sorted({name for one in desired if one.live for name in one.networks}):
-        there = [one for one in desired if network in one.networks]
-        for alias in sorted({name for one in there if one.live for name in _names(one.key)}):
-            claim = _claim(network, alias, there, neighbours[network], observed.sandboxes)
+    for network in sorted({name for d in desired if d.live for name in d.networks}):
+        proxies = [d for d in desired if network in d.networks]
+        for alias in sorted({name for d in proxies if d.live for name in _names(d.key)}):
+            claim = _claim(network, alias, proxies, neighbours[network], observed.sandboxes)
             if claim.owner is not None:
-                names = given.setdefault(claim.owner, {})
+                names = aliases.setdefault(claim.owner, {})
                 names[network] = (*names.get(network, ()), alias)
             problems += _problems(claim)
-    return given, problems
+    return aliases, problems
 
 
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
@@ -233,9 +233,9 @@ def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
 def holds(container: Container, network: str, alias: str) -> bool:
     """Whether a container answers to a name on a network; case does not matter to engines."""
     return any(
-        alias.lower() in map(str.lower, place.names)
-        for place in container.attachments
-        if place.network == network
+        alias.lower() in map(str.lower, attachment.names)
+        for attachment in container.attachments
+        if attachment.network == network
     )
 
 
@@ -250,42 +250,42 @@ def _names(key: Key) -> tuple[str, ...]:
 def _claim(
     network: str,
     alias: str,
-    there: Iterable[Desired],
+    proxies: Iterable[Desired],
     neighbours: Iterable[Container],
     sandboxes: Iterable[Sandbox],
 ) -> _Claim:
-    others = [
+    containers = [
         container.name
         for container in neighbours
         if container.state not in _GONE and holds(container, network, alias)
     ]
-    having = [box for box in sandboxes if holds(box.container, network, alias)]
-    staying = [one.key for one in there if one.key in {box.key for box in having}]
+    holding = [s for s in sandboxes if holds(s.container, network, alias)]
+    staying = [d.key for d in proxies if d.key in {s.key for s in holding}]
     # One that is restarting can't leave the network: it answers there again in a moment.
-    stuck = sorted(box.key for box in having if box.container.state == "restarting")
+    stuck = sorted(s.key for s in holding if s.container.state == "restarting")
     return _Claim(
         network,
         alias,
-        claimants=tuple(one for one in there if one.live and alias in _names(one.key)),
-        others=tuple(sorted(others)),
+        claimants=tuple(d for d in proxies if d.live and alias in _names(d.key)),
+        containers=tuple(sorted(containers)),
         holders=tuple(dict.fromkeys([*staying, *stuck])),
     )
 
 
 def _problems(claim: _Claim) -> Iterator[Problem]:
-    """What containers are told that look for their proxy by a name that others have."""
-    containers = [f"container {name}" for name in claim.others]
-    for one in claim.claimants:
-        if one.key == claim.owner and not claim.others and len(claim.holders) <= 1:
+    """Warnings for containers that look for their proxy by a name that others have."""
+    subjects = [f"container {name}" for name in claim.containers]
+    for claimant in claim.claimants:
+        if claimant.key == claim.owner and not claim.containers and len(claim.holders) <= 1:
             continue
-        proxies = {*claim.holders, claim.owner or one.key} - {one.key}
-        others = [*containers, *sorted(f"proxy {proxy_name(other)}" for other in proxies)]
-        host = proxy_name(one.key) if claim.alias == ALIAS else ALIAS
-        for container in needed_by(one, claim.network, claim.alias):
+        proxies = {*claim.holders, claim.owner or claimant.key} - {claimant.key}
+        holders = [*subjects, *sorted(f"proxy {proxy_name(key)}" for key in proxies)]
+        host = proxy_name(claimant.key) if claim.alias == ALIAS else ALIAS
+        for container in needed_by(claimant, claim.network, claim.alias):
             yield Problem(
                 f"container {container}",
                 f"looks for its proxy by the name {claim.alias}, but on network {claim.network} "
-                f"{listed(others)} answers to it, so its nodes go around their proxy: "
-                f"set ROS_MASTER_URI=http://{host}:{master(one.key).port}",
+                f"{listed(holders)} answers to it, so its nodes go around their proxy: "
+                f"set ROS_MASTER_URI=http://{host}:{master(claimant.key).port}",
                 fatal=False,
             )

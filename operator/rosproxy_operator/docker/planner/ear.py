@@ -33,8 +33,8 @@ def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:
     key = context.desired.key
     if not key.is_ros2:
         return steps
-    boxes = {box.container.name for box in context.observed.sandboxes_of(key)}
-    if any(_starts(step, boxes) for step in steps):
+    sandboxes = {s.container.name for s in context.observed.sandboxes_of(key)}
+    if any(_starts(step, sandboxes) for step in steps):
         return [*_without(context, "its proxy gets another address"), *steps]
     return [*steps, *_ear_steps(context)]
 
@@ -50,9 +50,9 @@ def missing_ear(key: Key, observed: HostState, settings: PlanSettings) -> Proble
     return Problem(f"proxy {proxy_name(key)}", text, fatal=False)
 
 
-def _starts(step: Action, boxes: Collection[str]) -> bool:
+def _starts(step: Action, sandboxes: Collection[str]) -> bool:
     """Whether a sandbox, one of these or a new one, begins or ends by a step."""
-    begins = isinstance(step, Start | Remove) and step.name in boxes
+    begins = isinstance(step, Start | Remove) and step.name in sandboxes
     return begins or isinstance(step, CreateSandbox)
 
 
@@ -67,48 +67,48 @@ def _wanted(context: PlanContext) -> CreateEar | None:
     """The ear that there ought to be; None if there ought to be none, or its proxy is not found."""
     key, observed, settings = context.desired.key, context.observed, context.settings
     lan, bind = _lan(key, observed, settings), context.ear
-    near = next(
+    address = next(
         (
-            place.address
-            for box in observed.sandboxes_of(key)
-            for place in box.container.attachments
-            if place.network == settings.uplink and place.address
+            attachment.address
+            for sandbox in observed.sandboxes_of(key)
+            for attachment in sandbox.container.attachments
+            if attachment.network == settings.uplink and attachment.address
         ),
         "",
     )
-    if not lan or not near or bind is None:
+    if not lan or not address or bind is None:
         return None
-    proxy = HostPort(near, context.ports.first)
+    proxy = HostPort(address, context.ports.first)
     return CreateEar(ear_name(key), key, context.ports, lan, bind, proxy)
 
 
 def _ear_steps(context: PlanContext) -> Iterator[Action]:
-    made = _wanted(context)
+    ear = _wanted(context)
     if context.settings.ros2_lan == NOWHERE:
         yield from _without(context, "the LAN is not to be heard")
-    elif made is not None:
-        yield from _made(context, made)
+    elif ear is not None:
+        yield from _ensure_ear(context, ear)
 
 
-def _made(context: PlanContext, made: CreateEar) -> Iterator[Action]:
-    """The steps to have this very ear, and no other."""
-    ears = context.observed.ears_of(made.key)
-    expected = ear_fingerprint(made, context.settings, context.observed.image_id)
-    found = context.select(ears, made.name, expected, lambda _: True)
-    if found.stuck or found.waiting:
+def _ensure_ear(context: PlanContext, ear: CreateEar) -> Iterator[Action]:
+    """The steps to have this ear and no other."""
+    ears = context.observed.ears_of(ear.key)
+    expected = ear_fingerprint(ear, context.settings, context.observed.image_id)
+    selection = context.select(ears, ear.name, expected, lambda _: True)
+    if selection.stuck or selection.waiting:
         return
-    yield from (Remove(one.name, "left over") for one in found.others)
+    yield from (Remove(container.name, "left over") for container in selection.others)
     taken = context.taken(ears)
-    if found.kept is None:
-        made = replace(made, name=free_name(made.name, taken), fingerprint=expected)
-        yield from created(found, made, former_name(found.old, made.name, taken))
+    if selection.kept is None:
+        ear = replace(ear, name=free_name(ear.name, taken), fingerprint=expected)
+        yield from created(selection, ear, former_name(selection.old, ear.name, taken))
         return
-    yield from tended(found, found.kept)
-    if made.name not in (found.kept.name, *taken):
-        yield Rename(found.kept.name, made.name)
+    yield from tended(selection, selection.kept)
+    if ear.name not in (selection.kept.name, *taken):
+        yield Rename(selection.kept.name, ear.name)
 
 
-def _without(context: PlanContext, why: str) -> Iterator[Action]:
-    for one in context.observed.ears_of(context.desired.key):
-        if one.container.state != "removing":
-            yield Remove(one.container.name, why)
+def _without(context: PlanContext, reason: str) -> Iterator[Action]:
+    for ear in context.observed.ears_of(context.desired.key):
+        if ear.container.state != "removing":
+            yield Remove(ear.container.name, reason)

@@ -18,23 +18,23 @@ from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanS
 OUTLIVES = 10.0
 """Seconds for which an address keeps its layers after its container has gone.
 
-What its nodes have registered goes a moment later, and must not come to light before it does.
+What its nodes have registered is removed a moment later, and must not become visible before.
 """
 
 
 def within_bounds(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """The members whose rules their proxies can hold, and what the others are told."""
+    """The members whose rules their proxies can hold, and problems of the others."""
     common = sum(len(layer.rules) for layer in settings.policy)
     rules: Counter[Key] = Counter()
     layers: Counter[Key] = Counter()
     crowded: list[Member] = []
     asking = [member for member in members if member.policy and member.container.alive]
-    for member in sorted(asking, key=lambda one: (len(one.policy), one.container.name)):
+    for member in sorted(asking, key=lambda m: (len(m.policy), m.container.name)):
         key = member.key
-        many = common + rules[key] + len(member.policy) > MOST_RULES
-        if many or layers[key] + len(settings.policy) >= MOST_LAYERS:
+        is_crowded = common + rules[key] + len(member.policy) > MOST_RULES
+        if is_crowded or layers[key] + len(settings.policy) >= MOST_LAYERS:
             crowded.append(member)
             continue
         rules[key] += len(member.policy)
@@ -53,15 +53,15 @@ def label_layers(
     members: Iterable[Member], by_id: Mapping[str, Container], networks: Collection[str]
 ) -> tuple[PolicyLayer, ...]:
     """The layers of a proxy's containers, for their addresses on these networks."""
-    found: list[PolicyLayer] = []
+    layers: list[PolicyLayer] = []
     for member in members:
         owner = network_owner(member.container, by_id)
-        places = (place for place in owner.attachments if place.network in networks)
-        addresses = frozenset(place.address for place in places if place.address)
+        attachments = (a for a in owner.attachments if a.network in networks)
+        addresses = frozenset(a.address for a in attachments if a.address)
         if member.policy and member.container.alive and addresses:
             name = bounded(f"label of container {member.container.name}", LONGEST_LAYER_NAME)
-            found.append(PolicyLayer(name, member.policy, addresses=addresses))
-    return tuple(found)
+            layers.append(PolicyLayer(name, member.policy, addresses=addresses))
+    return tuple(layers)
 
 
 def network_owner(container: Container, by_id: Mapping[str, Container]) -> Container:
@@ -73,14 +73,14 @@ class RecentLayers:
     """The layers of containers' labels, and for some seconds those of containers that are gone."""
 
     def __init__(self) -> None:
-        self._seen: dict[tuple[PolicyLayer, str], float] = {}
+        self._last_seen: dict[tuple[PolicyLayer, str], float] = {}
 
     def look(
         self, layers: Iterable[PolicyLayer], taken: Collection[str], now: float
     ) -> tuple[PolicyLayer, ...]:
-        """All that a proxy is to have, with those that a look has found.
+        """All layers that a proxy is to have, the ``layers`` of this look included.
 
-        ``taken`` are the addresses of all containers: whose address another one has is gone.
+        ``taken`` are the addresses of all containers: layers of earlier looks keep none of them.
         """
         current = {
             (structs.replace(layer, addresses=None), address): now
@@ -89,21 +89,19 @@ class RecentLayers:
         }
         recent = {
             pair: since
-            for pair, since in self._seen.items()
+            for pair, since in self._last_seen.items()
             if now < since + OUTLIVES and pair[1] not in taken
         }
-        self._seen = recent | current
-        found = _joined(self._seen)
-        fits = sum(len(layer.rules) for layer in found) <= MOST_RULES and len(found) < MOST_LAYERS
-        return found if fits else _joined(current)
+        self._last_seen = recent | current
+        joined = _joined(self._last_seen)
+        fits = sum(len(layer.rules) for layer in joined) <= MOST_RULES and len(joined) < MOST_LAYERS
+        return joined if fits else _joined(current)
 
 
-def _joined(seen: Mapping[tuple[PolicyLayer, str], float]) -> tuple[PolicyLayer, ...]:
+def _joined(pairs: Mapping[tuple[PolicyLayer, str], float]) -> tuple[PolicyLayer, ...]:
     """Layers with all their addresses, in a steady order."""
     addresses: dict[PolicyLayer, set[str]] = {}
-    for layer, address in seen:
+    for layer, address in pairs:
         addresses.setdefault(layer, set()).add(address)
-    whole = (
-        structs.replace(layer, addresses=frozenset(found)) for layer, found in addresses.items()
-    )
-    return tuple(sorted(whole, key=lambda layer: (layer.name, format_rules(layer.rules))))
+    joined = (structs.replace(layer, addresses=frozenset(a)) for layer, a in addresses.items())
+    return tuple(sorted(joined, key=lambda layer: (layer.name, format_rules(layer.rules))))

@@ -12,7 +12,7 @@ from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
-"""States of a container, in the engine's words, in which it is or may soon be somebody's node."""
+"""States of a container, in the engine's words, in which its nodes run, or may soon."""
 STARTED = frozenset({"running", "paused"})
 SERVING = STARTED | {"restarting"}
 """States of a container that runs, or does again in a moment."""
@@ -139,8 +139,8 @@ class Container:
     @property
     def shares(self) -> str | None:
         """The container whose network namespace it is in, by id or name; None if in its own."""
-        _, shared, other = self.network_mode.partition("container:")
-        return other if shared else None
+        _, separator, container = self.network_mode.partition("container:")
+        return container if separator else None
 
     @property
     def networks(self) -> frozenset[str]:
@@ -272,28 +272,28 @@ class HostState:
     @property
     def keys(self) -> frozenset[Key]:
         """The keys of all that is the operator's own."""
-        return frozenset(one.key for one in self.own)
+        return frozenset(own.key for own in self.own)
 
     def sandboxes_of(self, key: Key) -> tuple[Sandbox, ...]:
         """The sandboxes of a key."""
-        return tuple(one for one in self.sandboxes if one.key == key)
+        return tuple(s for s in self.sandboxes if s.key == key)
 
     def proxies_of(self, key: Key) -> tuple[Proxy, ...]:
         """The proxies of a key."""
-        return tuple(one for one in self.proxies if one.key == key)
+        return tuple(p for p in self.proxies if p.key == key)
 
     def gateway(self, name: str) -> str:
         """The gateway of a network; empty if it has none or is not there."""
-        return next((one.gateway for one in self.networks if one.name == name), "")
+        return next((n.gateway for n in self.networks if n.name == name), "")
 
     def ears_of(self, key: Key) -> tuple[EarContainer, ...]:
         """The ears of a key."""
-        return tuple(one for one in self.ears if one.key == key)
+        return tuple(e for e in self.ears if e.key == key)
 
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy is; None if it is there no more."""
-        home = proxy.container.shares
-        return next((box for box in self.sandboxes if box.container.id == home), None)
+        sandbox_id = proxy.container.shares
+        return next((s for s in self.sandboxes if s.container.id == sandbox_id), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +307,7 @@ class Member:
     ``policy`` are rules for its own nodes alone. ``peers`` are hosts outside, for a member of a
     ROS 2 domain, which has none of the others but ``ports`` and ``networks``. ``redirect`` is what
     its label says, None without one; ``by_address`` the address and port of its master that are to
-    lead to its proxy, in its network, None if nothing is to. A container that is not alive only
+    lead to its proxy, in its network, None if none are. A container that is not alive only
     keeps networks joined, and what else its labels made its proxy, for a while.
     """
 

@@ -47,9 +47,9 @@ _NEVER = (
     *("Privileged", "Binds", "Mounts", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
     *("PidMode", "UTSMode", "UsernsMode"),
 )
-"""Of the HostConfig what the operator never sets."""
+"""Fields of the HostConfig that the operator never sets."""
 _OWN_IPC = (None, "", "private", "shareable")
-"""What engines have for IpcMode where nothing was said."""
+"""What engines set as IpcMode by default."""
 _COMMANDS = {
     ROLE_SANDBOX: SANDBOX_COMMAND,
     ROLE_PROXY: PROXY_COMMAND,
@@ -92,8 +92,8 @@ def gives_away(own: OwnLabels, name: str, making: Making, image_id: str) -> str:
     command = _COMMANDS[own.role]
     of_image = own.role == ROLE_PROXY and making.image == image_id
     # What a redirect runs ends with its rules: they are in its fingerprint, and so in its name.
-    found = making.command[:1] if own.role == ROLE_REDIRECT else making.command
-    if found != command and not of_image:
+    actual = making.command[:1] if own.role == ROLE_REDIRECT else making.command
+    if actual != command and not of_image:
         return f"its command is not {' '.join(command)}"
     odd = {
         ROLE_SANDBOX: _odd_sandbox(own, making.host),
@@ -111,7 +111,7 @@ def _name(own: OwnLabels) -> str:
 
 
 def _odd(host: Mapping[str, Any]) -> Iterator[str]:
-    """The fields of a HostConfig that are otherwise on each container of the operator's."""
+    """The fields of a HostConfig that differ from what all containers of the operator have."""
     if host.get("ReadonlyRootfs") is not True:
         yield "ReadonlyRootfs"
     if host.get("CapDrop") != ["ALL"]:
@@ -131,15 +131,15 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
     if mode in ("host", "none") or mode.startswith("container:"):
         yield "NetworkMode"
     bindings = host.get("PortBindings") or {}
-    wanted = [
+    expected = [
         {name: {str(port)} for name, port in published_ports(own.key, own.range, udp)}
         for udp in (False, True)
     ]
-    found = {
-        port: {str(each.get("HostPort")) for each in bound or ()}
-        for port, bound in bindings.items()
+    actual = {
+        port: {str(binding.get("HostPort")) for binding in bindings_of_port or ()}
+        for port, bindings_of_port in bindings.items()
     }
-    if found not in wanted:
+    if actual not in expected:
         yield "PortBindings"
     sysctls = (host.get("Sysctls") or {}).keys()
     if "net.ipv4.ip_local_port_range" not in sysctls or not sysctls <= _SYSCTLS:

@@ -30,10 +30,9 @@ SOON = 1.0
 class Group:
     """Actions to be carried out one after the other, for one key (or for the uplink: no key).
 
-    Those ``about`` a container alone, a redirect, wait for nothing else of the key, nor else for
-    them.
-    When one fails, the rest is left out, so that a proxy is only removed when the one that takes
-    over was created; but a failed Connect or Disconnect keeps nothing else from being done.
+    One ``about`` a container alone, for a redirect, and the key's other groups do not wait for each
+    other. When an action fails, the rest of its group is left out, so that a proxy is only removed
+    when its successor was created; but a failed Connect or Disconnect stops nothing else.
     """
 
     key: Key | None
@@ -84,27 +83,27 @@ def plan(
     desired, bad_networks = desire(observed, settings, members, memory, now)
     memory = looked(memory, observed, desired, settings.grace, now)
     aliases, missed = assign(desired, observed)
-    live = {one.key for one in desired if one.live}
+    live = {d.key for d in desired if d.live}
     memory = refused(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
     creatable = obstacle is None
     memory, tight = allocate(observed, settings, desired, memory, now, frozen=not creatable)
-    over = {key for key, since in memory.absent.items() if now - since >= settings.grace}
-    planned: dict[Key, list[Action] | None] = {key: [*retired(observed, key)] for key in over}
-    for one in desired:
-        if ports := memory.planned.get(one.key):  # else its problem is told already
-            names = aliases.get(one.key, {})
-            context = PlanContext(observed, settings, one, ports, names, creatable)
+    expired = {key for key, since in memory.absent.items() if now - since >= settings.grace}
+    planned: dict[Key, list[Action] | None] = {key: [*retired(observed, key)] for key in expired}
+    for wanted in desired:
+        if ports := memory.planned.get(wanted.key):  # else its problem is reported already
+            names = aliases.get(wanted.key, {})
+            context = PlanContext(observed, settings, wanted, ports, names, creatable)
             steps = wanted_steps(context)
-            planned[one.key] = steps if steps is None else with_ear(context, steps)
+            planned[wanted.key] = steps if steps is None else with_ear(context, steps)
     problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *missed, *tight]
     problems += _unwell(observed, live)
     problems += _deaf(observed, settings, live)
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))
-    groups = [*_possible(observed, settings, desired, planned)]
+    groups = [*_possible_groups(observed, settings, desired, planned)]
     deferred = tuple(group for group in groups if _waits(group, observed, settings.uplink))
-    found = DockerPlan(
+    docker_plan = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
         deferred=deferred,
         memory=memory,
@@ -112,8 +111,8 @@ def plan(
         members=members,
         desired=desired,
     )
-    ends = [end for end in _ends(observed, settings, found, now) if end > 0]
-    return replace(found, again_in=min(ends, default=None))
+    delays = [delay for delay in _delays(observed, settings, docker_plan, now) if delay > 0]
+    return replace(docker_plan, again_in=min(delays, default=None))
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
@@ -134,16 +133,16 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     return None
 
 
-def _possible(
+def _possible_groups(
     observed: HostState,
     settings: PlanSettings,
     desired: Collection[Desired],
     planned: Mapping[Key, list[Action] | None],
 ) -> Iterator[Group]:
     """All groups but those of keys of which a container is busy, and the redirects'."""
-    busy = {one.key for one in observed.own if one.container.name in observed.busy}
-    every = _groups(observed, settings.uplink, desired, planned)
-    yield from (group for group in every if group.key not in busy)
+    busy = {own.key for own in observed.own if own.container.name in observed.busy}
+    groups = _groups(observed, settings.uplink, desired, planned)
+    yield from (group for group in groups if group.key not in busy)
     for steps in redirect_steps(observed, settings, desired):
         yield Group(steps.key, steps.actions, f"container {steps.container}")
 
@@ -155,28 +154,28 @@ def _groups(
     planned: Mapping[Key, list[Action] | None],
 ) -> Iterator[Group]:
     """First what makes names free, then the uplink, then one key after the other."""
-    for one in desired:
-        for action in leave(observed, one, planned.get(one.key) or [], uplink):
-            yield Group(one.key, (action,))
-    every = [action for actions in planned.values() for action in actions or ()]
-    joins = (isinstance(a, Connect) and a.network == uplink for a in every)
-    needed = any(joins) or any(isinstance(action, CreateSandbox) for action in every)
-    if needed and uplink not in {network.name for network in observed.networks}:
+    for wanted in desired:
+        for action in leave(observed, wanted, planned.get(wanted.key) or [], uplink):
+            yield Group(wanted.key, (action,))
+    all_actions = [action for actions in planned.values() for action in actions or ()]
+    joins = (isinstance(a, Connect) and a.network == uplink for a in all_actions)
+    is_needed = any(joins) or any(isinstance(action, CreateSandbox) for action in all_actions)
+    if is_needed and uplink not in {network.name for network in observed.networks}:
         yield Group(None, (CreateNetwork(uplink),))
-    for one in desired:
-        if actions := planned.get(one.key):
-            yield Group(one.key, tuple(actions))
+    for wanted in desired:
+        if actions := planned.get(wanted.key):
+            yield Group(wanted.key, tuple(actions))
 
 
 def _waits(group: Group, observed: HostState, uplink: str) -> bool:
     """Whether a group makes a proxy that lacks an address: its master's, or that of its uplink."""
     return any(
-        isinstance(action, Create) and _lacks(action.key, observed, uplink)
+        isinstance(action, Create) and _lacks_address(action.key, observed, uplink)
         for action in group.actions
     )
 
 
-def _lacks(key: Key, observed: HostState, uplink: str) -> bool:
+def _lacks_address(key: Key, observed: HostState, uplink: str) -> bool:
     if key.is_ros2:  # its ear is at the uplink's gateway
         return uplink not in {network.name for network in observed.networks}
     return observed.masters.get(master(key).host) == ""
@@ -184,36 +183,36 @@ def _lacks(key: Key, observed: HostState, uplink: str) -> bool:
 
 def _deaf(observed: HostState, settings: PlanSettings, live: Collection[Key]) -> Iterator[Problem]:
     """Proxies for ROS 2 that lack an ear."""
-    found = (missing_ear(key, observed, settings) for key in sorted(live) if key.is_ros2)
-    yield from filter(None, found)
+    problems = (missing_ear(key, observed, settings) for key in sorted(live) if key.is_ros2)
+    yield from filter(None, problems)
 
 
 def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
     """Proxies that end again and again, and masters that are not found."""
-    for one in observed.own:
-        name = one.container.name
-        if one.key in live and one.container.state == "restarting":
+    for own in observed.own:
+        name = own.container.name
+        if own.key in live and own.container.state == "restarting":
             yield Problem(f"proxy {name}", f"ends and is restarted: see docker logs {name}")
     for host in sorted(host for host, address in observed.masters.items() if not address):
         yield Problem(f"master {host}", unresolved_master(host))
 
 
-def _ends(
-    observed: HostState, settings: PlanSettings, found: DockerPlan, now: float
+def _delays(
+    observed: HostState, settings: PlanSettings, docker_plan: DockerPlan, now: float
 ) -> Iterator[float]:
-    """In how many seconds something comes to its end that no event tells."""
-    memory = found.memory
-    for one in found.desired:
-        own = [each.container for each in observed.own if each.key == one.key]
-        if not one.live and any(each.state != "removing" for each in own):
-            yield settings.grace - (now - memory.absent[one.key])
-        if one.live and any(e.state == "removing" or e.name in memory.refusals for e in own):
+    """In how many seconds something ends without an event."""
+    memory = docker_plan.memory
+    for wanted in docker_plan.desired:
+        present = [own.container for own in observed.own if own.key == wanted.key]
+        if not wanted.live and any(c.state != "removing" for c in present):
+            yield settings.grace - (now - memory.absent[wanted.key])
+        if wanted.live and any(c.state == "removing" or c.name in memory.refusals for c in present):
             yield SOON
-    if any(one.container.state == "removing" for one in observed.redirects):
+    if any(r.container.state == "removing" for r in observed.redirects):
         yield SOON
-    for member in found.members:
-        boxes = [one.container for one in observed.sandboxes_of(member.key)]
-        joined = any(b.networks & member.networks for b in boxes if b.state != "removing")
+    for member in docker_plan.members:
+        sandboxes = [s.container for s in observed.sandboxes_of(member.key)]
+        joined = any(c.networks & member.networks for c in sandboxes if c.state != "removing")
         asks = member.data_plane or member.direction or member.udp or member.peers
         if not member.container.alive and (joined or asks):
             yield settings.grace - (now - memory.exited[member.container.id])

@@ -92,41 +92,41 @@ class Places:
         self._absent: dict[ContainerNetwork, float] = {}
         self._moves: dict[str, tuple[str, float]] = {}
 
-    def look(self, known: NetworkFacts, now: float) -> None:
+    def look(self, latest: NetworkFacts, now: float) -> None:
         """Compare with what the last look has found."""
-        missing = [place for place in self._at if place not in known.addresses]
+        missing = [place for place in self._at if place not in latest.addresses]
         self._absent = {place: self._absent.get(place, now) for place in missing}
         for place, since in list(self._absent.items()):
-            if place[0] not in known.running or now >= since + AWAY:
+            if place[0] not in latest.running or now >= since + AWAY:
                 del self._at[place], self._absent[place]
-        for place, address in known.addresses.items():
-            before = self._at.get(place, address)
-            if before != address:
-                self._moves[before] = address, now
-        self._follow(known, now)
-        self._at |= known.addresses
+        for place, address in latest.addresses.items():
+            previous = self._at.get(place, address)
+            if previous != address:
+                self._moves[previous] = address, now
+        self._follow(latest, now)
+        self._at |= latest.addresses
         self._moves = {
             old: (new, since)
             for old, (new, since) in self._moves.items()
-            if now < since + MOVING and old not in known.addresses.values()
+            if now < since + MOVING and old not in latest.addresses.values()
         }
 
-    def _follow(self, known: NetworkFacts, now: float) -> None:
+    def _follow(self, latest: NetworkFacts, now: float) -> None:
         """Let nodes of a network that their container has left be found on one that it is on."""
         for container, network in list(self._absent):
             elsewhere = [
-                ((container, other) in self._at, address)
-                for (found, other), address in known.addresses.items()
-                if found == container
+                ((container, other_network) in self._at, address)
+                for (owner, other_network), address in latest.addresses.items()
+                if owner == container
             ]
             if elsewhere:
-                left = self._at.pop((container, network))
-                self._moves[left] = min(elsewhere)[1], now
+                former = self._at.pop((container, network))
+                self._moves[former] = min(elsewhere)[1], now
                 del self._absent[container, network]
 
     @property
     def held(self) -> frozenset[str]:
-        """The addresses that nobody has, but whose containers may come back or have moved."""
+        """The addresses that no container has, but whose containers may come back or have moved."""
         return frozenset(self._at[place] for place in self._absent) | self._moves.keys()
 
     @property
@@ -153,16 +153,16 @@ class ProxyNews:
         self._due: dict[ContainerArrival, list[float]] = {}
         self._moving = False
 
-    def look(self, known: NetworkFacts, now: float) -> None:
+    def look(self, latest: NetworkFacts, now: float) -> None:
         """Take note of what a look has found."""
-        self.facts = known
-        common = tuple(layer for layer in known.policy if layer.addresses is None)
-        own = (layer for layer in known.policy if layer.addresses is not None)
-        self.policy = (*common, *self._layers.look(own, known.taken, now))
-        self._subnets |= set(known.subnets)
+        self.facts = latest
+        common = tuple(layer for layer in latest.policy if layer.addresses is None)
+        own = (layer for layer in latest.policy if layer.addresses is not None)
+        self.policy = (*common, *self._layers.look(own, latest.taken, now))
+        self._subnets |= set(latest.subnets)
         self._due = {
             arrival: self._due.get(arrival, [now + after for after in AGAIN])
-            for arrival in known.arrivals
+            for arrival in latest.arrivals
         }
 
     def body(self, nodes: Collection[str], now: float) -> dict[str, Any]:
@@ -188,11 +188,11 @@ class ProxyNews:
 
         Only the engine can tell, so it must be in a network that the proxy is on or was on.
         """
-        known = node in self.facts.taken or node in self._places.held
-        return not known and is_inside(node, tuple(self._subnets))
+        is_known = node in self.facts.taken or node in self._places.held
+        return not is_known and is_inside(node, tuple(self._subnets))
 
     def told(self, now: float) -> None:
-        """Take note that the proxy has heard what was due until then."""
+        """Take note that the proxy has been told what was due until then."""
         self._due = {
             arrival: [when for when in times if when > now] for arrival, times in self._due.items()
         }
@@ -216,17 +216,17 @@ def facts(
     One for ROS 2 has no master, and hears by itself of containers that come.
     """
     host = "" if proxy.key.is_ros2 else master(proxy.key).host.lower()
-    box = observed.sandbox_of(proxy)
-    joined = {a.network for a in box.container.attachments if a.address} if box else set()
+    sandbox = observed.sandbox_of(proxy)
+    joined = {a.network for a in sandbox.container.attachments if a.address} if sandbox else set()
     by_id = {container.id: container for container in observed.containers}
     running = [container for container in observed.containers if container.state in STARTED]
-    mine = [member for member in members if member.key == proxy.key]
+    own_members = [member for member in members if member.key == proxy.key]
     return NetworkFacts(
         master_address="" if not host or is_address(host) else observed.masters.get(host, ""),
         addresses={
-            (container.id, place.network): place.address
+            (container.id, a.network): a.address
             for container in running
-            for place in _places(container, joined)
+            for a in _attachments(container, joined)
         },
         taken=observed.addresses | {network.gateway for network in observed.networks},
         subnets=tuple(
@@ -237,47 +237,45 @@ def facts(
         ),
         arrivals=frozenset(
             arrival
-            for member in mine
+            for member in own_members
             if not proxy.key.is_ros2
             for arrival in _arrivals(member, observed, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
         selected=frozenset(
-            place.address
-            for member in mine
+            a.address
+            for member in own_members
             if member.container.alive
-            for place in _places(network_owner(member.container, by_id), joined)
+            for a in _attachments(network_owner(member.container, by_id), joined)
         ),
-        policy=(*policy, *label_layers(mine, by_id, joined)),
+        policy=(*policy, *label_layers(own_members, by_id, joined)),
     )
 
 
-def _places(container: Container, networks: Collection[str]) -> list[Attachment]:
-    return [each for each in container.attachments if each.network in networks and each.address]
+def _attachments(container: Container, networks: Collection[str]) -> list[Attachment]:
+    return [a for a in container.attachments if a.network in networks and a.address]
 
 
 def _arrivals(
     member: Member, observed: HostState, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
-    """A container's places; of one that shares another's network, the other's."""
+    """A container's arrivals: where it, or the container whose network it shares, is attached."""
     container = member.container
     host = network_owner(container, by_id)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
-    if (
-        member.by_address
-    ):  # by a name, none would have come to the master before its proxy was there
+    if member.by_address:  # by name, no node reaches the master before its proxy is there
         own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
         own = {name for name in own if not is_loopback(name)}
     return [
         ContainerArrival(
             container.id,
-            place.network,
-            place.address,
-            place.endpoint,
-            frozenset(name for name in place.names | own if _HOST_NAME.fullmatch(name)),
+            attachment.network,
+            attachment.address,
+            attachment.endpoint,
+            frozenset(name for name in attachment.names | own if _HOST_NAME.fullmatch(name)),
             in_place(observed, member.key, host),
         )
-        for place in _places(host, joined)
+        for attachment in _attachments(host, joined)
     ]

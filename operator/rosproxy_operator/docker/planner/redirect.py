@@ -11,8 +11,8 @@ of its own, without rules. Where a record says something else than is wanted, th
 anew, in one transaction; where nothing is wanted any more, they are taken away and the record goes
 last. Connections that were there before stay as they are.
 
-A redirect is only set towards a proxy that runs. Once it is there, it stays while the proxy is away
-for a moment: its nodes then meet nobody, as they would by a name.
+A redirect is only set towards a proxy that runs. Once set, it stays while the proxy is away for a
+moment: its nodes then reach nothing, as they would by a name.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -59,31 +59,31 @@ table ip $table {
   }
 }
 """)
-"""Its source is chosen before the rule leads elsewhere, maybe to another network: so masquerade."""
+"""The source address is chosen before dnat, which may lead to another network: so masquerade."""
 MEMORY, PIDS = 64 * 1024**2, 16
-"""Bytes and threads of what sets the rules: nft has 5 MiB, and one."""
+"""Bounds of the container that sets the rules, bytes and threads: nft has 5 MiB, and one."""
 RedirectSite = tuple[Key, str]
 """A proxy's key, and the id of the container whose network a redirect is in."""
 
 
 @dataclass(frozen=True, slots=True)
 class RedirectSteps:
-    """What is to be done for one redirect; ``container`` is the name of whom users know it by."""
+    """What is to be done for one redirect; ``container`` names the one whose network it is in."""
 
     key: Key
     container: str
     actions: tuple[Action, ...]
 
 
-def redirect_config(made: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
+def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for what sets a redirect's rules."""
     return {
         "Image": settings.proxy_image,
         "User": REDIRECT_USER,
         "Entrypoint": [NFT],
-        "Cmd": [_rules(made)],
+        "Cmd": [_rules(action)],
         "Healthcheck": {"Test": ["NONE"]},
-        "Labels": own_labels(made),
+        "Labels": own_labels(action),
         "HostConfig": {
             **COMMON,
             "RestartPolicy": {"Name": "no"},
@@ -91,20 +91,20 @@ def redirect_config(made: CreateRedirect, settings: PlanSettings) -> dict[str, A
             "Init": False,
             "Memory": MEMORY,
             "PidsLimit": PIDS,
-            "NetworkMode": f"container:{made.target}",
+            "NetworkMode": f"container:{action.target}",
         },
     }
 
 
-def _rules(made: CreateRedirect) -> str:
+def _rules(action: CreateRedirect) -> str:
     """One transaction of nft(8): whatever a redirect has had there goes, and comes as it is now."""
-    table = f"rosproxy-redirect-{proxy_name(made.key).rpartition('-')[2]}"
+    table = f"rosproxy-redirect-{proxy_name(action.key).rpartition('-')[2]}"
     text = f"add table ip {table}\ndelete table ip {table}\n"
-    if made.master is None:
+    if action.master is None:
         return text
-    to = made.proxy or made.master
+    proxy = action.proxy or action.master
     return text + _SET.substitute(
-        table=table, address=made.master.host, port=made.master.port, proxy=to.host
+        table=table, address=action.master.host, port=action.master.port, proxy=proxy.host
     )
 
 
@@ -114,18 +114,18 @@ def redirect_steps(
     """What is to be done so that each redirect that is wanted is there, and no other."""
     wanted = _wanted(observed, settings, desired)
     records: dict[RedirectSite, list[RedirectContainer]] = {}
-    for one in observed.redirects:
-        records.setdefault((one.key, one.container.shares or ""), []).append(one)
+    for record in observed.redirects:
+        records.setdefault((record.key, record.container.shares or ""), []).append(record)
     names = {container.id: container.name for container in observed.containers}
-    for place in sorted(wanted.keys() | records.keys()):
-        there = records.get(place, [])
-        if place in wanted:
-            made = wanted[place]
-            steps = [] if made is None else _set(made, there, observed)
+    for site in sorted(wanted.keys() | records.keys()):
+        existing = records.get(site, [])
+        if site in wanted:
+            action = wanted[site]
+            steps = [] if action is None else _set_steps(action, existing, observed)
         else:
-            steps = _taken_away(place[1], there, observed, settings)
-        if steps and not _in_motion(there, observed):
-            yield RedirectSteps(place[0], names.get(place[1], place[1][:12]), tuple(steps))
+            steps = _removal_steps(site[1], existing, observed, settings)
+        if steps and not _is_busy(existing, observed):
+            yield RedirectSteps(site[0], names.get(site[1], site[1][:12]), tuple(steps))
 
 
 def in_place(observed: HostState, key: Key, owner: Container) -> str:
@@ -135,9 +135,9 @@ def in_place(observed: HostState, key: Key, owner: Container) -> str:
     """
     return next(
         (
-            one.container.name
-            for one in observed.redirects
-            if one.key == key and one.done and _is_of(one, owner)
+            record.container.name
+            for record in observed.redirects
+            if record.key == key and record.done and _is_of(record, owner)
         ),
         "",
     )
@@ -150,75 +150,75 @@ def _wanted(
 
     Of several proxies for one address, in one network, the first one gets it.
     """
-    found: dict[RedirectSite, CreateRedirect | None] = {}
-    owned: dict[tuple[str, HostPort], Key] = {}
+    wanted: dict[RedirectSite, CreateRedirect | None] = {}
+    owners: dict[tuple[str, HostPort], Key] = {}
     by_id = {container.id: container for container in observed.containers}
-    for one in desired:
-        for member in one.members if one.live else ():
+    for proxy in desired:
+        for member in proxy.members if proxy.live else ():
             owner = network_owner(member.container, by_id)
             if member.by_address is None or not {owner.state, member.container.state} <= STARTED:
                 continue
-            if owned.setdefault((owner.id, member.by_address), one.key) == one.key:
-                place = one.key, owner.id
-                found[place] = found.get(place) or _made(member, owner, observed, settings)
-    return found
+            if owners.setdefault((owner.id, member.by_address), proxy.key) == proxy.key:
+                site = proxy.key, owner.id
+                wanted[site] = wanted.get(site) or _redirect_to(member, owner, observed, settings)
+    return wanted
 
 
-def _made(
+def _redirect_to(
     member: Member, owner: Container, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect | None:
     """The redirect of a container; None while its proxy does not run, or is not met."""
-    key, to = member.key, _meeting(member, owner, observed)
-    if to is None:
+    key, meeting = member.key, _meeting(member, owner, observed)
+    if meeting is None:
         return None
-    proxy, ports = to
-    made = CreateRedirect("", key, ports, owner.id, owner.started_at, member.by_address, proxy)
-    return _named(made, observed, settings)
+    proxy, ports = meeting
+    action = CreateRedirect("", key, ports, owner.id, owner.started_at, member.by_address, proxy)
+    return _named(action, observed, settings)
 
 
 def _meeting(
     member: Member, owner: Container, observed: HostState
 ) -> tuple[HostPort, PortRange] | None:
     """Where a container meets its proxy, on the first network that both are on."""
-    near = {place.network for place in owner.attachments if place.address} & member.networks
-    running = [one for one in observed.proxies_of(member.key) if one.container.state == "running"]
+    shared = {a.network for a in owner.attachments if a.address} & member.networks
+    running = [p for p in observed.proxies_of(member.key) if p.container.state == "running"]
     for proxy in running:
         box = observed.sandbox_of(proxy)
         places = box.container.attachments if box and box.container.state == "running" else ()
-        met = sorted((p.network, p.address) for p in places if p.network in near and p.address)
-        if box and met:
-            return HostPort(met[0][1], master(member.key).port), box.range
+        pairs = sorted((p.network, p.address) for p in places if p.network in shared and p.address)
+        if box and pairs:
+            return HostPort(pairs[0][1], master(member.key).port), box.range
     return None
 
 
-def _named(made: CreateRedirect, observed: HostState, settings: PlanSettings) -> CreateRedirect:
+def _named(action: CreateRedirect, observed: HostState, settings: PlanSettings) -> CreateRedirect:
     """The same with what it is made of, and its name by that."""
-    body = redirect_config(replace(made, range=PortRange(1, 1)), settings)
+    body = redirect_config(replace(action, range=PortRange(1, 1)), settings)
     fingerprint = digest({**body, "Image": observed.image_id})
-    return replace(made, fingerprint=fingerprint, name=redirect_name(made.key, fingerprint))
+    return replace(action, fingerprint=fingerprint, name=redirect_name(action.key, fingerprint))
 
 
-def _set(
-    made: CreateRedirect, there: Collection[RedirectContainer], observed: HostState
+def _set_steps(
+    action: CreateRedirect, records: Collection[RedirectContainer], observed: HostState
 ) -> list[Action]:
     """Have these rules, and their record, and then no other record."""
-    same = [one for one in there if one.fingerprint == made.fingerprint]
-    found = next((one for one in same if one.container.state != "dead"), None)
+    matching = [r for r in records if r.fingerprint == action.fingerprint]
+    record = next((r for r in matching if r.container.state != "dead"), None)
     steps: list[Action] = []
-    if found is None:
+    if record is None:
         if not observed.image_id:
             return []
-        steps += [Remove(one.container.name, "dead") for one in same]
-        steps.append(made)
-    others = [one for one in there if one.fingerprint != made.fingerprint]
-    if found is None or not found.done or others:
-        steps.append(Run(made.name))  # others may have been started by hand since, and set theirs
-    return [*steps, *(Remove(one.container.name, "outdated") for one in others)]
+        steps += [Remove(r.container.name, "dead") for r in matching]
+        steps.append(action)
+    outdated = [r for r in records if r.fingerprint != action.fingerprint]
+    if record is None or not record.done or outdated:
+        steps.append(Run(action.name))  # others may have been started by hand since, and set theirs
+    return [*steps, *(Remove(r.container.name, "outdated") for r in outdated)]
 
 
-def _taken_away(
+def _removal_steps(
     target: str,
-    there: Collection[RedirectContainer],
+    records: Collection[RedirectContainer],
     observed: HostState,
     settings: PlanSettings,
 ) -> list[Action]:
@@ -226,27 +226,27 @@ def _taken_away(
 
     With a namespace its rules have gone.
     """
-    owner = next((one for one in observed.containers if one.id == target), None)
+    owner = next((c for c in observed.containers if c.id == target), None)
     if owner is None or owner.state not in STARTED:
-        return [Remove(one.container.name, "its network is gone") for one in there]
+        return [Remove(r.container.name, "its network is gone") for r in records]
     # Also those of a former start: whoever has started the record since has set its rules anew.
-    record = next(iter(there))
-    made = CreateRedirect("", record.key, record.range, target, owner.started_at)
-    made = _named(made, observed, settings)
-    steps = _set(made, there, observed)
-    if not steps and not any(one.fingerprint == made.fingerprint for one in there):
+    record = next(iter(records))
+    action = CreateRedirect("", record.key, record.range, target, owner.started_at)
+    action = _named(action, observed, settings)
+    steps = _set_steps(action, records, observed)
+    if not steps and not any(r.fingerprint == action.fingerprint for r in records):
         return []  # without an image they stay
-    return [*steps, Remove(made.name, "done")]
+    return [*steps, Remove(action.name, "done")]
 
 
-def _in_motion(there: Iterable[RedirectContainer], observed: HostState) -> bool:
-    """Whether the engine is at one of them, so that nothing can be done."""
+def _is_busy(records: Iterable[RedirectContainer], observed: HostState) -> bool:
+    """Whether the engine is busy with one of them, so that nothing can be done."""
     return any(
-        one.container.state == "removing" or one.container.name in observed.busy for one in there
+        r.container.state == "removing" or r.container.name in observed.busy for r in records
     )
 
 
 def _is_of(record: RedirectContainer, owner: Container) -> bool:
     """Whether it is about the network that a container has now."""
-    here = owner.id == record.container.shares and owner.started_at == record.started
-    return here and owner.state in STARTED
+    is_same = owner.id == record.container.shares and owner.started_at == record.started
+    return is_same and owner.state in STARTED

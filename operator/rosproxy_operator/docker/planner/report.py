@@ -31,22 +31,22 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
         columns,
         "",
     )
-    told = {f"container {container['name']}" for container in status["containers"]}
-    rest = [
+    subjects = {f"container {container['name']}" for container in status["containers"]}
+    problems = [
         f"{clean(problem['subject'])}: {clean(problem['text'])}"
         for problem in status["problems"]
-        if problem["subject"] not in told
+        if problem["subject"] not in subjects
     ]
     steps = [clean(action) for action in status["actions"]]
-    ending = _listing("problems:", rest, columns)
+    ending = _listing("problems:", problems, columns)
     ending += _listing(f"yet to be done: {plural(len(steps), 'step')}", steps, columns)
     full = [*head, "", *_proxies(status, columns), "", *_containers(status, columns, True), *ending]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
     short = [*head, *ending, "", *_containers(status, columns, False)]
     if len(short) > lines:
-        more = plural(len(short) - lines + 1, "line")
-        short[lines - 1 :] = [f"… {more} more: rosproxy-operator docker status"]
+        hidden = plural(len(short) - lines + 1, "line")
+        short[lines - 1 :] = [f"… {hidden} more: rosproxy-operator docker status"]
     return "\n".join(short)
 
 
@@ -86,39 +86,37 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         yield "No container is labelled: docker run --label rosproxy.enable=true …"
         return
     ranges = {proxy["name"]: proxy["range"] for proxy in status["proxies"]}
-    heading, *rows = _table(
-        [CONTAINERS, *(_container_row(each, ranges) for each in containers)], columns
-    )
+    heading, *rows = _table([CONTAINERS, *(_container_row(c, ranges) for c in containers)], columns)
     yield heading
-    told: set[str] = set()
+    reported: set[str] = set()
     for container, row in zip(containers, rows, strict=True):
         yield row
         if details and (redirect := container["redirect"]):
-            where = (
+            effect = (
                 "leads to its proxy there"
                 if redirect["in_place"]
                 else "does not lead to its proxy yet"
             )
-            yield from wrap(f"{redirect['master']} {where}", columns, INDENT)
+            yield from wrap(f"{redirect['master']} {effect}", columns, INDENT)
         if details:
             names = [clean(name) for node in container["nodes"] for name in node["names"]]
             yield from wrap("  ".join(names), columns, INDENT, most=MOST_LINES)
-            for one in container["participants"]:
-                yield from wrap(_participant(one), columns, INDENT, most=MOST_LINES)
+            for participant in container["participants"]:
+                yield from wrap(_participant(participant), columns, INDENT, most=MOST_LINES)
         yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
         subject = f"container {container['name']}"
-        if subject not in told:
+        if subject not in reported:
             yield from _wrong(
-                (each["text"] for each in status["problems"] if each["subject"] == subject), columns
+                (p["text"] for p in status["problems"] if p["subject"] == subject), columns
             )
-        told.add(subject)
+        reported.add(subject)
 
 
-def _participant(one: Status) -> str:
+def _participant(row: Status) -> str:
     """A participant's topics and services, in one line."""
-    words = (("publishes", "publishes"), ("subscribes to", "subscribes"), ("serves", "services"))
-    found = [f"{word} {'  '.join(map(clean, one[key]))}" for word, key in words if one[key]]
-    return f"{clean(one['vendor'])}: {'; '.join(found) or 'nothing announced yet'}"
+    verbs = (("publishes", "publishes"), ("subscribes to", "subscribes"), ("serves", "services"))
+    texts = [f"{verb} {'  '.join(map(clean, row[key]))}" for verb, key in verbs if row[key]]
+    return f"{clean(row['vendor'])}: {'; '.join(texts) or 'nothing announced yet'}"
 
 
 def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, ...]:

@@ -31,37 +31,37 @@ class Selection:
 
 
 def select(
-    own: Iterable[OwnContainer], name: str, right: Collection[str], creatable: bool
+    own: Iterable[OwnContainer], name: str, fit_ids: Collection[str], creatable: bool
 ) -> Selection:
     """Decide which of several containers for one thing stays, and which goes.
 
     Args:
         own: All that there are for one thing.
         name: What the one that stays is to be called.
-        right: The ids of those that are as they ought to be, and run or can be started.
+        fit_ids: The ids of those that are as they ought to be, and run or can be started.
         creatable: Whether one can be created. If not, one that runs stays as it is.
     """
-    every = sorted((one.container for one in own), key=lambda one: (one.name != name, one.name))
-    there = [one for one in every if one.state != "removing"]
-    serving = [one for one in there if one.state in SERVING]
-    best = min(serving, key=lambda one: one.id not in right, default=None)
-    if len(there) < len(every):
+    containers = sorted((c.container for c in own), key=lambda c: (c.name != name, c.name))
+    present = [c for c in containers if c.state != "removing"]
+    serving = [c for c in present if c.state in SERVING]
+    best = min(serving, key=lambda c: c.id not in fit_ids, default=None)
+    if len(present) < len(containers):
         return Selection(kept=best, waiting=True)
-    idle = [one for one in there if one.state in IDLE]
-    ready = next((one for one in idle if one.id in right), None)
+    idle = [c for c in present if c.state in IDLE]
+    ready = next((c for c in idle if c.id in fit_ids), None)
     kept, old = None, best or next(iter(idle), None)
-    if best and (best.id in right or not creatable):
+    if best and (best.id in fit_ids or not creatable):
         kept, old = best, None
     elif ready:
         kept, old = ready, best
     elif not creatable:
         return Selection(stuck=True)
-    return Selection(kept, old, tuple(one for one in there if one not in (kept, old)))
+    return Selection(kept, old, tuple(c for c in present if c not in (kept, old)))
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
     """The name, with a number behind it if it is taken."""
     number = 1
-    while (found := name if number == 1 else f"{name}-{number}") in taken:
+    while (free := name if number == 1 else f"{name}-{number}") in taken:
         number += 1
-    return found
+    return free

@@ -62,7 +62,7 @@ of that, it starts again what is to run ``always``, not what is so ``unless-stop
 _KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
 """What a proxy needs besides so that the kernel forwards for it: see the proxy's Dockerfile.
 
-Said in so many words, as an engine may have no-new-privileges for its default.
+Given explicitly, as an engine may have no-new-privileges for its default.
 """
 _ROLES = {
     CreateSandbox: ROLE_SANDBOX,
@@ -78,7 +78,7 @@ PROXY_COMMAND = ("rosproxy", "run")
 """What the proxy's image does by itself (its Dockerfile): the operator gives no other command."""
 NFT = "/usr/sbin/nft"
 REDIRECT_USER = "0:0"
-"""Whose capabilities count without a file that has them, which no-new-privileges would defeat."""
+"""Root: its capabilities need no file capabilities, which no-new-privileges would defeat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +93,9 @@ class OwnLabels:
 
 def proxy_name(key: Key) -> str:
     """The name of a key's proxy container: master's host or domain, six digits of a hash."""
-    digest = hashlib.sha256(_text(key).encode()).hexdigest()
-    word = f"domain-{key.domain}" if key.is_ros2 else master(key).host.lower()
-    slug = re.sub(r"[^a-z0-9]+", "-", word)[:30].strip("-")
+    digest = hashlib.sha256(_identity(key).encode()).hexdigest()
+    label = f"domain-{key.domain}" if key.is_ros2 else master(key).host.lower()
+    slug = re.sub(r"[^a-z0-9]+", "-", label)[:30].strip("-")
     return f"rosproxy-{slug or 'master'}-{digest[:6]}"
 
 
@@ -119,7 +119,7 @@ def is_proxy_name(name: str) -> bool:
     return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports|-ear)?", name) is not None
 
 
-def _text(key: Key) -> str:
+def _identity(key: Key) -> str:
     """What a key's proxy is known by."""
     return f"{key.graph if key.is_ros2 else key.master_uri} {key.advertise_host}"
 
@@ -137,11 +137,11 @@ def unresolved_master(host: str) -> str:
 
 
 def master(key: Key) -> HostPort:
-    """The host and port of a key's master, which one of ROS 2 does not have."""
-    where = parse_slave_uri(key.master_uri)
-    if where is None:
+    """The host and port of a key's master; a key of ROS 2 has none. Raises ValueError."""
+    host_port = parse_slave_uri(key.master_uri)
+    if host_port is None:
         raise ValueError(f"{key.master_uri!r} is no master's URI")
-    return where
+    return host_port
 
 
 def admin_port(key: Key) -> int:
@@ -156,7 +156,7 @@ def proxy_token(key: Key, secret: str) -> str:
     It is made anew whenever it is needed, so that it is kept nowhere: the proxy has its hash, and
     the operator has no disk.
     """
-    return hmac.new(secret.encode(), _text(key).encode(), hashlib.sha256).hexdigest()
+    return hmac.new(secret.encode(), _identity(key).encode(), hashlib.sha256).hexdigest()
 
 
 def reserved_ports(key: Key) -> frozenset[int]:
@@ -206,31 +206,31 @@ def _read_key(labels: Mapping[str, str]) -> Key | None:
         return None
     if uri:
         return Key(uri, host) if parse_slave_uri(uri) else None
-    known = re.fullmatch(r"[0-9]{1,3}", domain, re.ASCII) and int(domain) <= LAST_DOMAIN
-    return Key("", host, int(domain)) if known else None
+    is_domain = re.fullmatch(r"[0-9]{1,3}", domain, re.ASCII) and int(domain) <= LAST_DOMAIN
+    return Key("", host, int(domain)) if is_domain else None
 
 
-def own_labels(made: CreateSandbox | Create | CreateEar | CreateRedirect) -> dict[str, str]:
+def own_labels(action: CreateSandbox | Create | CreateEar | CreateRedirect) -> dict[str, str]:
     """The labels of a container, from which `read_own` reads it back."""
-    key = made.key
+    key = action.key
     return {
         MANAGED: "true",
-        ROLE: _ROLES[type(made)],
+        ROLE: _ROLES[type(action)],
         **({DOMAIN: str(key.domain)} if key.is_ros2 else {MASTER_URI: key.master_uri}),
         ADVERTISE_HOST: key.advertise_host,
-        RANGE: str(made.range),
-        FINGERPRINT: made.fingerprint,
-        **({STARTED_LABEL: made.started} if isinstance(made, CreateRedirect) else {}),
+        RANGE: str(action.range),
+        FINGERPRINT: action.fingerprint,
+        **({STARTED_LABEL: action.started} if isinstance(action, CreateRedirect) else {}),
     }
 
 
-def sandbox_fingerprint(made: CreateSandbox, settings: PlanSettings) -> str:
+def sandbox_fingerprint(action: CreateSandbox, settings: PlanSettings) -> str:
     """What a sandbox is made of, in 16 hex digits. Its name and the image are not in it."""
-    body = sandbox_config(replace(made, fingerprint=""), settings)
+    body = sandbox_config(replace(action, fingerprint=""), settings)
     return digest({**body, "Image": ""})
 
 
-def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secret: str) -> str:
+def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, secret: str) -> str:
     """What a proxy's own container is made of, in 16 hex digits.
 
     Neither its name, its sandbox nor the master's address are in it. The hash of its token is: a
@@ -238,23 +238,23 @@ def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secre
     """
     # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
     # is started again while the operator is away begins with the policy of its creation.
-    body = container_config(replace(made, sandbox="", fingerprint=""), settings, secret, "")
-    env = [one for one in body["Env"] if one.partition("=")[0] not in POLICY_VARIABLES]
+    body = container_config(replace(action, sandbox="", fingerprint=""), settings, secret, "")
+    env = [v for v in body["Env"] if v.partition("=")[0] not in POLICY_VARIABLES]
     return digest({**body, "Image": image_id, "Env": env})
 
 
-def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any]:
+def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a sandbox.
 
-    It does nothing, as long as it is let. Outgoing connections, which are the proxy's, start
+    It does nothing until it is stopped. Outgoing connections, which are the proxy's, start
     below the ports that a proxy is to listen on.
     """
     sysctls = {"net.ipv4.ip_local_port_range": "1024 11000"}
-    if made.forwards:
+    if action.forwards:
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {
         name: [{"HostIp": ip, "HostPort": str(port)} for ip in settings.publish_address]
-        for name, port in published_ports(made.key, made.range, made.udp)
+        for name, port in published_ports(action.key, action.range, action.udp)
     }
     return {
         "Image": settings.proxy_image,
@@ -262,7 +262,7 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
         "Entrypoint": [*SANDBOX_COMMAND[:1]],
         "Cmd": [*SANDBOX_COMMAND[1:]],
         "Healthcheck": {"Test": ["NONE"]},
-        "Labels": own_labels(made),
+        "Labels": own_labels(action),
         "ExposedPorts": {port: {} for port in bindings},
         "HostConfig": {
             **COMMON,
@@ -276,75 +276,75 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
 
 
 def container_config(
-    made: Create, settings: PlanSettings, secret: str, master_address: str
+    action: Create, settings: PlanSettings, secret: str, master_address: str
 ) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a proxy.
 
     ``secret`` is what its token is made of. ``master_address`` may be empty: then the proxy
     resolves its master's host itself.
     """
-    variables = _variables(made, settings, secret, master_address)
+    variables = _variables(action, settings, secret, master_address)
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
         "Image": settings.proxy_image,
         "User": USER,
         "Env": [f"{name}={value}" for name, value in variables.items() if value],
-        "Labels": own_labels(made),
+        "Labels": own_labels(action),
         "HostConfig": {
             **COMMON,
-            **(_KERNEL if made.data_plane == "kernel" else {}),
+            **(_KERNEL if action.data_plane == "kernel" else {}),
             "Init": False,
-            **{name: most for name, most in limits.items() if most},
-            "NetworkMode": f"container:{made.sandbox}",
+            **{name: limit for name, limit in limits.items() if limit},
+            "NetworkMode": f"container:{action.sandbox}",
         },
     }
 
 
 def _variables(
-    made: Create, settings: PlanSettings, secret: str, master_address: str
+    action: Create, settings: PlanSettings, secret: str, master_address: str
 ) -> dict[str, str]:
     """What a proxy is told; what is empty is left out. In another order it would be made anew."""
-    key = made.key
+    key = action.key
     return {
         "ROS_MASTER_URI": key.master_uri,
         "ROSPROXY_ADVERTISE_HOST": key.advertise_host,
-        "ROSPROXY_PORT_RANGE": str(own_range(key, made.range)),
+        "ROSPROXY_PORT_RANGE": str(own_range(key, action.range)),
         "ROSPROXY_MASTER_PORT": "" if key.is_ros2 else str(master(key).port),
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(key)}",
-        "ROSPROXY_DATA_PLANE": "" if made.data_plane == "auto" else made.data_plane,
-        "ROSPROXY_DIRECTION": "" if made.direction == "out" else made.direction,
-        "ROSPROXY_UDP": "1" if made.udp else "",
-        "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
+        "ROSPROXY_DATA_PLANE": "" if action.data_plane == "auto" else action.data_plane,
+        "ROSPROXY_DIRECTION": "" if action.direction == "out" else action.direction,
+        "ROSPROXY_UDP": "1" if action.udp else "",
+        "ROSPROXY_SLAVE_CONTROL": "" if action.slave_control == "any" else action.slave_control,
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
         **({} if key.is_ros2 else bound_variables(settings.proxy_bounds)),
-        **policy_variables((*settings.policy, *made.policy)),
-        **(_ros2_variables(made) if key.is_ros2 else {}),
+        **policy_variables((*settings.policy, *action.policy)),
+        **(_ros2_variables(action) if key.is_ros2 else {}),
     }
 
 
-def _ros2_variables(made: Create) -> dict[str, str]:
+def _ros2_variables(action: Create) -> dict[str, str]:
     return {
         "ROSPROXY_ROS": "2",
-        "ROSPROXY_ROS2_DOMAINS": str(made.key.domain),
-        "ROSPROXY_ROS2_PEERS": " ".join(made.peers),
-        "ROSPROXY_ROS2_EAR": str(made.ear or ""),
+        "ROSPROXY_ROS2_DOMAINS": str(action.key.domain),
+        "ROSPROXY_ROS2_PEERS": " ".join(action.peers),
+        "ROSPROXY_ROS2_EAR": str(action.ear or ""),
     }
 
 
-def ear_config(made: CreateEar, settings: PlanSettings) -> dict[str, Any]:
+def ear_config(action: CreateEar, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for an ear.
 
     It has the host's network and nothing else of the host's.
     """
-    variables = ear_variables(made.key.domain or 0, made.lan, made.bind, made.proxy)
+    variables = ear_variables(action.key.domain or 0, action.lan, action.bind, action.proxy)
     return {
         "Image": settings.proxy_image,
         "User": USER,
         "Cmd": [*EAR_COMMAND[1:]],
         "Healthcheck": {"Test": ["NONE"]},
         "Env": [f"{name}={value}" for name, value in variables.items()],
-        "Labels": own_labels(made),
+        "Labels": own_labels(action),
         "HostConfig": {
             **COMMON,
             "Init": False,
@@ -355,9 +355,9 @@ def ear_config(made: CreateEar, settings: PlanSettings) -> dict[str, Any]:
     }
 
 
-def ear_fingerprint(made: CreateEar, settings: PlanSettings, image_id: str) -> str:
+def ear_fingerprint(action: CreateEar, settings: PlanSettings, image_id: str) -> str:
     """What an ear is made of, in 16 hex digits; its name is not in it."""
-    body = ear_config(replace(made, fingerprint=""), settings)
+    body = ear_config(replace(action, fingerprint=""), settings)
     return digest({**body, "Image": image_id})
 
 

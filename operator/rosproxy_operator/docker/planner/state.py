@@ -41,32 +41,32 @@ class DockerMemory:
 
     def port_taken(self, name: str, port: int | None, now: float) -> "DockerMemory":
         """Note that the engine could not start the sandbox ``name``: a port of it is taken."""
-        known = self.refusals.get(name)
-        refusal = PortRefusal(known.since if known else now, port)
+        previous = self.refusals.get(name)
+        refusal = PortRefusal(previous.since if previous else now, port)
         return replace(self, refusals={**self.refusals, name: refusal})
 
 
 def noticed(memory: DockerMemory, members: Iterable[Member], now: float) -> DockerMemory:
-    """The memory with who has exited, and since when."""
+    """The memory with the containers that have exited, and since when."""
     gone = (member.container.id for member in members if not member.container.alive)
-    return replace(memory, exited={each: memory.exited.get(each, now) for each in gone})
+    return replace(memory, exited={c: memory.exited.get(c, now) for c in gone})
 
 
 def looked(
     memory: DockerMemory, observed: HostState, desired: Iterable[Desired], grace: float, now: float
 ) -> DockerMemory:
     """What is remembered after a look at the host, before anything is decided."""
-    live = {one.key for one in desired if one.live}
+    live = {d.key for d in desired if d.live}
     idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
-    known = (observed.keys | set(memory.served)) - live
-    absent = {key: memory.absent.get(key, now) for key in sorted(known)}
+    keys = (observed.keys | set(memory.served)) - live
+    absent = {key: memory.absent.get(key, now) for key in sorted(keys)}
     wanted = live | {key for key, since in absent.items() if now - since < grace}
     return DockerMemory(
         exited=memory.exited,
         absent={k: since for k, since in absent.items() if k in wanted | observed.keys},
         served={key: ports for key, ports in _served(memory, observed).items() if key in wanted},
         planned={key: ports for key, ports in memory.planned.items() if key in live},
-        refusals={name: said for name, said in memory.refusals.items() if name in idle},
+        refusals={name: refusal for name, refusal in memory.refusals.items() if name in idle},
         taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
         moved={key: move for key, move in memory.moved.items() if now - move.at < MOVED_FOR},
     )
@@ -78,10 +78,10 @@ def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
     What has stopped may be older than what is remembered, unless it has more ports.
     """
     served = dict(memory.served)
-    for one in (*observed.sandboxes, *observed.proxies):
-        known = served.get(one.key)
-        if one.container.state in _HAS_SERVED and (not known or within(known, one.range)):
-            served[one.key] = one.range
+    for own in (*observed.sandboxes, *observed.proxies):
+        previous = served.get(own.key)
+        if own.container.state in _HAS_SERVED and (not previous or within(previous, own.range)):
+            served[own.key] = own.range
     for sandbox in reversed(observed.sandboxes):
         if sandbox.container.state in SERVING:
             served[sandbox.key] = sandbox.range

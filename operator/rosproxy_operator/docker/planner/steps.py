@@ -71,8 +71,8 @@ class PlanContext:
 
     def taken(self, own: Iterable[OwnContainer]) -> frozenset[str]:
         """The names of all containers but these."""
-        every = [*self.observed.containers, *(one.container for one in self.observed.own)]
-        return frozenset(one.name for one in every) - {one.container.name for one in own}
+        containers = [*self.observed.containers, *(o.container for o in self.observed.own)]
+        return frozenset(c.name for c in containers) - {o.container.name for o in own}
 
     @property
     def label_policy(self) -> tuple[PolicyLayer, ...]:
@@ -89,16 +89,20 @@ class PlanContext:
         return HostPort(gateway, self.ports.last) if gateway else None
 
     def select(
-        self, own: Collection[OwnContainer], name: str, made: str, fits: Callable[[Container], bool]
+        self,
+        own: Collection[OwnContainer],
+        name: str,
+        fingerprint: str,
+        fits: Callable[[Container], bool],
     ) -> Selection:
         """Decide which of these stays and which goes.
 
-        Right is one that ``fits``, has the ports, and the fingerprint ``made`` of one that would be
-        created now; if none can be, any will do.
+        Right is one that ``fits``, has the ports, and the ``fingerprint`` of one that would be made
+        now; if none can be, any fingerprint will do.
         """
-        as_made = [one for one in own if one.fingerprint == made or not self.creatable]
-        here = [one.container for one in as_made if one.range == self.ports]
-        return select(own, name, {one.id for one in here if fits(one)}, self.creatable)
+        matching = [o for o in own if o.fingerprint == fingerprint or not self.creatable]
+        candidates = [o.container for o in matching if o.range == self.ports]
+        return select(own, name, {c.id for c in candidates if fits(c)}, self.creatable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,19 +127,19 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
     actions, home = _sandbox_steps(context)
     if actions is None or home is None:
         return actions
-    then = _process_steps(context, home, _removed(actions))
-    return None if then is None else actions + then
+    process_actions = _process_steps(context, home, _removed(actions))
+    return None if process_actions is None else actions + process_actions
 
 
 def retired(observed: HostState, key: Key) -> Iterator[Action]:
     """Remove everything of a key that nobody wants any more."""
-    why = "no running container wants it any more"
-    for one in (*observed.ears_of(key), *observed.proxies_of(key), *observed.sandboxes_of(key)):
-        state, name = one.container.state, one.container.name
-        if state == "paused" and isinstance(one, Proxy):
+    reason = "no running container wants it any more"
+    for own in (*observed.ears_of(key), *observed.proxies_of(key), *observed.sandboxes_of(key)):
+        state, name = own.container.state, own.container.name
+        if state == "paused" and isinstance(own, Proxy):
             yield Unpause(name)
         if state != "removing":
-            yield Remove(name, why, retire=isinstance(one, Proxy) and state in STARTED)
+            yield Remove(name, reason, retire=isinstance(own, Proxy) and state in STARTED)
 
 
 def leave(
@@ -147,10 +151,10 @@ def leave(
     """
     gone = _removed(planned)
     for sandbox in observed.sandboxes_of(desired.key):
-        box = sandbox.container
-        if box.state in _CHANGEABLE and box.name not in gone:
-            for network in _joined(observed, box):
-                action = Disconnect(box.name, network)
+        container = sandbox.container
+        if container.state in _CHANGEABLE and container.name not in gone:
+            for network in _joined(observed, container):
+                action = Disconnect(container.name, network)
                 if network not in desired.networks | {uplink} and action not in planned:
                     yield action
 
@@ -171,26 +175,26 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     # rules there, and one without the capability can't take them away.
     forwards = context.desired.data_plane == "kernel"
     udp = context.desired.udp
-    made = CreateSandbox(sandbox_name(key), key, context.ports, forwards=forwards, udp=udp)
-    expected = sandbox_fingerprint(made, context.settings)
-    found = context.select(
-        sandboxes, made.name, expected, lambda box: _usable(box, context.observed)
+    action = CreateSandbox(sandbox_name(key), key, context.ports, forwards=forwards, udp=udp)
+    expected = sandbox_fingerprint(action, context.settings)
+    selection = context.select(
+        sandboxes, action.name, expected, lambda c: _usable(c, context.observed)
     )
-    kept = found.kept
-    if found.stuck:
+    kept = selection.kept
+    if selection.stuck:
         return None, None
-    actions: list[Action] = [Remove(one.name, "left over") for one in found.others]
-    if kept is None and not found.waiting:
-        made = replace(made, name=free_name(made.name, taken), fingerprint=expected)
-        former = former_name(found.old, made.name, taken)
-        ended = _emptied(context, found.old) if found.old else ()
-        actions += [*created(found, made, former, ended), *_connect(context, made.name)]
-        return actions, _Home(made.name, starts=True)
+    actions: list[Action] = [Remove(c.name, "left over") for c in selection.others]
+    if kept is None and not selection.waiting:
+        action = replace(action, name=free_name(action.name, taken), fingerprint=expected)
+        former = former_name(selection.old, action.name, taken)
+        ended = _emptying_steps(context, selection.old) if selection.old else ()
+        actions += [*created(selection, action, former, ended), *_connect(context, action.name)]
+        return actions, _Home(action.name, starts=True)
     if kept is None or kept.state == "restarting":
         return actions, None
-    name = kept.name if found.waiting or made.name in taken else made.name
+    name = kept.name if selection.waiting or action.name in taken else action.name
     serves = kept.state in SERVING
-    actions += _joining(context, kept) if serves else _started(context, found, kept)
+    actions += _join_steps(context, kept) if serves else _start_steps(context, selection, kept)
     if kept.name != name:
         actions.append(Rename(kept.name, name))
     return actions, _Home(name, kept.id, not serves, kept.started_at)
@@ -198,23 +202,23 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
 
 def _usable(sandbox: Container, observed: HostState) -> bool:
     """Whether it runs or the engine can start it: not when one of its networks is gone."""
-    return sandbox.state in SERVING or all(_there(observed, each) for each in sandbox.attachments)
+    return sandbox.state in SERVING or all(_has_network(observed, a) for a in sandbox.attachments)
 
 
-def _there(observed: HostState, place: Attachment) -> bool:
+def _has_network(observed: HostState, attachment: Attachment) -> bool:
     """Whether the network is still the one that was joined, and not a new one of its name."""
     return any(
-        network.name == place.network and place.network_id in ("", network.id)
+        network.name == attachment.network and attachment.network_id in ("", network.id)
         for network in observed.networks
     )
 
 
 def _joined(observed: HostState, container: Container) -> list[str]:
-    """The networks that a container is on, those aside that are gone."""
-    return sorted(place.network for place in container.attachments if _there(observed, place))
+    """The networks that a container is on, without those that are gone."""
+    return sorted(a.network for a in container.attachments if _has_network(observed, a))
 
 
-def _joining(context: PlanContext, kept: Container) -> Iterator[Action]:
+def _join_steps(context: PlanContext, kept: Container) -> Iterator[Action]:
     """Resume a sandbox that is paused, and join the networks that it is not on."""
     if kept.state == "paused":
         yield Unpause(kept.name)
@@ -240,15 +244,15 @@ def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
     )
 
 
-def _started(context: PlanContext, found: Selection, kept: Container) -> Iterator[Action]:
+def _start_steps(context: PlanContext, selection: Selection, kept: Container) -> Iterator[Action]:
     for network in _joined(context.observed, kept):
         if network != context.settings.uplink:
             yield Disconnect(kept.name, network)
     if context.settings.uplink not in kept.networks:
         yield Connect(kept.name, context.settings.uplink, ())
-    if found.old:
-        yield from _emptied(context, found.old)
-        yield Remove(found.old.name, "another one takes over")
+    if selection.old:
+        yield from _emptying_steps(context, selection.old)
+        yield Remove(selection.old.name, "another one takes over")
     yield Start(kept.name)
     yield from _connect(context, kept.name)
 
@@ -258,11 +262,11 @@ def _connect(context: PlanContext, name: str) -> Iterator[Action]:
         yield Connect(name, network, context.aliases.get(network, ()))
 
 
-def _emptied(context: PlanContext, old: Container) -> Iterator[Action]:
+def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
     """End the proxies properly that are in a sandbox, before it goes."""
-    for one in context.observed.proxies_of(context.desired.key):
-        if one.container.shares == old.id and one.container.state != "removing":
-            yield Remove(one.container.name, "its sandbox is made anew", stop=True)
+    for proxy in context.observed.proxies_of(context.desired.key):
+        if proxy.container.shares == old.id and proxy.container.state != "removing":
+            yield Remove(proxy.container.name, "its sandbox is made anew", stop=True)
 
 
 def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> list[Action] | None:
@@ -270,11 +274,11 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
 
     ``gone`` are the names of containers that are removed before.
     """
-    key, wanted = context.desired.key, proxy_name(context.desired.key)
+    key, wanted_name = context.desired.key, proxy_name(context.desired.key)
     proxies = context.observed.proxies_of(key)
     taken = context.taken(proxies)
-    name = free_name(wanted, taken)
-    made = Create(
+    name = free_name(wanted_name, taken)
+    action = Create(
         name,
         key,
         context.ports,
@@ -288,35 +292,35 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
         ear=context.ear,
     )
     observed = context.observed
-    expected = proxy_fingerprint(made, context.settings, observed.image_id, observed.secret)
-    there = [one for one in proxies if one.container.name not in gone]
-    found = context.select(there, wanted, expected, lambda one: one.shares == home.id)
-    kept = found.kept
+    expected = proxy_fingerprint(action, context.settings, observed.image_id, observed.secret)
+    staying = [p for p in proxies if p.container.name not in gone]
+    selection = context.select(staying, wanted_name, expected, lambda c: c.shares == home.id)
+    kept = selection.kept
     misplaced = kept and kept.shares != home.id
-    if found.waiting and (misplaced or not kept):
+    if selection.waiting and (misplaced or not kept):
         return []
-    if found.stuck or misplaced:
+    if selection.stuck or misplaced:
         return None
-    actions: list[Action] = [Remove(one.name, "left over") for one in found.others]
+    actions: list[Action] = [Remove(c.name, "left over") for c in selection.others]
     if kept:
-        actions += tended(found, kept, _lost(kept, home))
-        if wanted not in (kept.name, *taken) and not found.waiting:
-            actions.append(Rename(kept.name, wanted))
+        actions += tended(selection, kept, _lost(kept, home))
+        if wanted_name not in (kept.name, *taken) and not selection.waiting:
+            actions.append(Rename(kept.name, wanted_name))
         return actions
-    former = former_name(found.old, name, taken)
-    before = [one.container.name for one in proxies if one.container.name in gone]
-    replaces = former or next(iter(before), "")
-    made = replace(made, fingerprint=expected, replaces=replaces)
-    return [*actions, *created(found, made, former)]
+    former = former_name(selection.old, name, taken)
+    removed = [p.container.name for p in proxies if p.container.name in gone]
+    replaces = former or next(iter(removed), "")
+    action = replace(action, fingerprint=expected, replaces=replaces)
+    return [*actions, *created(selection, action, former)]
 
 
-def tended(found: Selection, kept: Container, lost: bool = False) -> Iterator[Action]:
+def tended(selection: Selection, kept: Container, lost: bool = False) -> Iterator[Action]:
     """Have a container run that stays; one that is ``lost`` is to be started anew."""
-    if found.old:
-        yield Remove(found.old.name, "another one takes over")
+    if selection.old:
+        yield Remove(selection.old.name, "another one takes over")
     if kept.state == "paused":
         yield Unpause(kept.name)
-    if found.waiting:
+    if selection.waiting:
         return
     if kept.state not in SERVING:
         yield Start(kept.name)
@@ -347,8 +351,8 @@ def former_name(old: Container | None, name: str, taken: Collection[str]) -> str
 
 
 def created(
-    found: Selection,
-    made: CreateSandbox | Create | CreateEar,
+    selection: Selection,
+    action: CreateSandbox | Create | CreateEar,
     former: str,
     ended: Iterable[Action] = (),
 ) -> Iterator[Action]:
@@ -356,10 +360,10 @@ def created(
 
     ``ended``: what must go before the old one does.
     """
-    if found.old and found.old.name != former:
-        yield Rename(found.old.name, former)
-    yield made
-    if found.old:
+    if selection.old and selection.old.name != former:
+        yield Rename(selection.old.name, former)
+    yield action
+    if selection.old:
         yield from ended
         yield Remove(former, "made anew")
-    yield Start(made.name)
+    yield Start(action.name)

@@ -1,7 +1,7 @@
 """The API server as far as the operator needs it: a thin layer over the `kubernetes` client.
 
-Its service account may do exactly this. Those of the second part are for single objects, by
-name::
+The operator's service account has exactly these rights. Those of the second group are for single
+objects, by name::
 
     nodes                   list watch
     pods                    get list watch create delete patch
@@ -40,7 +40,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
 from rosproxy_operator.kubernetes.resources.values import part, word
 
-Found = dict[str, Any]
+JsonObject = dict[str, Any]
 Timeout = tuple[float, float]
 WITHIN: Timeout = (3.0, 15.0)
 """Seconds to connect and to wait for an answer."""
@@ -55,7 +55,7 @@ SILENT: Timeout = (3.0, 90.0)
 PAGE = 500
 """Objects in one answer to a list."""
 TRIES = 4
-"""How often something is asked that the API server puts off (429)."""
+"""How often a request is sent that the API server puts off (429)."""
 LONGEST_PAUSE = 10.0
 """Seconds that it may put it off at a time."""
 WEBHOOKS = "mutatingwebhookconfigurations"
@@ -67,7 +67,7 @@ _ROOTS = {
     POLICIES: "/apis/networking.k8s.io/v1",
     LEASES: "/apis/coordination.k8s.io/v1",
 }
-"""Where kinds are found that are not of the core group."""
+"""The API's paths for kinds that are not of the core group."""
 _TERMINATING = "because it is being terminated"
 """What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted.
 
@@ -86,7 +86,7 @@ class ApiError(Exception):
 
 
 class ApiAway(ApiError):
-    """It can't be reached, or is not ready to answer."""
+    """The API server can't be reached, or is not ready to answer."""
 
 
 class NotLeading(ApiAway):
@@ -119,7 +119,7 @@ class Page(msgspec.Struct, frozen=True):
     ``version`` is that of the whole list: a watch goes on from there.
     """
 
-    items: list[Found]
+    items: list[JsonObject]
     version: str
     more: str
 
@@ -128,7 +128,7 @@ class Event(msgspec.Struct, frozen=True):
     """What a watch tells: ADDED, MODIFIED, DELETED, BOOKMARK (a version alone) or ERROR."""
 
     type: str
-    object: Found
+    object: JsonObject
 
 
 class Watch:
@@ -139,10 +139,10 @@ class Watch:
 
     def __iter__(self) -> Iterator[list[Event]]:
         """Give events, those together that came together. Raises ApiLost."""
-        held = b""
+        partial = b""
         try:
             for chunk in self._response.stream():
-                *lines, held = (held + chunk).split(b"\n")
+                *lines, partial = (partial + chunk).split(b"\n")
                 yield [_EVENT.decode(line) for line in lines if line]
         except (HTTPError, OSError, msgspec.DecodeError, UnicodeDecodeError, ValueError) as error:
             raise ApiLost(f"a watch was lost: {' '.join(str(error).split())[:200]}") from error
@@ -190,31 +190,31 @@ class Api:
         """Close all connections."""
         self._client.close()  # type: ignore[no-untyped-call]
 
-    def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[Found]:
+    def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[JsonObject]:
         """All RosProxies, or those of a namespace, as they are at this moment."""
         places = (namespace,) if namespace else self._places
         lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
-        return [found for each in lists for found in self._items(each)]
+        return [obj for listing in lists for obj in self._items(listing)]
 
-    def own_pods(self) -> list[Found]:
+    def own_pods(self) -> list[JsonObject]:
         """The pods that the operator has made."""
         query = {"labelSelector": OWN_SELECTOR}
         lists = (self._ask("GET", _path("pods", place), query) for place in self._places)
-        return [found for each in lists for found in self._items(each)]
+        return [obj for listing in lists for obj in self._items(listing)]
 
     def places(self, kind: str) -> tuple[str, ...]:
-        """The namespaces in which a kind is watched; one that is empty for all of them.
+        """The namespaces in which a kind is watched; an empty one stands for all of them.
 
-        Others' pods and Services count as well, so that those are all of the cluster.
+        Others' pods and Services count as well, so those are watched in all of the cluster.
         """
         return self._places if kind in (PLURAL, POLICIES) else ("",)
 
-    def page(self, kind: str, place: str, more: str = "") -> Page:
+    def page(self, kind: str, place: str, token: str = "") -> Page:
         """A part of the list of a kind, as it is now. Raises ApiExpired, too."""
-        query = {"limit": str(PAGE), **_watched(kind), **({"continue": more} if more else {})}
-        found = self._ask("GET", _path(kind, place), query)
-        about = part(found, "metadata")
-        return Page(self._items(found), word(about, "resourceVersion"), word(about, "continue"))
+        query = {"limit": str(PAGE), **_watched(kind), **({"continue": token} if token else {})}
+        listing = self._ask("GET", _path(kind, place), query)
+        meta = part(listing, "metadata")
+        return Page(self._items(listing), word(meta, "resourceVersion"), word(meta, "continue"))
 
     def watch(self, kind: str, place: str, version: str) -> Watch:
         """What happens to a kind after a version of its list. Raises ApiExpired, too."""
@@ -225,11 +225,11 @@ class Api:
             raise refusal(int(answer.status), str(answer.reason or ""), self._body(answer))
         return Watch(answer.response)
 
-    def fresh(self, kind: str, namespace: str, selector: str) -> list[Found]:
-        """What a field selector fits, as it is now in the API server's store."""
+    def fresh(self, kind: str, namespace: str, selector: str) -> list[JsonObject]:
+        """The objects that a field selector fits, as they are now in the API server's store."""
         return self._items(self._ask("GET", _path(kind, namespace), {"fieldSelector": selector}))
 
-    def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> Found:
+    def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> JsonObject:
         """One object, for example of the kind ``services``."""
         return self._ask("GET", _path(kind, id.namespace, id.name), within=within)
 
@@ -239,8 +239,8 @@ class Api:
 
     def delete(self, kind: str, id: Name, uid: str, version: str = "") -> None:
         """Delete an object if it still has this uid, and this version if one is given."""
-        must = {"uid": uid, **({"resourceVersion": version} if version else {})}
-        options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": must}
+        preconditions = {"uid": uid, **({"resourceVersion": version} if version else {})}
+        options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": preconditions}
         self._ask("DELETE", _path(kind, id.namespace, id.name), body=options)
 
     def evict(self, id: Name, uid: str) -> None:
@@ -257,20 +257,20 @@ class Api:
         """Change an object, or a part of it as ``rosproxies/status``, by a JSON patch."""
         self._ask("PATCH", _path(kind, id.namespace, id.name), body=operations, within=within)
 
-    def fill_secret(self, name: Name, there: Json, entries: Mapping[str, str]) -> None:
+    def fill_secret(self, name: Name, secret: Json, entries: Mapping[str, str]) -> None:
         """Write entries (in base64) into a Secret, if it is as it was when it was read.
 
         Raises ApiInvalid or ApiConflict if somebody else was faster, other ApiErrors.
         """
-        version = word(part(there, "metadata"), "resourceVersion")
+        version = word(part(secret, "metadata"), "resourceVersion")
         operations: list[Json] = [
             {"op": "test", "path": "/metadata/resourceVersion", "value": version},
-            {"op": "add", "path": "/data", "value": {**part(there, "data"), **entries}},
+            {"op": "add", "path": "/data", "value": {**part(secret, "data"), **entries}},
         ]
         self.patch("secrets", name, operations)
 
-    def _items(self, found: Found) -> list[Found]:
-        items = found.get("items")
+    def _items(self, listing: JsonObject) -> list[JsonObject]:
+        items = listing.get("items")
         if not isinstance(items, list):
             raise ApiAway(f"what answers at {self.server} is no API server")
         return [item for item in items if isinstance(item, dict)]
@@ -282,17 +282,17 @@ class Api:
         query: Mapping[str, str] | None = None,
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
-    ) -> Found:
-        answer = self._patiently(method, path, query, body, within)
+    ) -> JsonObject:
+        answer = self._send_with_retries(method, path, query, body, within)
         data = self._body(answer)
         if not 200 <= answer.status <= 299:
             raise refusal(int(answer.status), str(answer.reason or ""), data)
         try:
-            return msgspec.json.decode(data, type=Found)
+            return msgspec.json.decode(data, type=JsonObject)
         except (msgspec.DecodeError, UnicodeDecodeError):
             raise ApiAway(f"what answers at {self.server}{path} is no API server") from None
 
-    def _patiently(
+    def _send_with_retries(
         self,
         method: str,
         path: str,
@@ -300,17 +300,17 @@ class Api:
         body: Json | list[Json] | None,
         within: Timeout,
     ) -> Any:
-        """Its answer; where it puts callers off (429: nothing was begun) asked again, as it says.
+        """The answer; where it puts callers off (429: nothing was begun) asked again, as it says.
 
-        Whoever has little time tries again himself.
+        Callers that have little time try again themselves.
         """
         for _ in range(TRIES if within is WITHIN else 1):
             answer = self._send(method, path, query, body, within)
-            after = str(answer.getheader("Retry-After", ""))
-            if answer.status != 429 or not after.isdecimal():
+            retry_after = str(answer.getheader("Retry-After", ""))
+            if answer.status != 429 or not retry_after.isdecimal():
                 break
             self._body(answer)
-            time.sleep(min(float(after), LONGEST_PAUSE))
+            time.sleep(min(float(retry_after), LONGEST_PAUSE))
         return answer
 
     def _send(
@@ -321,11 +321,11 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> Any:
-        """Its answer, of which the body is yet to be read. Raises ApiAway."""
-        patch = isinstance(body, list)
+        """The answer, of which the body is yet to be read. Raises ApiAway."""
+        is_patch = isinstance(body, list)
         headers = {
             "Accept": "application/json",
-            "Content-Type": "application/json-patch+json" if patch else "application/json",
+            "Content-Type": "application/json-patch+json" if is_patch else "application/json",
         }
         try:
             request = self._client.param_serialize(
@@ -338,8 +338,8 @@ class Api:
             )
             if method == "GET" or path.startswith(_ROOTS[LEASES]):
                 return self._client.call_api(*request, _request_timeout=within)
-            with self.gate.passing() as may:
-                if not may:
+            with self.gate.passing() as may_send:
+                if not may_send:
                     raise NotLeading("this operator does not lead")
                 return self._client.call_api(*request, _request_timeout=within)
         except (HTTPError, ApiException, ConfigException, OSError) as error:
@@ -357,15 +357,15 @@ class Api:
 
 
 def _watched(kind: str) -> dict[str, str]:
-    """Which objects of a kind are watched: others' NetworkPolicies are nobody's business here."""
+    """The query for the objects of a kind that are watched: of NetworkPolicies only our own."""
     return {"labelSelector": OWN_SELECTOR} if kind == POLICIES else {}
 
 
 def _path(kind: str, namespace: str, name: str = "") -> str:
-    """Where objects of a kind, or one of them or a part of it as ``kind/part``, are found."""
-    kind, _, part = kind.partition("/")
-    where = ["namespaces", namespace, kind, name, part] if namespace else [kind, name, part]
-    return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(one, safe="") for one in where if one)])
+    """The path of a kind's objects, of one of them, or of a subresource (``pods/eviction``)."""
+    kind, _, sub = kind.partition("/")
+    segments = ["namespaces", namespace, kind, name, sub] if namespace else [kind, name, sub]
+    return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(s, safe="") for s in segments if s)])
 
 
 def refusal(status: int, reason: str, body: bytes) -> ApiError:

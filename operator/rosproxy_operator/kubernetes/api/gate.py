@@ -1,4 +1,4 @@
-"""What may be written while this operator leads, and not a moment longer.
+"""Lets the operator write while it leads, and not a moment longer.
 
 Every request that changes something passes here just before it is sent, from whichever thread. One
 that was sent may still arrive late: so deletions name what they are for (uid, resourceVersion), and
@@ -22,13 +22,13 @@ class Gate:
     def passing(self) -> Iterator[bool]:
         """Whether a request may be sent, which counts as under way until this ends."""
         with self._changed:
-            may = not self._closed and self.open()
-            self._passing += may
+            may_pass = not self._closed and self.open()
+            self._passing += may_pass
         try:
-            yield may
+            yield may_pass
         finally:
             with self._changed:
-                self._passing -= may
+                self._passing -= may_pass
                 self._changed.notify_all()
 
     def close(self, seconds: float) -> bool:

@@ -16,18 +16,18 @@ class NoCluster(Exception):
 
 def configuration() -> Any:
     """How to reach the API server. Raises NoCluster."""
-    found = Configuration()
+    settings = Configuration()
     try:
         if os.environ.get("KUBERNETES_SERVICE_HOST"):
-            load_incluster_config(client_configuration=found)  # type: ignore[no-untyped-call]
+            load_incluster_config(client_configuration=settings)  # type: ignore[no-untyped-call]
         else:
-            load_kube_config(client_configuration=found)  # type: ignore[no-untyped-call]
+            load_kube_config(client_configuration=settings)  # type: ignore[no-untyped-call]
     except (ConfigException, OSError) as error:
         raise NoCluster(
             f"no cluster is known here ({error}): run it in a pod with a service account, or name "
             "a kubeconfig (KUBECONFIG)"
         ) from error
-    # Whoever asks tries again, and is to know at once.
-    found.retries = False
-    found.connection_pool_maxsize = CONNECTIONS
-    return found
+    # Callers try again themselves, and are to know of an error at once.
+    settings.retries = False
+    settings.connection_pool_maxsize = CONNECTIONS
+    return settings

@@ -10,12 +10,12 @@ _RBAC = re.compile(
 
 def missing_rule(message: str) -> str:
     """The rule that the operator's role lacks, by the API server's words; empty if it is none."""
-    found = _RBAC.search(message)
-    if found is None:
+    match = _RBAC.search(message)
+    if match is None:
         return ""
-    where = f" in the namespace {found['namespace']}" if found["namespace"] else ""
+    place = f" in the namespace {match['namespace']}" if match["namespace"] else ""
     return (
-        f"the operator's role lacks a rule{where}: "
-        f'apiGroups ["{found["group"]}"], resources ["{found["resource"]}"], '
-        f'verbs ["{found["verb"]}"]'
+        f"the operator's role lacks a rule{place}: "
+        f'apiGroups ["{match["group"]}"], resources ["{match["resource"]}"], '
+        f'verbs ["{match["verb"]}"]'
     )

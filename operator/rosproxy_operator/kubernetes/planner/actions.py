@@ -43,7 +43,7 @@ class SetPolicy(ObjectAction, frozen=True):
 
 
 class DeletePolicy(ObjectAction, frozen=True):
-    """Delete a NetworkPolicy that is not to be there."""
+    """Delete a NetworkPolicy that ought not to exist."""
 
     why: str
 
@@ -57,7 +57,7 @@ class CreateProxy(ClusterAction, frozen=True):
 class DeleteProxy(ObjectAction, frozen=True):
     """Delete a proxy's pod.
 
-    With ``retire`` its nodes are unregistered at the master first: nobody takes over.
+    With ``retire`` its nodes are unregistered at the master first: no proxy takes over.
     """
 
     why: str
@@ -77,7 +77,7 @@ class DeleteEar(ObjectAction, frozen=True):
 
 
 class EvictPod(ObjectAction, frozen=True):
-    """Evict a user's pod that whoever made it makes anew."""
+    """Evict a user's pod that its controller makes anew."""
 
     why: str
 

@@ -1,4 +1,4 @@
-"""What a proxy is to be told of the pods on its node: which addresses are nobody's any more.
+"""What a proxy is to be told of the pods on its node: which addresses no pod has any more.
 
 A proxy finds out by probing that a ROS node is gone, which takes long; the operator knows from the
 API server that a pod is gone. It compares the addresses at which a proxy has ROS nodes with those
@@ -17,7 +17,7 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Prox
 from rosproxy_operator.kubernetes.resources.model import ClusterNode
 
 UNSEEN = 15.0
-"""Seconds after which an address in a node's pod network is nobody's that no pod was seen with.
+"""Seconds after which an address in a node's pod network counts as gone that no pod was seen with.
 
 A pod's containers run before the API server knows its address.
 """
@@ -27,7 +27,7 @@ REMEMBERED = 15.0
 A proxy's answer may be older than the look: what has just registered is named in the next one.
 """
 LONGEST = 3600.0
-"""The same where a proxy does not answer at all."""
+"""The same while a proxy does not answer at all."""
 AGAIN = 3.0
 """Seconds until proxies are looked at again whose pods have just gone."""
 
@@ -43,61 +43,61 @@ def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departur
     """Compare where the proxies' ROS nodes are with the pods that there are.
 
     An address counts as gone if a pod was seen with it and none has it now; or if it belongs to
-    the node's pod networks, all pods there have others, and that has been so for a while.
+    the node's pod networks and every pod there has had another one for `UNSEEN` seconds.
     """
-    every = {pod.uid: pod for pod in (*(one.pod for one in observed.proxies), *observed.pods)}
-    pods = grouped((pod.node, pod) for pod in every.values())
-    known: dict[str, dict[str, float]] = {}
-    for on in {one.on for one in observed.proxies}:
-        own = {pod.ip: now for pod in pods.get(on, ()) if pod.ip and not pod.host_network}
-        known[on] = {**state.addresses.get(on, {}), **own}
-    found: dict[str, tuple[str, ...]] = {}
+    pod_by_uid = {pod.uid: pod for pod in (*(p.pod for p in observed.proxies), *observed.pods)}
+    pods = grouped((pod.node, pod) for pod in pod_by_uid.values())
+    last_seen: dict[str, dict[str, float]] = {}
+    for name in {p.on for p in observed.proxies}:
+        seen_now = {pod.ip: now for pod in pods.get(name, ()) if pod.ip and not pod.host_network}
+        last_seen[name] = {**state.addresses.get(name, {}), **seen_now}
+    departed: dict[str, tuple[str, ...]] = {}
     strange: dict[tuple[str, str], float] = {}
     for proxy in observed.proxies:
-        answer, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.on)
-        if answer is None or not answer.answered or node is None or not node.ready:
+        report, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.on)
+        if report is None or not report.answered or node is None or not node.ready:
             continue
         living = [pod for pod in pods.get(node.name, ()) if not pod.ended]
-        missing = answer.addresses - {pod.ip for pod in living}
-        unseen = {ip for ip in missing - known[node.name].keys() if _is_pods(ip, proxy, node)}
+        missing = report.addresses - {pod.ip for pod in living}
+        unseen = {ip for ip in missing - last_seen[node.name].keys() if _is_pod_ip(ip, proxy, node)}
         since = {ip: state.strange.get((node.name, ip), now) for ip in unseen}
         strange |= {(node.name, ip): at for ip, at in since.items()}
-        unnamed = any(not pod.ip and not pod.host_network for pod in living)
-        late = {ip for ip, at in since.items() if now - at >= UNSEEN and not unnamed}
-        if addresses := (missing & known[node.name].keys()) | late:
-            found[proxy.pod.uid] = tuple(sorted(addresses))
-    proxies = grouped((one.on, observed.reports.get(one.pod.uid)) for one in observed.proxies)
-    kept = {on: _kept(proxies[on], some, now) for on, some in known.items()}
-    return Departures(found, replace(state, addresses=kept, strange=strange))
+        has_pending = any(not pod.ip and not pod.host_network for pod in living)
+        late = {ip for ip, at in since.items() if now - at >= UNSEEN and not has_pending}
+        if addresses := (missing & last_seen[node.name].keys()) | late:
+            departed[proxy.pod.uid] = tuple(sorted(addresses))
+    reports = grouped((p.on, observed.reports.get(p.pod.uid)) for p in observed.proxies)
+    kept = {name: _kept(reports[name], times, now) for name, times in last_seen.items()}
+    return Departures(departed, replace(state, addresses=kept, strange=strange))
 
 
-def _is_pods(address: str, proxy: ProxyPod, node: ClusterNode) -> bool:
+def _is_pod_ip(address: str, proxy: ProxyPod, node: ClusterNode) -> bool:
     """Whether an address is in the pod networks, and of the family that pods are listed with.
 
     Of a pod with addresses of both families only one is known here.
     """
     try:
-        ip, own = ip_address(address), ip_address(proxy.pod.ip)
+        ip, proxy_ip = ip_address(address), ip_address(proxy.pod.ip)
         networks = [ip_network(network, strict=False) for network in node.pod_networks]
     except ValueError:
         return False
-    return ip.version == own.version and any(ip in network for network in networks)
+    return ip.version == proxy_ip.version and any(ip in network for network in networks)
 
 
 def _kept(
-    asked: Collection[ProxyReport | None], known: Mapping[str, float], now: float
+    reports: Collection[ProxyReport | None], last_seen: Mapping[str, float], now: float
 ) -> dict[str, float]:
     """Which addresses are worth remembering: those that a proxy names, or may name yet."""
-    answers = [answer for answer in asked if answer is not None and answer.answered]
-    named = {address for answer in answers for address in answer.addresses}
-    longest = REMEMBERED if len(answers) == len(asked) else LONGEST
-    return {ip: at for ip, at in known.items() if ip in named or now - at < longest}
+    answered = [report for report in reports if report is not None and report.answered]
+    named = {address for report in answered for address in report.addresses}
+    longest = REMEMBERED if len(answered) == len(reports) else LONGEST
+    return {ip: at for ip, at in last_seen.items() if ip in named or now - at < longest}
 
 
-def waits(found: Departures, now: float) -> Iterator[float]:
-    """In how many seconds there may be something to be told."""
-    recent = (at for some in found.state.addresses.values() for at in some.values() if at != now)
-    if found.gone or any(now - at < REMEMBERED for at in recent):
+def waits(departed: Departures, now: float) -> Iterator[float]:
+    """In how many seconds there may be something to tell the proxies."""
+    recent = (at for ips in departed.state.addresses.values() for at in ips.values() if at != now)
+    if departed.gone or any(now - at < REMEMBERED for at in recent):
         yield AGAIN
-    strange = (at + UNSEEN - now for at in found.state.strange.values())
-    yield from (left for left in strange if left > 0)
+    strange = (at + UNSEEN - now for at in departed.state.strange.values())
+    yield from (seconds for seconds in strange if seconds > 0)

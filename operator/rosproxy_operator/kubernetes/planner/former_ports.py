@@ -2,7 +2,7 @@
 
 A proxy that is started again in its pod is told that by the participants themselves. A new pod has
 another address, at which they don't answer it (see `rosproxy.ros2.discovery.returning`): then the
-operator tells what the former proxy has said last. If it has not seen that one, nobody tells.
+operator tells it what the former proxy reported last, if it has seen that; otherwise nobody does.
 """
 
 from collections.abc import Mapping
@@ -21,25 +21,25 @@ class FormerPorts(msgspec.Struct, frozen=True):
     leases: Leases
 
 
-def remember(view: View, before: Mapping[ProxyPlace, FormerPorts]) -> dict[ProxyPlace, FormerPorts]:
-    """What is known of each place: as its proxy says now; or as the one before has said last.
+def remember(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[ProxyPlace, FormerPorts]:
+    """The ports by place: as its proxy reports them now, or as the former one did last.
 
-    That one's counts until the new one has participants.
+    Those of the former proxy count until the new one has participants.
     """
-    known = {place: each for place, each in before.items() if place.of in view.rosproxies}
+    latest = {place: ports for place, ports in former.items() if place.of in view.rosproxies}
     for place, proxy in view.current.items():
-        answer = view.observed.reports.get(proxy.pod.uid)
-        if answer is None or not answer.answered:
+        report = view.observed.reports.get(proxy.pod.uid)
+        if report is None or not report.answered:
             continue
-        if answer.leases or (place in known and known[place].uid == proxy.pod.uid):
-            known[place] = FormerPorts(proxy.pod.uid, answer.leases)
-    return known
+        if report.leases or (place in latest and latest[place].uid == proxy.pod.uid):
+            latest[place] = FormerPorts(proxy.pod.uid, report.leases)
+    return latest
 
 
-def former_ports(view: View, known: Mapping[ProxyPlace, FormerPorts]) -> dict[str, Leases]:
-    """What proxies are to be told of those before them, by the uid of their pod."""
+def former_ports(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[str, Leases]:
+    """What proxies are to be told of their predecessors, by the uid of their pod."""
     return {
-        proxy.pod.uid: known[place].leases
+        proxy.pod.uid: former[place].leases
         for place, proxy in view.current.items()
-        if place in known and known[place].uid != proxy.pod.uid
+        if place in former and former[place].uid != proxy.pod.uid
     }

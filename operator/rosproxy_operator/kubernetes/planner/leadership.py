@@ -3,14 +3,14 @@
 The Lease (coordination.k8s.io/v1) names its holder, who writes it anew every `RENEW` seconds. The
 rules are those of k8s.io/client-go, tools/leaderelection:
 
-- Whoever wrote it last and knows so acts for `DEADLINE` seconds, counted from before that write
-  was sent; not a moment longer, unless the next write has succeeded.
-- Whoever sees the same version of it for `DURATION` seconds takes it, counted from when that
-  version was first seen, which is after it was written.
+- The operator that wrote it last and knows so acts for `DEADLINE` seconds, counted from before
+  that write was sent; not a moment longer, unless the next write has succeeded.
+- An operator that sees the same version of it for `DURATION` seconds takes it, counted from when
+  that version was first seen, which is after it was written.
 - A write goes through only if the Lease is still the version that was seen (resourceVersion).
 
-`DURATION` is longer than `DEADLINE`, so that nobody begins before the one before has ended. Each
-counts on a clock of its own; the times that stand in the Lease are for people alone.
+`DURATION` is longer than `DEADLINE`, so that no operator begins before the former one has ended.
+Each counts on a clock of its own; the times that stand in the Lease are for people alone.
 """
 
 import msgspec
@@ -19,11 +19,11 @@ from msgspec.structs import replace
 DURATION = 10.0
 """Seconds without a renewal after which another operator takes the Lease."""
 DEADLINE = 6.0
-"""Seconds for which one acts after a renewal. Requests that it has sent have the rest to arrive."""
+"""Seconds for which a holder acts after a renewal. Its requests have until `DURATION` to arrive."""
 RENEW = 2.0
 """Seconds between two renewals."""
 LOOK = 1.0
-"""Seconds at most between two looks of one that stands by."""
+"""Seconds at most between two looks of an operator that stands by."""
 NEVER = float("-inf")
 NOBODY = "nobody"
 """The holder of a Lease that was missing and is made anew: it, too, has to run out first."""
@@ -32,8 +32,8 @@ NOBODY = "nobody"
 class LeaseRecord(msgspec.Struct, frozen=True):
     """A Lease as it is in one ``version``; an empty ``holder``: it was released.
 
-    ``duration`` is what its holder promises, in seconds. ``transitions``: how often another one has
-    taken it. ``acquired``: when the holder has, in its own words.
+    ``duration`` is what its holder promises, in seconds. ``transitions``: how often another holder
+    has taken it. ``acquired``: when this one has, in its own words.
     """
 
     version: str
@@ -62,41 +62,41 @@ class Candidate(msgspec.Struct, frozen=True):
         return now < self.until
 
 
-def observe(one: Candidate, seen: LeaseRecord | None, now: float) -> Candidate:
+def observe(candidate: Candidate, record: LeaseRecord | None, now: float) -> Candidate:
     """What is known after the Lease was read; ``now`` is after the answer."""
-    if seen == one.seen and one.since is not None:
-        return one
-    kept = seen is not None and seen.holder == one.name
-    return replace(one, seen=seen, since=now, until=one.until if kept else NEVER)
+    if record == candidate.seen and candidate.since is not None:
+        return candidate
+    is_holder = record is not None and record.holder == candidate.name
+    return replace(candidate, seen=record, since=now, until=candidate.until if is_holder else NEVER)
 
 
-def wanted(one: Candidate, now: float) -> LeaseRecord | None:
+def wanted(candidate: Candidate, now: float) -> LeaseRecord | None:
     """What is to be written over what was read; None: nothing, somebody else holds it."""
-    seen, since = one.seen, now if one.since is None else one.since
-    if seen is None:  # it may have been taken away from one that acts
+    record, since = candidate.seen, now if candidate.since is None else candidate.since
+    if record is None:  # it may have been deleted while an operator acts
         return LeaseRecord("", NOBODY)
-    if seen.holder == one.name:
-        return replace(seen, duration=DURATION)
-    if seen.holder and now - since < max(seen.duration, DURATION):
+    if record.holder == candidate.name:
+        return replace(record, duration=DURATION)
+    if record.holder and now - since < max(record.duration, DURATION):
         return None
-    return LeaseRecord(seen.version, one.name, transitions=seen.transitions + 1)
+    return LeaseRecord(record.version, candidate.name, transitions=record.transitions + 1)
 
 
-def wrote(one: Candidate, record: LeaseRecord, begun: float, now: float) -> Candidate:
+def wrote(candidate: Candidate, record: LeaseRecord, begun: float, now: float) -> Candidate:
     """What is known after a write that was sent at ``begun`` is known at ``now`` to be there."""
-    if record.holder != one.name:
-        return one
-    terms = one.terms if one.leads(now) else one.terms + 1
-    return replace(one, until=begun + DEADLINE, terms=terms)
+    if record.holder != candidate.name:
+        return candidate
+    terms = candidate.terms if candidate.leads(now) else candidate.terms + 1
+    return replace(candidate, until=begun + DEADLINE, terms=terms)
 
 
-def resigned(one: Candidate) -> Candidate:
-    """What is known by one that acts no more."""
-    return replace(one, until=NEVER)
+def resigned(candidate: Candidate) -> Candidate:
+    """What is known by a candidate that acts no more."""
+    return replace(candidate, until=NEVER)
 
 
-def released(seen: LeaseRecord | None, name: str) -> LeaseRecord | None:
-    """What is to be written by one that acts no more; None if the Lease is not its own."""
-    if seen is None or seen.holder != name:
+def released(record: LeaseRecord | None, name: str) -> LeaseRecord | None:
+    """What a candidate that acts no more is to write; None if the Lease is not its own."""
+    if record is None or record.holder != name:
         return None
-    return replace(seen, holder="", duration=1.0)
+    return replace(record, holder="", duration=1.0)

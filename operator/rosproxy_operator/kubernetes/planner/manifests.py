@@ -72,16 +72,16 @@ _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000
 
 
 _FINGERPRINTS: dict[Name, tuple[object, str]] = {}
-"""What proxies' pods were made of when their fingerprints were worked out last, and those."""
-_MOST = 8192
+"""By the pod's name: what its fingerprint was last worked out from, and that fingerprint."""
+_MAX_FINGERPRINTS = 8192
 
 
 class Site(msgspec.Struct, frozen=True):
     """A proxy on a node.
 
-    ``master`` is the real master as a proxy is told it: ``uri`` also of a Service, ``address``
-    empty if its name is to be resolved, ``publish`` 0 where that port can't be had. ``peers`` are
-    all of ROS 2: those of the RosProxy, and its proxies on other nodes.
+    ``master`` is the real master as the proxy is told it: with a ``uri`` even if it is a Service,
+    ``address`` empty if its name is to be resolved, ``publish`` 0 where that port can't be had.
+    ``peers`` are all of ROS 2: those of the RosProxy, and its proxies on other nodes.
     """
 
     rosproxy: RosProxy
@@ -100,7 +100,7 @@ class Site(msgspec.Struct, frozen=True):
 
     @property
     def ear(self) -> HostPort | None:
-        """Where the proxy's ear is told of participants, on the node; None if there is none."""
+        """Where on the node the proxy's ear is told of participants; None if it has no ear."""
         lan = lan_address(self.node, self.advertise_host)
         multicast = self.rosproxy.spec.multicast and lan
         return HostPort(lan, self.ports.last) if multicast else None
@@ -109,11 +109,11 @@ class Site(msgspec.Struct, frozen=True):
 def lan_address(node: ClusterNode, advertise_host: str) -> str:
     """A node's own IPv4 address on the LAN; empty if it has none.
 
-    It is the one that is advertised, if that is the node's own, else its InternalIP.
+    It is the advertised one, if that is the node's own, else its InternalIP.
     """
-    own = [one for one in node.addresses.values() if is_address(one) and ":" not in one]
+    ipv4 = [a for a in node.addresses.values() if is_address(a) and ":" not in a]
     internal = node.addresses.get("InternalIP", "")
-    return next((one for one in (advertise_host, internal) if one in own), "")
+    return next((a for a in (advertise_host, internal) if a in ipv4), "")
 
 
 def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
@@ -122,57 +122,57 @@ def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
 
 
 def slave_control_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
-    """Who may control a RosProxy's nodes: the operator's word, which it may only narrow."""
-    both = (settings.bounds.slave_control, rosproxy.spec.slave_control)
-    return "master" if "master" in both else "any"
+    """Who may control a RosProxy's nodes: the operator decides, the RosProxy may only narrow it."""
+    modes = (settings.bounds.slave_control, rosproxy.spec.slave_control)
+    return "master" if "master" in modes else "any"
 
 
 def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
     """A proxy's pod.
 
-    The fingerprint says what the pod is made of, but for its image, which can be exchanged, and its
-    policy; then as what its nodes know it, see `finds_again`.
+    The fingerprint says what the pod is made of, except its image, which can be exchanged, its
+    policy and its peers; then under what its nodes know the proxy, see `finds_again`.
     """
-    of, container = site.rosproxy, _container(site, settings)
-    notes = {
+    rosproxy, container = site.rosproxy, _container(site, settings)
+    annotations = {
         NODE: site.node.name,
         PORT_RANGE: str(site.ports),
         ADVERTISE_HOST: site.advertise_host,
     }
-    meta = metadata(of, proxy_id(of.id, site.node.name), notes)
-    # A running proxy is told its policy: another one makes no pod anew. A proxy that is started
+    meta = metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations)
+    # A running proxy is told a new policy, so that makes no pod anew. A proxy that is started
     # again while the operator is away begins with the policy of its pod's creation.
-    # So it is with peers, which come and go with the nodes.
-    told = {*POLICY_VARIABLES, PEERS_VARIABLE}
-    env = [one for one in container["env"] if one["name"] not in told]
+    # The same holds for peers, which come and go with the nodes.
+    live_variables = {*POLICY_VARIABLES, PEERS_VARIABLE}
+    env = [v for v in container["env"] if v["name"] not in live_variables]
     spec = {**_spec(site), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
-    known_as = _digest(f"{site.master.uri}{_domain(of)} {site.advertise_host}")[:8]
-    notes[FINGERPRINT] = f"{_fingerprint(body)}-{known_as}"
+    identity = _digest(f"{site.master.uri}{_domain(rosproxy)} {site.advertise_host}")[:8]
+    annotations[FINGERPRINT] = f"{_fingerprint(body)}-{identity}"
     return {**body, "spec": {**spec, "containers": [container]}}
 
 
 def proxy_fingerprint(site: Site, settings: ClusterSettings) -> str:
-    """The fingerprint of a proxy's pod, worked out anew only if what it is made of is another.
+    """The fingerprint of a proxy's pod, worked out anew only if what it is made of has changed.
 
-    With a thousand proxies that would be half of what a look takes. Peers are no part of it.
+    With a thousand proxies it would take half the time of a look. Peers are no part of it.
     """
-    of = site.rosproxy
-    made_of = (of.uid, of.spec, site.node, site.advertise_host, site.ports, site.master)
-    about = (*made_of, site.token_hash, settings)
-    name = proxy_id(of.id, site.node.name)
-    known = _FINGERPRINTS.get(name)
-    if known is None or known[0] != about:
-        if len(_FINGERPRINTS) >= _MOST:
+    rosproxy = site.rosproxy
+    inputs = (rosproxy.uid, rosproxy.spec, site.node, site.advertise_host, site.ports, site.master)
+    key = (*inputs, site.token_hash, settings)
+    name = proxy_id(rosproxy.id, site.node.name)
+    cached = _FINGERPRINTS.get(name)
+    if cached is None or cached[0] != key:
+        if len(_FINGERPRINTS) >= _MAX_FINGERPRINTS:
             _FINGERPRINTS.clear()
-        known = _FINGERPRINTS[name] = about, fingerprint_of(proxy_pod(site, settings))
-    return known[1]
+        cached = _FINGERPRINTS[name] = key, fingerprint_of(proxy_pod(site, settings))
+    return cached[1]
 
 
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
-    """A RosProxy's Service, under one address the proxy on each pod's own node."""
-    notes: dict[str, str] = {}
-    meta = metadata(rosproxy, service_id(rosproxy.id), notes)
+    """A RosProxy's Service: its one address leads each pod to the proxy on the pod's own node."""
+    annotations: dict[str, str] = {}
+    meta = metadata(rosproxy, service_id(rosproxy.id), annotations)
     spec: dict[str, Any] = {
         "type": "ClusterIP",
         "selector": meta["labels"],
@@ -182,29 +182,29 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
         "ports": [*_service_ports(rosproxy)],
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
-    notes[FINGERPRINT] = _fingerprint(body)
+    annotations[FINGERPRINT] = _fingerprint(body)
     if cluster_ip:
         spec["clusterIP"] = cluster_ip
     return body
 
 
-def _service_ports(of: RosProxy) -> Iterator[Json]:
+def _service_ports(rosproxy: RosProxy) -> Iterator[Json]:
     listening = []
-    if of.spec.ros1:
+    if rosproxy.spec.ros1:
         listening.append(("master", MASTER_PORT, "TCP"))
-    if of.spec.ros2:
-        listening.append(("discovery", discovery_port(of.spec.ros2.number), "UDP"))
+    if rosproxy.spec.ros2:
+        listening.append(("discovery", discovery_port(rosproxy.spec.ros2.number), "UDP"))
     for name, port, protocol in listening:
         yield {"name": name, "port": port, "targetPort": port, "protocol": protocol}
 
 
-def _domain(of: RosProxy) -> str:
+def _domain(rosproxy: RosProxy) -> str:
     """The domain as part of what a proxy's nodes know it by; empty without ROS 2."""
-    return f" domain {of.spec.ros2.number}" if of.spec.ros2 else ""
+    return f" domain {rosproxy.spec.ros2.number}" if rosproxy.spec.ros2 else ""
 
 
 def finds_again(old: str, new: str) -> bool:
-    """Whether a proxy finds at its master the nodes of another one, by their fingerprints.
+    """Whether a new proxy finds at its master the former one's nodes, by both fingerprints.
 
     It does if both have the same master, or domain, and the same advertised host.
     """
@@ -214,8 +214,8 @@ def finds_again(old: str, new: str) -> bool:
 def fingerprinted(body: Json) -> Json:
     """An object with its fingerprint written on it."""
     meta = body["metadata"]
-    notes = {**meta["annotations"], FINGERPRINT: _fingerprint(body)}
-    return {**body, "metadata": {**meta, "annotations": notes}}
+    annotations = {**meta["annotations"], FINGERPRINT: _fingerprint(body)}
+    return {**body, "metadata": {**meta, "annotations": annotations}}
 
 
 def fingerprint_of(body: Json) -> str:
@@ -224,7 +224,7 @@ def fingerprint_of(body: Json) -> str:
 
 
 def without_cluster_ip(body: Json) -> Json:
-    """A Service that takes any address, where the one that it had is somebody else's now."""
+    """A Service that takes any address, for when another Service has its former one now."""
     spec = {key: value for key, value in body["spec"].items() if key != "clusterIP"}
     return {**body, "spec": spec}
 
@@ -238,20 +238,20 @@ def _digest(text: str) -> str:
 
 
 def metadata(
-    of: RosProxy, id: Name, annotations: dict[str, str], component: str = PROXY
+    rosproxy: RosProxy, id: Name, annotations: dict[str, str], component: str = PROXY
 ) -> dict[str, Any]:
     """The metadata of an object that belongs to a RosProxy and goes with it."""
     owner = {
         "apiVersion": API_VERSION,
         "kind": KIND,
-        "name": of.id.name,
-        "uid": of.uid,
+        "name": rosproxy.id.name,
+        "uid": rosproxy.uid,
         "controller": True,
     }
     return {
         "name": id.name,
         "namespace": id.namespace,
-        "labels": own_labels(of.id.name, component),
+        "labels": own_labels(rosproxy.id.name, component),
         "annotations": annotations,
         "ownerReferences": [owner],
     }
@@ -263,7 +263,7 @@ def _spec(site: Site) -> dict[str, Any]:
     The pod is bound to its node through the scheduler, as a DaemonSet's: it checks the ports.
     """
     spec = site.rosproxy.spec
-    aliases = [dict(one) for one in spec.host_aliases]
+    aliases = [dict(alias) for alias in spec.host_aliases]
     sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}]
     return {
         **bound_to(site.node.name, spec),
@@ -281,7 +281,7 @@ def bound_to(node: str, spec: RosProxySpec) -> dict[str, Any]:
         {"key": f"node.kubernetes.io/{taint}", "operator": "Exists", "effect": effect}
         for taint, effect in _TAINTS
     ]
-    secrets = [dict(one) for one in spec.image_pull_secrets]
+    secrets = [dict(secret) for secret in spec.image_pull_secrets]
     return {
         "affinity": {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": terms}},
         "tolerations": [*tolerations, *map(dict, spec.tolerations)],
@@ -296,9 +296,9 @@ def bound_to(node: str, spec: RosProxySpec) -> dict[str, Any]:
 def _local_ports(site: Site) -> str:
     fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
     ros2 = site.rosproxy.spec.ros2
-    known = sorted(well_known_ports(ros2.number)) if ros2 else ()
-    listening = [site.ports, *(PortRange(port, port) for port in (*fixed, *known) if port)]
-    free = (one for one in _LOCAL_PORTS if not any(overlap(one, other) for other in listening))
+    ros2_ports = sorted(well_known_ports(ros2.number)) if ros2 else ()
+    listening = [site.ports, *(PortRange(port, port) for port in (*fixed, *ros2_ports) if port)]
+    free = (r for r in _LOCAL_PORTS if not any(overlap(r, used) for used in listening))
     ports = next(free, _LOCAL_PORTS[0])
     return f"{ports.first} {ports.last}"
 
@@ -312,8 +312,8 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
     publish = [site.master.publish] if site.master.publish else []
-    taken = [("TCP", [*site.ports.ports(), *publish])] if spec.ros1 else []
-    taken += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
+    host_ports = [("TCP", [*site.ports.ports(), *publish])] if spec.ros1 else []
+    host_ports += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
     variables = _environment(site, settings)
     forwards = spec.data_plane == "kernel"
     return {
@@ -323,7 +323,7 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
         "env": [{"name": name, "value": value} for name, value in variables.items()],
         "ports": [
             {"containerPort": port, "hostPort": port, "protocol": protocol}
-            for protocol, ports in taken
+            for protocol, ports in host_ports
             for port in ports
         ],
         "resources": dict(spec.resources),
@@ -377,5 +377,5 @@ def _ros2_variables(site: Site) -> Mapping[str, str]:
 
 
 def _probe(path: str, period: int) -> dict[str, Any]:
-    where = {"path": path, "port": ADMIN_PORT}
-    return {"httpGet": where, "periodSeconds": period, "timeoutSeconds": 3}
+    target = {"path": path, "port": ADMIN_PORT}
+    return {"httpGet": target, "periodSeconds": period, "timeoutSeconds": 3}

@@ -2,8 +2,8 @@
 
 RosProxies of one namespace choose among the same pods, and proxies on one node among the same
 ports: so a part is made of namespaces and of the nodes that they use, with all that is connected
-by these. `plan` is asked for a part as it is for a whole cluster: `cut` gives it what there is of
-that part alone, and `joined` puts what it remembers into the memory of the whole.
+by these. `plan` plans a part as it does a whole cluster: `cut` reduces the snapshot to that part,
+and `joined` puts the part's new state into the state of the whole.
 """
 
 from collections import defaultdict
@@ -36,101 +36,97 @@ def part_of(
     for namespace, node in _uses(observed):
         nodes_of[namespace].add(node)
         users[node].add(namespace)
-    found, found_nodes = set(namespaces), set[str]()
+    reached, reached_nodes = set(namespaces), set[str]()
     for node in nodes:
-        found |= users.get(node, set())
-    left = [*found]
-    while left:
-        new = nodes_of.get(left.pop(), set()) - found_nodes
-        found_nodes |= new
-        more = {one for node in new for one in users[node]} - found
-        found |= more
-        left += more
-    return Part(frozenset(found), frozenset(found_nodes))
+        reached |= users.get(node, set())
+    pending = [*reached]
+    while pending:
+        new_nodes = nodes_of.get(pending.pop(), set()) - reached_nodes
+        reached_nodes |= new_nodes
+        new_users = {user for node in new_nodes for user in users[node]} - reached
+        reached |= new_users
+        pending += new_users
+    return Part(frozenset(reached), frozenset(reached_nodes))
 
 
 def parts(observed: ClusterSnapshot) -> Iterator[Part]:
     """All parts."""
-    left = {one.id.namespace for one in observed.rosproxies}
-    left |= {one.namespace for one in observed.unusable}
-    left |= {namespace for namespace, _ in _uses(observed)}
-    left |= {one.namespace for one in (*observed.services, *observed.policies)}
-    while left:
-        part = part_of(observed, [min(left)])
-        left -= part.namespaces
-        yield part
+    pending = {r.id.namespace for r in observed.rosproxies}
+    pending |= {name.namespace for name in observed.unusable}
+    pending |= {namespace for namespace, _ in _uses(observed)}
+    pending |= {name.namespace for name in (*observed.services, *observed.policies)}
+    while pending:
+        partition = part_of(observed, [min(pending)])
+        pending -= partition.namespaces
+        yield partition
 
 
 def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
-    """Which namespace uses which node: by pods, by proxies, or by ports that it had there."""
+    """Which namespace uses which node: by pods, by proxies, or by ports that it had on it."""
     for pod in observed.pods:
         if pod.uid in observed.selected:
             yield pod.id.namespace, pod.node
-    for one in own_pods(observed.proxies, observed.ears):
-        yield one.of.namespace, one.on
-        yield one.of.namespace, one.pod.node
+    for own_pod in own_pods(observed.proxies, observed.ears):
+        yield own_pod.of.namespace, own_pod.on
+        yield own_pod.of.namespace, own_pod.pod.node
     for rosproxy in observed.rosproxies:
         for node in rosproxy.former:
             yield rosproxy.id.namespace, node
 
 
-def cut(observed: ClusterSnapshot, part: Part) -> ClusterSnapshot:
-    """What there is of a part. What is only looked up by name is left as it is."""
-    own = part.namespaces
+def cut(observed: ClusterSnapshot, partition: Part) -> ClusterSnapshot:
+    """The snapshot of a part alone. What is only looked up by name is left as it is."""
+    namespaces = partition.namespaces
     return replace(
         observed,
-        rosproxies=tuple(one for one in observed.rosproxies if one.id.namespace in own),
-        unusable={id: one for id, one in observed.unusable.items() if id.namespace in own},
+        rosproxies=tuple(r for r in observed.rosproxies if r.id.namespace in namespaces),
+        unusable={id: r for id, r in observed.unusable.items() if id.namespace in namespaces},
         pods=tuple(
-            pod for pod in observed.pods if pod.id.namespace in own or pod.node in part.nodes
+            p for p in observed.pods if p.id.namespace in namespaces or p.node in partition.nodes
         ),
-        proxies=tuple(one for one in observed.proxies if one.of.namespace in own),
-        ears=tuple(one for one in observed.ears if one.of.namespace in own),
-        services={id: one for id, one in observed.services.items() if id.namespace in own},
-        policies={id: one for id, one in observed.policies.items() if id.namespace in own},
+        proxies=tuple(p for p in observed.proxies if p.of.namespace in namespaces),
+        ears=tuple(ear for ear in observed.ears if ear.of.namespace in namespaces),
+        services={id: s for id, s in observed.services.items() if id.namespace in namespaces},
+        policies={id: p for id, p in observed.policies.items() if id.namespace in namespaces},
     )
 
 
-def cut_state(state: ClusterState, part: Part) -> ClusterState:
-    """What is remembered of a part."""
-    return _chosen(state, part, True)
+def cut_state(state: ClusterState, partition: Part) -> ClusterState:
+    """The state of a part alone."""
+    return _filtered(state, partition, True)
 
 
-def joined(state: ClusterState, part: Part, new: ClusterState) -> ClusterState:
-    """What is remembered of all, with what is remembered of a part now."""
-    others = _chosen(state, part, False)
-    both = {
-        name: {**getattr(others, name), **getattr(new, name)}
+def joined(state: ClusterState, partition: Part, new: ClusterState) -> ClusterState:
+    """The state of the whole cluster, with the new state of a part."""
+    outside = _filtered(state, partition, False)
+    merged = {
+        name: {**getattr(outside, name), **getattr(new, name)}
         for name in (*_BY_PLACE, *_BY_NODE, "attempts", "reported", "taken", "strange")
     }
-    return replace(new, **both)
+    return replace(new, **merged)
 
 
 _BY_PLACE = ("absent", "served", "given", "refused", "moved", "tried", "former")
 _BY_NODE = ("lost", "addresses")
 
 
-def _chosen(state: ClusterState, part: Part, inside: bool) -> ClusterState:
-    """What is remembered of a part, or of all others."""
-    own, nodes = part.namespaces, part.nodes
-    found: dict[str, Mapping[Any, Any]] = {
+def _filtered(state: ClusterState, partition: Part, inside: bool) -> ClusterState:
+    """The state of what is inside a part, or of all outside it."""
+    namespaces, nodes = partition.namespaces, partition.nodes
+    fields: dict[str, Mapping[Any, Any]] = {
         "attempts": {
-            task: one
-            for task, one in state.attempts.items()
-            if (task.of.namespace in own) == inside
+            t: a for t, a in state.attempts.items() if (t.of.namespace in namespaces) == inside
         },
         "reported": {
-            one: at for one, at in state.reported.items() if (one.of.namespace in own) == inside
+            f: at for f, at in state.reported.items() if (f.of.namespace in namespaces) == inside
         },
-        "taken": {where: at for where, at in state.taken.items() if (where[0] in nodes) == inside},
-        "strange": {
-            where: at for where, at in state.strange.items() if (where[0] in nodes) == inside
-        },
+        "taken": {key: at for key, at in state.taken.items() if (key[0] in nodes) == inside},
+        "strange": {key: at for key, at in state.strange.items() if (key[0] in nodes) == inside},
     }
     for name in _BY_PLACE:
         places = getattr(state, name)
-        found[name] = {p: one for p, one in places.items() if (p.of.namespace in own) == inside}
+        fields[name] = {p: v for p, v in places.items() if (p.of.namespace in namespaces) == inside}
     for name in _BY_NODE:
         table = getattr(state, name)
-        found[name] = {node: one for node, one in table.items() if (node in nodes) == inside}
-    return replace(state, **found)
+        fields[name] = {node: v for node, v in table.items() if (node in nodes) == inside}
+    return replace(state, **fields)

@@ -1,10 +1,10 @@
 """From what is seen in a cluster to what is to be done there: the way of a RosProxy.
 
-`plan` is a function of what is seen, the state before and the time. `bounds` sets aside who asks
-for more than he may. `view` puts in order what is seen: who is wanted where. `state.learn` draws
-conclusions from it, `allocation.allocate` gives each wanted proxy its ports, `reconcile` and
-`network_policy` say what is to be done to Services, proxies and NetworkPolicies, `status` and
-`events` what users are told of it, `departures`, `callers` and `policies` what proxies are told.
+`plan` is a function of what is seen, the state before and the time. `bounds` sets aside RosProxies
+that ask for too much. `view` puts in order what is seen: which proxies are wanted where.
+`state.learn` draws conclusions from it, `allocation.allocate` gives each wanted proxy its ports,
+`reconcile` and `network_policy` say what is to be done to Services, proxies and NetworkPolicies,
+`status` and `events` what users are told, `departures`, `callers` and `policies` what proxies are.
 """
 
 import json
@@ -100,111 +100,111 @@ def plan(
     ``state`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
     clock that goes on as long as the state does; ``stamp`` is the time of day in RFC 3339.
     """
-    whole, observed = observed, within_bounds(observed, settings)
-    seen = view(observed)
-    learned = learn(seen, state, now)
-    ranges = allocate(seen, settings, learned)
+    full_snapshot, observed = observed, within_bounds(observed, settings)
+    cluster_view = view(observed)
+    learned = learn(cluster_view, state, now)
+    ranges = allocate(cluster_view, settings, learned)
     decided = decide(learned, ranges.given, now)
     retries = Retries(decided.attempts, observed.failures, now)
-    context = ClusterContext(seen, settings, decided, ranges, retries, now)
+    context = ClusterContext(cluster_view, settings, decided, ranges, retries, now)
     actions = [*reconcile_orphans(context), *reconcile_orphaned_policies(context)]
-    problems = [*seen.findings]
-    moved = tuple(moves(seen, decided, ranges.given))
-    for _, rosproxy in sorted(seen.rosproxies.items()):
+    problems = [*cluster_view.findings]
+    moved = tuple(moves(cluster_view, decided, ranges.given))
+    for _, rosproxy in sorted(cluster_view.rosproxies.items()):
         own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))
-        found = _problems(context, rosproxy, states, moved)
+        own_problems = _problems(context, rosproxy, states, moved)
         master, _ = master_of(rosproxy, observed)
         uri, address = master.uri if master else "", context.cluster_ip(rosproxy)
-        status = status_of(rosproxy, states, found, address, uri, stamp)
-        problems += found
+        status = status_of(rosproxy, states, own_problems, address, uri, stamp)
+        problems += own_problems
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
-    for bad in observed.unusable.values():
-        problems.append(finding(bad, bad.reason, bad.text, fatal=True))
-        actions += _patch(context, bad, status_of_invalid(bad, stamp))
-    every = tuple(dict.fromkeys(problems))
-    new = events.warnings(every, decided.reported, now)
-    gone = departures.gone(observed, decided, now)
-    soon = (left for left in ends(context) if left > 0)
+    for invalid in observed.unusable.values():
+        problems.append(finding(invalid, invalid.reason, invalid.text, fatal=True))
+        actions += _patch(context, invalid, status_of_invalid(invalid, stamp))
+    unique = tuple(dict.fromkeys(problems))
+    warnings = events.warnings(unique, decided.reported, now)
+    departed = departures.gone(observed, decided, now)
+    soon = (seconds for seconds in ends(context) if seconds > 0)
     return ClusterPlan(
-        actions=(*actions, *new.emits),
-        problems=every,
-        state=replace(gone.state, attempts=retries.noted, reported=new.reported),
-        gone=gone.gone,
-        callers=callers(whole),
-        policies=policies(whole, settings),
+        actions=(*actions, *warnings.emits),
+        problems=unique,
+        state=replace(departed.state, attempts=retries.noted, reported=warnings.reported),
+        gone=departed.gone,
+        callers=callers(full_snapshot),
+        policies=policies(full_snapshot, settings),
         peers=peers(context),
-        former=former_ports(seen, decided.former),
-        again_in=min((*soon, *retries.waits(), *departures.waits(gone, now)), default=None),
+        former=former_ports(cluster_view, decided.former),
+        again_in=min((*soon, *retries.waits(), *departures.waits(departed, now)), default=None),
     )
 
 
 def stand_by(
     observed: ClusterSnapshot, settings: ClusterSettings, state: ClusterState, now: float
 ) -> ClusterState:
-    """What an operator remembers while another one acts, to begin where that one ends.
+    """What an operator remembers while another operator acts, to take over from it.
 
     That is what can't be seen any more once it is needed: which ports participants had, and which
     addresses pods had. Everything else is learnt from the cluster by the first plan.
     """
-    seen = departures.gone(observed, state, now).state
+    departed = departures.gone(observed, state, now).state
     former = remember(view(within_bounds(observed, settings)), state.former)
-    return ClusterState(former=former, addresses=seen.addresses, strange=seen.strange)
+    return ClusterState(former=former, addresses=departed.addresses, strange=departed.strange)
 
 
-def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
+def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[NodeState]:
     """What a RosProxy has on each node that its status names: also where it had a proxy."""
-    ears = [one for one in context.observed.ears if one.owner == of.uid]
-    named = {*of.former, *(place.node for place in context.view.places.get(of.id, ()))}
-    for node in sorted(named & context.observed.nodes.keys()):
-        place = ProxyPlace(of.id, node)
+    ears = [ear for ear in context.observed.ears if ear.owner == rosproxy.uid]
+    node_names = {*rosproxy.former, *(p.node for p in context.view.places.get(rosproxy.id, ()))}
+    for node in sorted(node_names & context.observed.nodes.keys()):
+        place = ProxyPlace(rosproxy.id, node)
         current, wanted = context.view.current.get(place), place in context.view.wanted
         site = site_of(context, place) if wanted else None
-        former = context.state.given.get(place) or of.former.get(node)
+        former = context.state.given.get(place) or rosproxy.former.get(node)
         kept = current.range if current else former
         yield NodeState(
             name=node,
-            advertise_host=advertise_host(of, context.observed.nodes[node])[0],
+            advertise_host=advertise_host(rosproxy, context.observed.nodes[node])[0],
             range=context.ranges.given.get(place) if wanted else kept,
             proxy=current,
             pods=context.view.wanted.get(place, ()),
             answer=context.observed.reports.get(current.pod.uid) if current else None,
             obstacle=site if isinstance(site, Obstacle) else None,
-            ear=next((one for one in ears if one.on == node), None),
+            ear=next((ear for ear in ears if ear.on == node), None),
         )
 
 
 def _problems(
     context: ClusterContext,
-    of: RosProxy,
+    rosproxy: RosProxy,
     states: tuple[NodeState, ...],
     moved: Iterable[ClusterFinding],
 ) -> tuple[ClusterFinding, ...]:
     """All that is wrong with a RosProxy."""
-    address = context.cluster_ip(of)
-    pods = context.view.taken.get(of.id, ()) if address else ()
-    others = (*context.view.findings, *moved, *context.ranges.findings)
+    address = context.cluster_ip(rosproxy)
+    pods = context.view.taken.get(rosproxy.id, ()) if address else ()
+    shared = (*context.view.findings, *moved, *context.ranges.findings)
     unlisted = context.observed.no_policies if context.settings.network_policy else ""
     text = f"the NetworkPolicies can't be listed, so none is made for it: {unlisted}"
     return (
-        *((finding(of, "NoNetworkPolicy", text),) if unlisted else ()),
-        *findings(of, states, context.retries.failures(of.id)),
-        *(one for one in others if one.of == of.id),
-        *filter(None, (unwired(pod, of, address) for pod in pods if of.spec.ros1)),
-        *(one for pod in pods for one in unmet(pod, of, address)),
-        *ear_findings(context, of),
+        *((finding(rosproxy, "NoNetworkPolicy", text),) if unlisted else ()),
+        *findings(rosproxy, states, context.retries.failures(rosproxy.id)),
+        *(f for f in shared if f.of == rosproxy.id),
+        *filter(None, (unwired(pod, rosproxy, address) for pod in pods if rosproxy.spec.ros1)),
+        *(f for pod in pods for f in unmet(pod, rosproxy, address)),
+        *ear_findings(context, rosproxy),
     )
 
 
 def _patch(
-    context: ClusterContext, of: RosProxy | InvalidRosProxy, status: Json
+    context: ClusterContext, rosproxy: RosProxy | InvalidRosProxy, status: Json
 ) -> Iterator[Action]:
-    """Write a status if it is another one; not over and over again if that does not help.
+    """Write a status if it has changed; not over and over again if that does not help.
 
-    Whether it is the same that was written before is told without its times.
+    Whether it was written before is judged without its times.
     """
-    if status != of.status:
-        conditions = [{**one, "lastTransitionTime": ""} for one in status.get("conditions", ())]
-        said = json.dumps({**status, "conditions": conditions}, sort_keys=True, default=str)
-        if context.retries.ask(Task(of.id, "status", of.id, said)):
-            yield PatchStatus(of.id, of.uid, status)
+    if status != rosproxy.status:
+        conditions = [{**c, "lastTransitionTime": ""} for c in status.get("conditions", ())]
+        content = json.dumps({**status, "conditions": conditions}, sort_keys=True, default=str)
+        if context.retries.ask(Task(rosproxy.id, "status", rosproxy.id, content)):
+            yield PatchStatus(rosproxy.id, rosproxy.uid, status)

@@ -1,8 +1,8 @@
-"""When an action is asked for again that has had no effect: soon, then ever later.
+"""When an action that has had no effect is tried again: soon, then after ever longer pauses.
 
 The planner asks (`Retries.ask`) before each action whether it is to be done now. What was asked for
 is noted, with the time and with the error if the API server refused it, and goes into the next
-state; what nobody asks for any more has had its effect and is forgotten.
+state; a task that is not asked for any more has had its effect and is forgotten.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ FIRST = 1.0
 LONGEST = 60.0
 """Seconds between tries at most."""
 AT_ONCE = 3
-"""How often a pod is made anew without delay that never got well."""
+"""How often a pod that never got well is made anew without delay."""
 
 
 class Task(msgspec.Struct, frozen=True):
@@ -50,24 +50,24 @@ class RetryRecord(msgspec.Struct, frozen=True):
     def pause(self) -> float:
         """Seconds after which it may be tried again."""
         if self.effect and not self.error:
-            late = self.count - AT_ONCE
-            return min(FIRST * 2.0 ** min(late, 10), LONGEST) if late >= 0 else 0.0
+            excess = self.count - AT_ONCE
+            return min(FIRST * 2.0 ** min(excess, 10), LONGEST) if excess >= 0 else 0.0
         first = FIRST if self.error else LAG
         return min(first * 2.0 ** min(self.count - 1, 10), LONGEST)
 
 
 class Retries:
-    """The tries as they are noted in one look. What no one asks about is forgotten."""
+    """The attempts noted in one look. A task that is not asked about is forgotten."""
 
     def __init__(
         self,
-        known: Mapping[Task, RetryRecord],
+        attempts: Mapping[Task, RetryRecord],
         failures: Mapping[Name, Mapping[Name, str]],
         now: float,
     ) -> None:
-        self._known = {
-            task: replace(tried, error=failures.get(task.of, {}).get(task.id, tried.error))
-            for task, tried in known.items()
+        self._attempts = {
+            task: replace(record, error=failures.get(task.of, {}).get(task.id, record.error))
+            for task, record in attempts.items()
         }
         self._now = now
         self.noted: dict[Task, RetryRecord] = {}
@@ -75,31 +75,31 @@ class Retries:
 
     def ask(self, task: Task) -> bool:
         """Whether a task is to be done now; if so, that is noted."""
-        tried = self._known.get(task)
-        if tried is not None and self._now - tried.at < tried.pause:
-            self.noted[task] = tried
+        record = self._attempts.get(task)
+        if record is not None and self._now - record.at < record.pause:
+            self.noted[task] = record
             return False
-        count, error = (tried.count, tried.error) if tried else (0, "")
+        count, error = (record.count, record.error) if record else (0, "")
         self.noted[task] = RetryRecord(count + 1, self._now, error=error)
         return True
 
     def later(self, seconds: float) -> None:
-        """Note that something else has to come first, which is to be looked for in a while."""
+        """Note that something else has to come first: look again in that many seconds."""
         self._later.append(seconds)
 
     def effect(self, task: Task) -> None:
-        """Note that what a task does is there, though not well yet."""
-        if task in self._known:
-            self.noted[task] = replace(self._known[task], effect=True, error="")
+        """Note that a task has had its effect, though it may have to be done again."""
+        if task in self._attempts:
+            self.noted[task] = replace(self._attempts[task], effect=True, error="")
 
     def failures(self, of: Name) -> Mapping[Name, str]:
-        """What can't be done for a RosProxy: what was said, by the object."""
+        """What can't be done for a RosProxy: what the API server said, by the object."""
         noted = self.noted.items()
-        return {task.id: tried.error for task, tried in noted if task.of == of and tried.error}
+        return {task.id: record.error for task, record in noted if task.of == of and record.error}
 
     def waits(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""
         yield from self._later
-        for tried in self.noted.values():
-            if not tried.effect:
-                yield max(tried.at + tried.pause - self._now, 0.0)
+        for record in self.noted.values():
+            if not record.effect:
+                yield max(record.at + record.pause - self._now, 0.0)

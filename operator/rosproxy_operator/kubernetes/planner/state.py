@@ -1,7 +1,7 @@
 """What the operator remembers from look to look. Losing it costs time, never correctness.
 
 Each plan makes the next state out of the one before, in two steps: `learn` draws from what is seen
-(who is not wanted any more, which node is gone, who has served where, which ports were refused),
+(which proxy is unwanted now, which node is gone, which has served where, which ports were refused),
 before anything is decided; `decide` adds the ranges that were given. The other parts are those of
 `departures` (addresses), `retries` (attempts) and `events` (reported), each made once as well.
 """
@@ -74,7 +74,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
     `RETRY_FOR` seconds, since its ports may only be slow to be let go: they count as taken then.
     """
     absent = view.proxies.keys() - view.wanted.keys()
-    lost = {one.on for one in view.observed.proxies} - view.observed.nodes.keys()
+    lost = {p.on for p in view.observed.proxies} - view.observed.nodes.keys()
     served = _served(view, state)
     waiting, refused = _refused(view, served, state.refused, now)
     taken = {port: at for port, at in state.taken.items() if now - at < TAKEN_FOR}
@@ -94,49 +94,49 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
 
 
 def decide(state: ClusterState, ranges: Mapping[ProxyPlace, PortRange], now: float) -> ClusterState:
-    """The state with the ranges that are given, and with who had to leave which."""
-    left = _left(state.served, ranges, now)
+    """The state with the ranges that are given, and with the proxies that had to leave theirs."""
+    moved = _new_moves(state.served, ranges, now)
     tried = {place: ports for place, ports in state.given.items() if place not in state.served}
     return replace(
         state,
         given={**state.given, **ranges},
-        served={place: ports for place, ports in state.served.items() if place not in left},
-        moved={**state.moved, **left},
-        tried={**state.tried, **_left(tried, ranges, now)},
+        served={place: ports for place, ports in state.served.items() if place not in moved},
+        moved={**state.moved, **moved},
+        tried={**state.tried, **_new_moves(tried, ranges, now)},
     )
 
 
 def moves(
     view: View, state: ClusterState, ranges: Mapping[ProxyPlace, PortRange]
 ) -> Iterator[ClusterFinding]:
-    """Who has had to leave which ports."""
-    for left, served in ((state.moved, True), (state.tried, False)):
-        for place, move in sorted(left.items()):
+    """Which proxies have had to leave which ports."""
+    for moved, has_served in ((state.moved, True), (state.tried, False)):
+        for place, move in sorted(moved.items()):
             if place in ranges and not _is_kept(move.ports, ranges[place]):
-                of = view.rosproxies[place.of]
+                rosproxy = view.rosproxies[place.of]
                 why = "they could not be had: nothing needs to be done"
-                if served:
-                    lost = after_move(of.spec.ros1, of.spec.ros2 is not None)
+                if has_served:
+                    lost = after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
                     why = f"something else has taken them or the RosProxy forbids them now: {lost}"
-                what = f"has left ports {move.ports} for {ranges[place]}"
-                text = f"the proxy on node {place.node} {what}, since {why}"
-                yield finding(of, "PortConflict", text)
+                change = f"has left ports {move.ports} for {ranges[place]}"
+                text = f"the proxy on node {place.node} {change}, since {why}"
+                yield finding(rosproxy, "PortConflict", text)
 
 
 def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
     """Where each proxy has served; what the status says is believed only once, at the start."""
     served = dict(state.served)
     if not state.begun:
-        for of, rosproxy in view.rosproxies.items():
-            served |= {ProxyPlace(of, node): ports for node, ports in rosproxy.former.items()}
-    served |= {place_of(one): one.range for one in view.observed.proxies if serves(one)}
+        for name, rosproxy in view.rosproxies.items():
+            served |= {ProxyPlace(name, node): ports for node, ports in rosproxy.former.items()}
+    served |= {place_of(p): p.range for p in view.observed.proxies if serves(p)}
     return _possible(view, served)
 
 
-def _possible(view: View, given: Mapping[ProxyPlace, PortRange]) -> dict[ProxyPlace, PortRange]:
-    """Those whose RosProxy and whose node are there."""
+def _possible(view: View, ranges: Mapping[ProxyPlace, PortRange]) -> dict[ProxyPlace, PortRange]:
+    """The ranges whose RosProxy and whose node exist."""
     rosproxies, nodes = view.rosproxies, view.observed.nodes
-    return {p: ports for p, ports in given.items() if p.of in rosproxies and p.node in nodes}
+    return {p: ports for p, ports in ranges.items() if p.of in rosproxies and p.node in nodes}
 
 
 def _recent(view: View, moves: Mapping[ProxyPlace, Move], since: float) -> dict[ProxyPlace, Move]:
@@ -149,33 +149,33 @@ def _refused(
     since: Mapping[ProxyPlace, float],
     now: float,
 ) -> tuple[dict[ProxyPlace, float], set[tuple[str, int]]]:
-    """Who waits for his ports since when, and the ports by node that nobody gets.
+    """Which proxies wait for their ports since when, and the ports by node that no proxy gets.
 
-    A proxy whose ports another one of the operator's still holds, while it ends, has only to wait.
+    A proxy has only to wait while another one that is being deleted still holds its ports.
     """
-    waiting = {place: at for place, at in since.items() if _waits(view, place)}
+    waiting = {place: at for place, at in since.items() if _is_waiting(view, place)}
     taken: set[tuple[str, int]] = set()
     for proxy in view.observed.proxies:
-        place, there = place_of(proxy), view.on.get(proxy.on, ())
-        ends = any(one.pod.deleting and overlap(one.range, proxy.range) for one in there)
+        place, neighbours = place_of(proxy), view.on.get(proxy.on, ())
+        ends_soon = any(p.pod.deleting and overlap(p.range, proxy.range) for p in neighbours)
         is_stuck = proxy.stuck is Stuck.PORTS and not proxy.pod.deleting
-        if not is_stuck or place not in view.wanted or ends:
+        if not is_stuck or place not in view.wanted or ends_soon:
             continue
-        before, began = served.get(place), waiting.pop(place, now)
-        if before is not None and overlap(before, proxy.range) and now - began < RETRY_FOR:
+        former, began = served.get(place), waiting.pop(place, now)
+        if former is not None and overlap(former, proxy.range) and now - began < RETRY_FOR:
             waiting[place] = began
             continue
-        others = (one.pod for one in there if place_of(one) != place)
+        other_pods = (p.pod for p in neighbours if place_of(p) != place)
         spec = view.rosproxies[place.of].spec
-        held = ports_held((*view.strangers.get(proxy.on, ()), *others), spec)
-        # Whoever holds them is seen, or all of them are avoided.
-        seen = held & proxy.pod.every_port
-        hit = held.intersection(proxy.range.ports()) if seen else proxy.range.ports()
-        taken |= {(proxy.on, port) for port in hit}
+        pod_ports = ports_held((*view.strangers.get(proxy.on, ()), *other_pods), spec)
+        # If the pods that hold them are seen, only their ports are avoided, else the whole range.
+        conflicts = pod_ports & proxy.pod.every_port
+        avoided = pod_ports.intersection(proxy.range.ports()) if conflicts else proxy.range.ports()
+        taken |= {(proxy.on, port) for port in avoided}
     return waiting, taken
 
 
-def _waits(view: View, place: ProxyPlace) -> bool:
+def _is_waiting(view: View, place: ProxyPlace) -> bool:
     """Whether the proxy of a place is wanted, but has not got its ports yet."""
     proxy = view.current.get(place)
     return place in view.wanted and (proxy is None or not has_ports(proxy))
@@ -186,16 +186,16 @@ def ports_held(pods: Iterable[Pod], spec: RosProxySpec) -> set[int]:
     return {port for pod in pods for port in pod.ports_of(spec)}
 
 
-def _left(
-    before: Mapping[ProxyPlace, PortRange], ranges: Mapping[ProxyPlace, PortRange], now: float
+def _new_moves(
+    former: Mapping[ProxyPlace, PortRange], ranges: Mapping[ProxyPlace, PortRange], now: float
 ) -> dict[ProxyPlace, Move]:
     return {
         place: Move(ports, now)
-        for place, ports in before.items()
+        for place, ports in former.items()
         if place in ranges and not _is_kept(ports, ranges[place])
     }
 
 
-def _is_kept(before: PortRange, ports: PortRange) -> bool:
-    """Whether ports were at most added or taken off."""
-    return within(before, ports) or within(ports, before)
+def _is_kept(former: PortRange, ports: PortRange) -> bool:
+    """Whether a range has at most been enlarged or reduced."""
+    return within(former, ports) or within(ports, former)

@@ -1,4 +1,4 @@
-"""What is seen in a cluster, put in order: who is wanted where, and what is there.
+"""What is seen in a cluster, put in order: which proxies are wanted where, and which exist.
 
 Everything after this works by place, that is a RosProxy on a node, and not by pod.
 """
@@ -32,11 +32,11 @@ class View(msgspec.Struct, frozen=True):
     ``rosproxies`` are those that are not being deleted; ``proxies`` those that belong to one of
     them, ``orphans`` those of RosProxies that are gone. ``current`` is the proxy of a place, under
     the name that it is to have, unless it is being deleted. ``on`` are, by the node that they are
-    meant for, all proxies that hold ports, whosever they are. ``wanted`` are the places where pods
-    want a proxy, and those pods; ``places`` those where a proxy is wanted or there, in order;
+    meant for, all proxies that hold ports, of any RosProxy. ``wanted`` are the places where pods
+    want a proxy, and those pods; ``places`` those where a proxy is wanted or exists, in order;
     ``taken`` all pods that a RosProxy has taken, wherever they are. ``strangers`` are, by node, the
-    other pods on it that hold ports, ``others`` the names of all that are no proxies, ``names``
-    those of all proxies. ``findings`` are those about pods.
+    pods that hold ports and are neither proxies nor ears, ``others`` the names of all such pods,
+    with ports or not, ``names`` those of all proxies. ``findings`` are those about pods.
     """
 
     observed: ClusterSnapshot
@@ -72,12 +72,12 @@ def has_ports(proxy: ProxyPod) -> bool:
 
 def view(observed: ClusterSnapshot) -> View:
     """Put in order what is seen."""
-    rosproxies = {one.id: one for one in observed.rosproxies if not one.deleting}
-    proxies = grouped((place_of(one), one) for one in observed.proxies if _owned(one, rosproxies))
-    unusable = {one.uid for one in observed.unusable.values()}
-    orphans = (one for one in observed.proxies if not _owned(one, rosproxies))
-    own = {one.pod.uid for one in observed.proxies} | {ear.pod.uid for ear in observed.ears}
-    others = {pod.uid: pod for pod in observed.pods if pod.uid not in own}.values()
+    rosproxies = {r.id: r for r in observed.rosproxies if not r.deleting}
+    proxies = grouped((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
+    unusable = {r.uid for r in observed.unusable.values()}
+    orphans = (p for p in observed.proxies if not _owned(p, rosproxies))
+    own_uids = {p.pod.uid for p in observed.proxies} | {ear.pod.uid for ear in observed.ears}
+    other_pods = {pod.uid: pod for pod in observed.pods if pod.uid not in own_uids}.values()
     taken, findings = _taken(observed, rosproxies)
     wanted, left_out = _wanted(observed, rosproxies, taken)
     return View(
@@ -85,21 +85,21 @@ def view(observed: ClusterSnapshot) -> View:
         rosproxies=rosproxies,
         proxies=proxies,
         current={
-            place: one
-            for place, there in proxies.items()
-            for one in there
-            if one.pod.id == proxy_id(place.of, place.node) and not one.pod.deleting
+            place: proxy
+            for place, candidates in proxies.items()
+            for proxy in candidates
+            if proxy.pod.id == proxy_id(place.of, place.node) and not proxy.pod.deleting
         },
-        orphans=tuple(one for one in orphans if one.owner not in unusable),
-        on=grouped((one.on, one) for one in observed.proxies if not one.pod.ended),
+        orphans=tuple(p for p in orphans if p.owner not in unusable),
+        on=grouped((p.on, p) for p in observed.proxies if not p.pod.ended),
         wanted=wanted,
         places=grouped((place.of, place) for place in sorted({*wanted, *proxies})),
         taken=taken,
         strangers=grouped(
-            (pod.node, pod) for pod in others if pod.node and pod.every_port and not pod.ended
+            (pod.node, pod) for pod in other_pods if pod.node and pod.every_port and not pod.ended
         ),
-        others=frozenset(pod.id for pod in others),
-        names=frozenset(one.pod.id for one in observed.proxies),
+        others=frozenset(pod.id for pod in other_pods),
+        names=frozenset(p.pod.id for p in observed.proxies),
         findings=(*findings, *left_out),
     )
 
@@ -112,10 +112,10 @@ def _taken(
     observed: ClusterSnapshot, rosproxies: Mapping[Name, RosProxy]
 ) -> tuple[dict[Name, tuple[Pod, ...]], list[ClusterFinding]]:
     """Which RosProxy has taken which pods, and what is wrong with that."""
-    there = [pod for pod in observed.pods if not (pod.ended or pod.deleting or is_own(pod.labels))]
-    choices = [(chosen(pod, rosproxies.values()), pod) for pod in there]
-    taken = grouped((one.id, pod) for one, pod in choices if isinstance(one, RosProxy))
-    return taken, [one for one, _ in choices if isinstance(one, ClusterFinding)]
+    pods = [pod for pod in observed.pods if not (pod.ended or pod.deleting or is_own(pod.labels))]
+    choices = [(chosen(pod, rosproxies.values()), pod) for pod in pods]
+    taken = grouped((choice.id, pod) for choice, pod in choices if isinstance(choice, RosProxy))
+    return taken, [choice for choice, _ in choices if isinstance(choice, ClusterFinding)]
 
 
 def _wanted(
@@ -123,15 +123,15 @@ def _wanted(
     rosproxies: Mapping[Name, RosProxy],
     taken: Mapping[Name, Iterable[Pod]],
 ) -> tuple[dict[ProxyPlace, tuple[Pod, ...]], list[ClusterFinding]]:
-    """The places where pods want a proxy, and what is to be told of those that get none."""
-    places = grouped((ProxyPlace(of, pod.node), pod) for of, pods in taken.items() for pod in pods)
+    """The places where pods want a proxy, and findings about pods that get none."""
+    places = grouped((ProxyPlace(n, pod.node), pod) for n, pods in taken.items() for pod in pods)
     wanted: dict[ProxyPlace, tuple[Pod, ...]] = {}
     findings: list[ClusterFinding] = []
     for place, pods in sorted(places.items()):
-        of, node = rosproxies[place.of], observed.nodes.get(place.node)
+        rosproxy, node = rosproxies[place.of], observed.nodes.get(place.node)
         if node is None or node.deleting:
             continue
-        if on_node(of, node):
+        if on_node(rosproxy, node):
             wanted[place] = pods
             continue
         text = (
@@ -139,18 +139,18 @@ def _wanted(
             f"have no proxy: {short(str(pod.id) for pod in pods)}: widen spec.nodeSelector, or "
             "give the pods the same one"
         )
-        findings.append(finding(of, "NodeLeftOut", text))
+        findings.append(finding(rosproxy, "NodeLeftOut", text))
     return wanted, findings
 
 
 def short(texts: Iterable[str]) -> str:
-    """A few of them, and how many more there are."""
+    """A few of the texts, and how many more there are."""
     return listed(sorted(set(texts)))
 
 
 def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, tuple[V, ...]]:
     """The values of each key, in their order."""
-    found: dict[K, list[V]] = defaultdict(list)
+    groups: dict[K, list[V]] = defaultdict(list)
     for key, value in pairs:
-        found[key].append(value)
-    return {key: tuple(values) for key, values in found.items()}
+        groups[key].append(value)
+    return {key: tuple(values) for key, values in groups.items()}

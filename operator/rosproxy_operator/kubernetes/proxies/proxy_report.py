@@ -1,4 +1,4 @@
-"""What of a proxy's status matters to the operator."""
+"""The part of a proxy's status that matters to the operator."""
 
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.telemetry.text import clean
@@ -11,49 +11,46 @@ from rosproxy_operator.common.proxy_status import (
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 
 RECENT = 300.0
-"""Seconds that a problem counts: a proxy tells the last ones, however old they are."""
+"""Seconds for which a problem counts: a proxy lists the last ones, however old they are."""
 _LONGEST = 300
-"""Characters of a problem or an error, which may be of any size there."""
+"""Characters kept of a problem or an error, which may be of any size in the status."""
 
 
 def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
-    """What a proxy says, and why it does not take its policy.
+    """The report on a proxy, by its status; ``refusal`` is why it does not take its policy.
 
     Nodes that it has given up already are not among its nodes.
     """
     master, nodes = status.master, nodes_by_address(status)
-    every = [node for there in nodes.values() for node in there]
-    topics = {topic for node in every for topic in node.publishes + node.subscribes}
+    all_nodes = [node for group in nodes.values() for node in group]
+    topics = {topic for node in all_nodes for topic in node.publishes + node.subscribes}
     participants = participants_by_address(status)
-    for one in (one for there in participants.values() for one in there):
-        topics.update(one.publishes + one.subscribes)
+    for participant in (p for group in participants.values() for p in group):
+        topics.update(participant.publishes + participant.subscribes)
     up = master.up or "1" not in status.settings.ros
     return ProxyReport(
         answered=True,
         master_up=up,
         error="" if up else short(master.error or "not asked yet"),
         participants={
-            address: tuple(one.guid_prefix for one in there)
-            for address, there in participants.items()
+            address: tuple(p.guid_prefix for p in group) for address, group in participants.items()
         },
         leases=leases(status),
         nodes={
-            address: tuple(sorted({name for node in there for name in node.nodes}))
-            for address, there in nodes.items()
+            address: tuple(sorted({name for node in group for name in node.nodes}))
+            for address, group in nodes.items()
         },
         topics=frozenset(topics),
         refusal=refusal,
-        problems=tuple(
-            short(f"{one.subject}: {one.text}") for one in status.problems if one.age <= RECENT
-        ),
+        problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if p.age <= RECENT),
     )
 
 
 def no_answer(error: str) -> ProxyReport:
-    """What is known of a proxy that does not answer."""
+    """The report on a proxy that does not answer."""
     return ProxyReport(answered=False, error=short(error))
 
 
 def short(text: str) -> str:
-    """What a proxy says, as it may be shown."""
+    """A proxy's text, cleaned and cut so that it may be shown."""
     return bounded(clean(text), _LONGEST)

@@ -1,12 +1,12 @@
-"""Keeping proxies and operator in step, over the proxies' admin endpoints.
+"""Keeps proxies and operator in step, over the proxies' admin endpoints.
 
-Each proxy's pod that has an address has a `ProxyPoller` of its own. It waits until the proxy tells
-of a change (``/status/changes``), which costs nothing as long as none happens; one that is just
-starting, does not answer or is of a former release it asks again and again. And it tells the proxy
+Each proxy's pod that has an address has a `ProxyPoller` of its own. It waits until the proxy
+reports a change (``/status/changes``), which costs nothing as long as none happens; a proxy that is
+just starting, does not answer or is of a former release is polled. The poller also sends the proxy
 its policy (``/policy``), which pods may use it as their master and which are gone
-(``/containers``), until that is confirmed. What a proxy says lands in `ClusterProxySync.reports`,
-from where the operator takes it with each look; a report that is another one than before wakes the
-operator. An operator that does not lead listens as well, and tells nothing.
+(``/containers``), until the proxy confirms. Reports land in `ClusterProxySync.reports`, from where
+each look takes them; one that has changed wakes the operator. An operator that does not lead
+listens as well, and sends nothing.
 """
 
 import asyncio
@@ -30,33 +30,33 @@ from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
 log = logging.getLogger(__name__)
 
 EVERY = 3.0
-"""Seconds between two questions to a proxy."""
+"""Seconds between two polls of a proxy."""
 EVERY_STARTING = 0.5
 """The same until it has answered for the first time."""
 EVERY_FORMER = 15.0
-"""The same for one that does not tell of changes."""
+"""The same for one that does not report changes (``/status/changes``)."""
 WAIT = 300.0
-"""Seconds at most, and half of it at least, until a proxy answers that nothing has changed."""
+"""Longest wait for a change, in seconds, until a proxy answers in any case; half of it at least."""
 STARTING = 10.0
 """Seconds for which a proxy may be silent after its pod has an address: it is just starting."""
 SILENT = 2
-"""Unanswered questions in a row before a proxy counts as silent."""
+"""Unanswered polls in a row before a proxy counts as silent."""
 AT_ONCE = 32
-"""Proxies that are asked at the same time."""
+"""Proxies that are polled at the same time."""
 SLOW_AT_ONCE = 256
-"""The same of calls that may take as long as a proxy's master: they keep no others waiting."""
+"""The same for calls that may wait for a proxy's master: so they hold up no other calls."""
 REPEATED = 30.0
-"""Seconds after which one that does not tell of changes is told anew which pods may use it."""
+"""Seconds after which a proxy that does not report changes is sent anew which pods may use it."""
 
 
 _KNOWS_NO_CHANGES = (403, 404, 405, 503)
-"""HTTP answers of one that is of a former release, or for which too many wait already."""
+"""HTTP answers of a proxy of a former release, or of one at which too many wait already."""
 _Callers = tuple[tuple[str, ...], tuple[str, ...] | None, Leases]
-"""Addresses that may use a proxy, its peers of ROS 2, None for one without, and former ports."""
+"""Addresses that may use a proxy, its ROS 2 peers (None without ROS 2), and former ports."""
 
 
-class Room:
-    """How many calls are under way at once: questions, and those that may wait for a master."""
+class CallLimits:
+    """Limits of calls at the same time: short questions, and calls that may wait for a master."""
 
     def __init__(self) -> None:
         self.questions = asyncio.Semaphore(AT_ONCE)
@@ -64,46 +64,46 @@ class Room:
 
 
 class ProxyPoller:
-    """Asks one proxy again and again, and tells it what it is to know until it confirms that.
+    """Polls one proxy, and sends it what it is to know until it confirms that.
 
-    ``changed`` is called when what is known of it has changed.
+    ``changed`` is called when its report has changed.
     """
 
     def __init__(
         self,
         proxy: ProxyPod,
         proxies: ProxyClient,
-        room: Room,
+        limits: CallLimits,
         changed: Callable[[], None],
         key: bytes,
         leads: Callable[[], bool] = lambda: True,
     ) -> None:
         self._leads = leads
-        self.where, self.token = address_of(proxy), token_for(proxy, key)
+        self.target, self.token = address_of(proxy), token_for(proxy, key)
         self.name = str(proxy.pod.id)
         self.report: ProxyReport | None = None
-        self._proxies, self._room, self._changed = proxies, room, changed
+        self._proxies, self._limits, self._changed = proxies, limits, changed
         self._gone: set[str] = set()
         self._restarts = proxy.restarts
         self._policy: tuple[PolicyLayer, ...] | None = None
         self._known_policy: tuple[PolicyLayer, ...] | None = None
         self._refusal = ""
         self._callers: _Callers | None = None
-        self._known: _Callers | None = None
-        self._known_at = 0.0
+        self._granted: _Callers | None = None
+        self._granted_at = 0.0
         self._pending = asyncio.Event()
         self._recheck, self._failures = False, 0
-        self._tells, self._version, self._instance = True, "", ""
+        self._tells_changes, self._version, self._instance = True, "", ""
         self._since = time.monotonic()
 
     def report_gone(self, gone: Iterable[str]) -> None:
-        """Let it know that the pods with these addresses are no more."""
+        """Have the proxy told that the pods with these addresses are gone."""
         self._gone |= set(gone)
         if self._gone:
             self._pending.set()
 
     def report_policy(self, policy: tuple[PolicyLayer, ...]) -> None:
-        """Let it know all layers of its policy."""
+        """Have the proxy told all layers of its policy."""
         self._policy = policy
         if policy != self._known_policy:
             self._pending.set()
@@ -114,68 +114,68 @@ class ProxyPoller:
         peers: tuple[str, ...] | None = None,
         former: Leases | None = None,
     ) -> None:
-        """Let it know the addresses of all pods that may use it as their master.
+        """Have the proxy told the addresses of all pods that may use it as their master.
 
-        And, if it is for ROS 2, its peers, and which ports participants had at the one before.
+        And, if it is for ROS 2, its peers, and which ports participants had at the former proxy.
         """
         self._callers = callers, peers, former or {}
-        if self._callers != self._known:
+        if self._callers != self._granted:
             self._pending.set()
 
     def restarted(self, restarts: int) -> None:
-        """Take notice of how often its container was started again: it knows nothing then."""
+        """Note how often its container was started again: a proxy knows nothing after that."""
         if restarts != self._restarts:
             self._restarts = restarts
             self._forget()
             self._pending.set()
 
     async def run(self) -> None:
-        """Listen and tell until cancelled."""
-        news: asyncio.Task[None] | None = None
+        """Poll the proxy and send to it until cancelled."""
+        long_poll: asyncio.Task[None] | None = None
         try:
             while True:
-                told = await self._tell()
-                if self._listens and not told:
-                    news = news or asyncio.create_task(self._ask(_some_time()))
-                    await self._either(news)
-                    if news.done():
-                        news = news.result()
+                told_gone = await self._tell()
+                if self._listens and not told_gone:
+                    long_poll = long_poll or asyncio.create_task(self._ask(_random_wait()))
+                    await self._wait_for_either(long_poll)
+                    if long_poll.done():
+                        long_poll = long_poll.result()
                     continue
-                # What it was told may take it a moment: then it is looked at once more, not now.
-                self._recheck = self._recheck and not told
-                async with self._room.questions:
+                # Acting on that may take the proxy a moment: the next poll rechecks, not this one.
+                self._recheck = self._recheck and not told_gone
+                async with self._limits.questions:
                     await self._ask()
-                self._recheck = told
+                self._recheck = told_gone
                 if not self._listens:
-                    await self._rest()
+                    await self._pause()
         finally:
-            if news is not None:
-                news.cancel()
+            if long_poll is not None:
+                long_poll.cancel()
 
     @property
     def _listens(self) -> bool:
-        """Whether it is waited until the proxy tells of a change, instead of asking it."""
+        """Whether to wait until the proxy reports a change, instead of polling it."""
         answers = self.report is not None and self.report.answered
-        return answers and self._tells and not self._is_busy
+        return answers and self._tells_changes and not self._is_busy
 
     @property
     def _is_busy(self) -> bool:
-        """Whether it is yet to answer, or to confirm what it was told."""
-        known = self._policy in (None, self._known_policy) and self._callers in (None, self._known)
-        return bool(self._failures or self._recheck or self._gone) or not known
+        """Whether the proxy is yet to answer, or to confirm what it was sent."""
+        done = self._policy in (None, self._known_policy) and self._callers in (None, self._granted)
+        return bool(self._failures or self._recheck or self._gone) or not done
 
-    async def _either(self, news: asyncio.Task[None]) -> None:
-        """Wait for news, or until there is something to tell."""
+    async def _wait_for_either(self, long_poll: asyncio.Task[None]) -> None:
+        """Wait for a change, or until there is something to send."""
         pending = asyncio.create_task(self._pending.wait())
         try:
-            await asyncio.wait({news, pending}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({long_poll, pending}, return_when=asyncio.FIRST_COMPLETED)
         finally:
             pending.cancel()
 
-    async def _rest(self) -> None:
-        """Wait until it is to be asked again, or until there is something to tell."""
+    async def _pause(self) -> None:
+        """Wait until the next poll is due, or until there is something to send."""
         answers = self.report is not None and self.report.answered
-        pause = EVERY if answers or self._waited(EVERY * 20) else EVERY_STARTING
+        pause = EVERY if answers or self._has_waited(EVERY * 20) else EVERY_STARTING
         if answers and not self._is_busy:
             pause = EVERY_FORMER
         with contextlib.suppress(TimeoutError):
@@ -183,125 +183,125 @@ class ProxyPoller:
                 await self._pending.wait()
 
     async def _tell(self) -> bool:
-        """Tell all that it is to know and has not confirmed yet; whether some pods are gone."""
+        """Send all that is not confirmed yet. Returns whether gone pods were confirmed now."""
         self._pending.clear()
-        if await self._tell_policy():  # nobody is let in whose policy it does not have
+        if await self._tell_policy():  # nobody is let in before the policy is known
             await self._tell_callers()
         return await self._tell_gone()
 
     async def _ask(self, within: float = 0.0) -> None:
-        """Ask for its status, or wait for a change of it."""
+        """Request its status, or wait for a change of it for ``within`` seconds."""
         try:
-            status = await self._question(within)
-            found = report(status, self._refusal)
+            status = await self._fetch_status(within)
+            new_report = report(status, self._refusal)
             self._failures = 0
         except ProxyError as error:
-            self._forget()  # who answers next may have been started meanwhile
+            self._forget()  # the process that answers next may be a new one
             self._failures += 1
-            if self._failures < SILENT or not (self.report or self._waited(STARTING)):
+            if self._failures < SILENT or not (self.report or self._has_waited(STARTING)):
                 return
-            found = no_answer(str(error))
-        starting = self.report is None and not self._waited(STARTING)
-        if starting and found.answered and not found.master_up:
+            new_report = no_answer(str(error))
+        starting = self.report is None and not self._has_waited(STARTING)
+        if starting and new_report.answered and not new_report.master_up:
             return  # it may not have asked its master yet
         # A process may outlive its pod for a moment: then the next look tells it again.
         recheck, self._recheck = self._recheck, False
-        if found != self.report or recheck:
-            self.report = found
+        if new_report != self.report or recheck:
+            self.report = new_report
             self._changed()
 
-    async def _question(self, within: float) -> ProxyStatus:
-        if self._tells:
+    async def _fetch_status(self, within: float) -> ProxyStatus:
+        if self._tells_changes:
             try:
                 since = self._version if within else ""
-                found = await self._proxies.changes(self.where, self.token, since, within)
+                change = await self._proxies.changes(self.target, self.token, since, within)
             except ProxyError as error:
                 if error.status not in _KNOWS_NO_CHANGES:
                     raise
-                self._tells = False
+                self._tells_changes = False
             else:
-                self._version, status = found
-                self._met(status.instance)
+                self._version, status = change
+                self._note_instance(status.instance)
                 return status
-        return await self._proxies.status(self.where)
+        return await self._proxies.status(self.target)
 
-    def _met(self, instance: str) -> None:
-        """Take notice of which process it is: one that was started again knows nothing."""
+    def _note_instance(self, instance: str) -> None:
+        """Note which process answers: one that was started again knows nothing."""
         if self._instance and instance != self._instance:
             self._forget()
             self._pending.set()
         self._instance = instance
 
     def _forget(self) -> None:
-        """Take it that the proxy knows nothing."""
-        self._known = self._known_policy = None
-        self._tells = True
+        """Assume that the proxy knows nothing."""
+        self._granted = self._known_policy = None
+        self._tells_changes = True
 
     async def _tell_policy(self) -> bool:
-        """Tell its policy, if it does not know that; whether it does now."""
+        """Send its policy, if it does not have that. Returns whether it has it now."""
         policy = self._policy
         if policy is None or policy == self._known_policy:
             return True
         try:
-            async with self._room.slow:
+            async with self._limits.slow:
                 if not self._leads():
                     return False
-                await self._proxies.policy(self.where, self.token, policy)
+                await self._proxies.policy(self.target, self.token, policy)
         except PolicyRefused as error:
             self._refusal = short(str(error))
             return False
         except ProxyError as error:
-            log.debug("%s was not told its policy: %s", self.where, error)
+            log.debug("%s was not told its policy: %s", self.target, error)
             return False
         self._recheck = self._recheck or bool(self._refusal)  # it has another report now
         self._known_policy, self._refusal = policy, ""
         return True
 
     async def _tell_callers(self) -> None:
-        """Tell which pods may use it, if it does not know.
+        """Send which pods may use it, if it does not know.
 
-        In a call of its own, before the others: those may wait for the master, but pods wait here.
+        In a call of its own, before the others: those may wait for the master, and pods for this.
         """
         callers = self._callers
-        recent = self._tells or time.monotonic() - self._known_at < REPEATED
-        if callers is None or (callers == self._known and recent):
+        recent = self._tells_changes or time.monotonic() - self._granted_at < REPEATED
+        if callers is None or (callers == self._granted and recent):
             return
         try:
-            async with self._room.questions:
+            async with self._limits.questions:
                 if not self._leads():  # the call before may have taken long
                     return
-                await self._proxies.selected(self.where, self.token, *callers)
+                await self._proxies.selected(self.target, self.token, *callers)
         except ProxyError as error:
-            log.debug("%s was not told that %s may use it: %s", self.where, callers, error)
+            log.debug("%s was not told that %s may use it: %s", self.target, callers, error)
             return
-        self._known, self._known_at = callers, time.monotonic()
+        self._granted, self._granted_at = callers, time.monotonic()
 
     async def _tell_gone(self) -> bool:
-        """Tell which pods are gone, if any are; whether it has confirmed that."""
+        """Send which pods are gone, if any are. Returns whether the proxy has confirmed that."""
         gone = sorted(self._gone)
         if not gone:
             return False
         try:
-            async with self._room.slow:
+            async with self._limits.slow:
                 if not self._leads():
                     return False
-                told = await self._proxies.containers(self.where, self.token, {"gone": gone})
+                answer = await self._proxies.containers(self.target, self.token, {"gone": gone})
         except ProxyError as error:
-            # It may just be without its master; it is told again with the next question.
-            log.debug("%s was not told that %s are gone: %s", self.where, gone, error)
+            # It may just be without its master; it is sent again with the next poll.
+            log.debug("%s was not told that %s are gone: %s", self.target, gone, error)
             return False
         self._gone -= set(gone)
-        log.debug("%s was told that %s are gone: %s", self.where, gone, told)
+        log.debug("%s was told that %s are gone: %s", self.target, gone, answer)
         return True
 
-    def _waited(self, seconds: float) -> bool:
+    def _has_waited(self, seconds: float) -> bool:
         return time.monotonic() - self._since > seconds
 
 
 class ClusterProxySync:
     """All pollers, one for each proxy's pod that has an address.
 
-    ``changed`` is called with the namespaces of proxies of which something new is known.
+    ``changed`` is called with the namespaces of proxies whose reports have changed.
     """
 
     def __init__(
@@ -312,42 +312,42 @@ class ClusterProxySync:
         leads: Callable[[], bool] = lambda: True,
     ) -> None:
         self._tasks, self._proxies, self._changed, self._leads = tasks, proxies, changed, leads
-        self._room = Room()
-        self._all: dict[str, tuple[ProxyPoller, asyncio.Task[None]]] = {}
+        self._limits = CallLimits()
+        self._pollers: dict[str, tuple[ProxyPoller, asyncio.Task[None]]] = {}
 
     @property
     def reports(self) -> dict[str, ProxyReport]:
-        """What is known, by the uid of the proxy's pod; of one that is just starting, nothing."""
-        return {uid: one.report for uid, (one, _) in self._all.items() if one.report is not None}
+        """The reports by the uids of the proxies' pods; none of a proxy that is just starting."""
+        return {uid: p.report for uid, (p, _) in self._pollers.items() if p.report is not None}
 
     @property
     def ways(self) -> dict[str, tuple[HostPort, str]]:
-        """Where each proxy is asked, and the token, by the names of their pods."""
-        return {one.name: (one.where, one.token) for one, _ in self._all.values()}
+        """Each proxy's admin endpoint and the token for it, by the names of their pods."""
+        return {poller.name: (poller.target, poller.token) for poller, _ in self._pollers.values()}
 
     def follow(self, proxies: Iterable[ProxyPod], key: bytes = b"") -> None:
         """Poll these and no others, with tokens made from this key."""
-        wanted = {each.pod.uid: each for each in proxies if each.pod.ip and not each.pod.ended}
-        for uid in [*self._all]:
-            poller, task = self._all[uid]
-            known = wanted.get(uid)
-            way = _way(known, key) if known else None
-            if known is None or way != (poller.where, poller.token) or task.done():
+        wanted = {p.pod.uid: p for p in proxies if p.pod.ip and not p.pod.ended}
+        for uid in [*self._pollers]:
+            poller, task = self._pollers[uid]
+            current = wanted.get(uid)
+            endpoint = _admin_endpoint(current, key) if current else None
+            if current is None or endpoint != (poller.target, poller.token) or task.done():
                 task.cancel()
-                del self._all[uid]
+                del self._pollers[uid]
             else:
-                poller.restarted(known.restarts)
+                poller.restarted(current.restarts)
         for uid, proxy in wanted.items():
-            if uid not in self._all:
+            if uid not in self._pollers:
                 changed = partial(self._changed, [proxy.of.namespace])
-                one = ProxyPoller(proxy, self._proxies, self._room, changed, key, self._leads)
-                task = self._tasks.spawn(one.run(), f"polling {proxy.pod.id}")
-                self._all[uid] = one, task
+                added = ProxyPoller(proxy, self._proxies, self._limits, changed, key, self._leads)
+                task = self._tasks.spawn(added.run(), f"polling {proxy.pod.id}")
+                self._pollers[uid] = added, task
 
     async def forget(self) -> None:
-        """Take it that no proxy knows anything: another operator has told them meanwhile."""
-        tasks = [task for _, task in self._all.values()]
-        self._all.clear()
+        """Assume that no proxy knows anything: another operator has sent to them meanwhile."""
+        tasks = [task for _, task in self._pollers.values()]
+        self._pollers.clear()
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -355,8 +355,8 @@ class ClusterProxySync:
     def report_policies(self, policies: Mapping[str, tuple[PolicyLayer, ...]]) -> None:
         """Let proxies know, by the uid of their pod, the layers of their policy."""
         for uid, policy in policies.items():
-            if uid in self._all:
-                self._all[uid][0].report_policy(policy)
+            if uid in self._pollers:
+                self._pollers[uid][0].report_policy(policy)
 
     def report_callers(
         self,
@@ -366,33 +366,33 @@ class ClusterProxySync:
     ) -> None:
         """Let proxies know, by the uid of their pod, which addresses may use them, and peers."""
         for uid, addresses in callers.items():
-            if uid in self._all:
-                self._all[uid][0].report_callers(addresses, peers.get(uid), former.get(uid))
+            if uid in self._pollers:
+                self._pollers[uid][0].report_callers(addresses, peers.get(uid), former.get(uid))
 
     def report_gone(self, gone: Mapping[str, Iterable[str]]) -> None:
         """Let proxies know, by the uid of their pod, which addresses are no pod's any more."""
         for uid, addresses in gone.items():
-            if uid in self._all:
-                self._all[uid][0].report_gone(addresses)
+            if uid in self._pollers:
+                self._pollers[uid][0].report_gone(addresses)
 
 
-def _some_time() -> float:
-    """Seconds to wait for news: not the same for all, which begin together."""
+def _random_wait() -> float:
+    """Seconds to wait for a change: not the same for all pollers, which begin together."""
     return WAIT * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
 
 
 def address_of(proxy: ProxyPod) -> HostPort:
-    """Where a proxy answers the operator."""
+    """A proxy's admin endpoint."""
     return HostPort(proxy.pod.ip, ADMIN_PORT)
 
 
 def token_for(proxy: ProxyPod, key: bytes) -> str:
     """The token of a proxy's admin endpoint, by the operator's key.
 
-    One that a former operator has made has it in its pod.
+    A proxy that a former operator has made has the token in its pod.
     """
     return proxy.token or token_of(key, proxy.pod.id, proxy.on)
 
 
-def _way(proxy: ProxyPod, key: bytes) -> tuple[HostPort, str]:
+def _admin_endpoint(proxy: ProxyPod, key: bytes) -> tuple[HostPort, str]:
     return address_of(proxy), token_for(proxy, key)

@@ -1,7 +1,7 @@
-"""What only an Event tells: that the kubelet can't set a proxy's pod up, for a port for one.
+"""Why the kubelet can't set up a proxy's pod, a taken port for one: only an Event tells that.
 
-As long as proxies have been waiting for a while, the Events with that reason are asked for, in one
-request for a namespace and never often.
+While proxies have been waiting for some time, the Events with that reason are requested, at once
+for a whole namespace and never often.
 """
 
 import asyncio
@@ -23,9 +23,9 @@ from rosproxy_operator.kubernetes.resources.values import part, word
 FAILED = "FailedCreatePodSandBox"
 """The reason of the kubelet's Event, which alone says that a hostPort could not be had."""
 PATIENCE = 2.0
-"""Seconds for which a proxy's pod may wait on its node without anybody asking why."""
+"""Seconds for which a proxy's pod may wait on its node before its Events are requested."""
 EVERY = 3.0
-"""Seconds between two questions about a namespace."""
+"""Seconds between two requests for a namespace's Events."""
 _IDS = re.compile(r"\b[0-9a-f]{32,64}\b")
 _LONGEST = 300
 
@@ -35,23 +35,23 @@ class SandboxFailures:
 
     def __init__(self, api: Api) -> None:
         self._api = api
-        self._since: dict[str, float] = {}
-        self._asked: dict[str, float] = {}
+        self._waiting_since: dict[str, float] = {}
+        self._asked_at: dict[str, float] = {}
         self._messages: dict[str, str] = {}
 
     async def read(self, observed: ClusterSnapshot) -> set[str]:
-        """Ask where it is time to; the namespaces of which something new is known."""
-        now, waiting = time.monotonic(), [one for one in observed.proxies if _waits(one)]
-        uids = {one.pod.uid for one in waiting}
-        self._since = {uid: self._since.get(uid, now) for uid in uids}
+        """Request the Events that are due. Returns the namespaces with new messages."""
+        now, waiting = time.monotonic(), [proxy for proxy in observed.proxies if _waits(proxy)]
+        uids = {p.pod.uid for p in waiting}
+        self._waiting_since = {uid: self._waiting_since.get(uid, now) for uid in uids}
         self._messages = {uid: text for uid, text in self._messages.items() if uid in uids}
-        late = {one.of.namespace for one in waiting if now - self._since[one.pod.uid] >= PATIENCE}
-        due = [name for name in late if now - self._asked.get(name, -EVERY) >= EVERY]
-        self._asked = {name: at for name, at in self._asked.items() if name in late}
-        self._asked |= dict.fromkeys(due, now)
-        found = await asyncio.gather(*(in_thread(self._events, name) for name in due))
+        late = {p.of.namespace for p in waiting if now - self._waiting_since[p.pod.uid] >= PATIENCE}
+        due = [name for name in late if now - self._asked_at.get(name, -EVERY) >= EVERY]
+        self._asked_at = {name: at for name, at in self._asked_at.items() if name in late}
+        self._asked_at |= dict.fromkeys(due, now)
+        event_lists = await asyncio.gather(*(in_thread(self._events, name) for name in due))
         new: set[str] = set()
-        for name, events in zip(due, found, strict=True):
+        for name, events in zip(due, event_lists, strict=True):
             for uid, text in _latest(events).items():
                 if uid in uids and self._messages.get(uid) != text:
                     self._messages[uid] = text
@@ -62,14 +62,14 @@ class SandboxFailures:
         return self._api.fresh("events", namespace, f"reason={FAILED}")
 
     def shown(self, observed: ClusterSnapshot) -> ClusterSnapshot:
-        """What is seen, with what is known of its proxies."""
+        """The snapshot, with the Events' messages at its proxies."""
         if not self._messages:
             return observed
         return replace(observed, proxies=tuple(map(self._shown, observed.proxies)))
 
     def again_in(self) -> float | None:
-        """In how many seconds there is something to be asked; None: never."""
-        return EVERY if self._since else None
+        """In how many seconds to request Events again; None: no proxy waits."""
+        return EVERY if self._waiting_since else None
 
     def _shown(self, proxy: ProxyPod) -> ProxyPod:
         message = self._messages.get(proxy.pod.uid, "")
@@ -81,19 +81,19 @@ class SandboxFailures:
 
 
 def _waits(proxy: ProxyPod) -> bool:
-    """Whether a proxy's pod is on its node, and nothing more is heard of it."""
+    """Whether a proxy's pod is on its node, without an address or a known failure yet."""
     pod = proxy.pod
-    there = pod.phase == "Pending" and bool(pod.node) and not pod.deleting
-    return there and not (proxy.stuck or pod.ip)
+    is_pending = pod.phase == "Pending" and bool(pod.node) and not pod.deleting
+    return is_pending and not (proxy.stuck or pod.ip)
 
 
 def _latest(events: Sequence[Json]) -> dict[str, str]:
     """What the last Event about each pod says, by the pod's uid."""
-    found: dict[str, Json] = {}
-    for event in sorted(events, key=_when):
-        found[word(part(event, "involvedObject"), "uid")] = event
-    return {uid: word(event, "message") for uid, event in found.items()}
+    latest: dict[str, Json] = {}
+    for event in sorted(events, key=_timestamp):
+        latest[word(part(event, "involvedObject"), "uid")] = event
+    return {uid: word(event, "message") for uid, event in latest.items()}
 
 
-def _when(event: Json) -> str:
+def _timestamp(event: Json) -> str:
     return word(event, "lastTimestamp") or word(event, "eventTime")

@@ -2,9 +2,9 @@
 
 A proxy's pod holds only the hash of its token, so that whoever may read pods can't change what the
 proxy knows. The operator has no disk, and computes each token anew from this key and the proxy's
-name (`names.token_of`), as others that stand by do. The chart makes the Secret without data, so
-that the right to write is for one name; upgrades leave it alone. Whoever takes the key out of it
-gets another one, and the proxies are made anew, one of a RosProxy after the other, on the same
+name (`names.token_of`), as operators that stand by do. The chart makes the Secret without data, so
+that the right to write is for one name; upgrades leave it alone. If the key is removed from it,
+another one is made, and the proxies are made anew, one of a RosProxy after the other, on the same
 ports.
 """
 
@@ -29,9 +29,9 @@ from rosproxy_operator.kubernetes.resources.values import part, word
 log = logging.getLogger(__name__)
 
 ENTRY = "key"
-"""Where it is in the Secret's data."""
+"""The key's name in the Secret's data."""
 LENGTH = 32
-"""Bytes of it: those of the hash that it is used with (RFC 2104, section 3)."""
+"""Bytes of the key: as many as those of the hash that it is used with (RFC 2104, section 3)."""
 
 
 class TokenKey:
@@ -39,41 +39,41 @@ class TokenKey:
 
     def __init__(self, api: Api, secret: Name | None) -> None:
         self._api, self._secret = api, secret
-        self._own = b""
+        self._cached_key = b""
         self.problems: Sequence[Problem] = ()
 
     def read(self) -> bytes:
         """The key as it is now. Raises ApiAway."""
         self.problems = ()
         if self._secret is None:
-            return self._kept()
+            return self._kept_key()
         try:
-            there = self._api.get("secrets", self._secret)
-            found = _read(there)
-            if not found:
-                found = secrets.token_bytes(LENGTH)
-                self._put(self._secret, found, there)
+            manifest = self._api.get("secrets", self._secret)
+            key = _read(manifest)
+            if not key:
+                key = secrets.token_bytes(LENGTH)
+                self._put(self._secret, key, manifest)
         except ApiAway:
             raise
         except ApiError as error:
             self._complain(error)
-            return self._kept()
-        self._own = found
-        return found
+            return self._kept_key()
+        self._cached_key = key
+        return key
 
-    def _put(self, secret: Name, key: bytes, there: Json) -> None:
-        """Write a key into the Secret. Whoever was faster has the right one. Raises ApiError."""
+    def _put(self, secret: Name, key: bytes, manifest: Json) -> None:
+        """Write a key to the Secret; if somebody else was faster theirs counts. Raises ApiError."""
         entries = {ENTRY: base64.b64encode(key).decode()}
         try:
-            self._api.fill_secret(secret, there, entries)
+            self._api.fill_secret(secret, manifest, entries)
         except (ApiInvalid, ApiConflict) as error:
             raise ApiAway(f"somebody else writes {secret}: {error}") from None
         log.info("made a key for the proxies' tokens in Secret %s", secret)
 
-    def _kept(self) -> bytes:
+    def _kept_key(self) -> bytes:
         """The key that was known last, else one that lasts as long as this process."""
-        self._own = self._own or secrets.token_bytes(LENGTH)
-        return self._own
+        self._cached_key = self._cached_key or secrets.token_bytes(LENGTH)
+        return self._cached_key
 
     def _complain(self, error: ApiError) -> None:
         text = (
@@ -88,7 +88,7 @@ class TokenKey:
 def _read(secret: Json) -> bytes:
     """The key in a Secret; empty if there is none that is long enough."""
     try:
-        found = base64.b64decode(word(part(secret, "data"), ENTRY), validate=True)
+        key = base64.b64decode(word(part(secret, "data"), ENTRY), validate=True)
     except binascii.Error:
         return b""
-    return found if len(found) >= LENGTH else b""
+    return key if len(key) >= LENGTH else b""

@@ -1,7 +1,7 @@
 """What a user writes, read strictly: the first field that does not fit is refused by its name.
 
-Not by msgspec, which the proxy's documents are read with: what it says of a field is neither named
-as Kubernetes names it nor tells what to do.
+Not by msgspec, which reads the proxy's documents: its messages neither name a field as Kubernetes
+does nor tell what to do.
 """
 
 from collections.abc import Mapping
@@ -29,38 +29,38 @@ class Field(msgspec.Struct, frozen=True):
     path: str
     value: Any
 
-    def refused(self, what: str, fix: str) -> InvalidField:
+    def refused(self, problem: str, fix: str) -> InvalidField:
         """The error to raise for it: what is wrong, and what to do."""
-        return InvalidField(f"{self.path}: {quoted(self.value)} {what}: {fix}")
+        return InvalidField(f"{self.path}: {quoted(self.value)} {problem}: {fix}")
 
     def __getitem__(self, key: str) -> "Field":
         return Field(f"{self.path}.{key}", self.map().get(key))
 
     def map(self, default: Mapping[str, Any] = _NOTHING) -> Mapping[str, Any]:
         """A map of anything."""
-        return self._of(dict, default, "a map of fields")
+        return self._checked(dict, default, "a map of fields")
 
     def texts(self) -> dict[str, str]:
         """A map of texts."""
         return {key: self[key].text() for key in self.map()}
 
     def each(self) -> list["Field"]:
-        """What a list holds."""
-        found = [
-            Field(f"{self.path}[{i}]", one) for i, one in enumerate(self._of(list, [], "a list"))
+        """The fields of a list."""
+        fields = [
+            Field(f"{self.path}[{i}]", v) for i, v in enumerate(self._checked(list, [], "a list"))
         ]
-        for one in found:
-            if one.value is None:
-                raise one.refused("does not fit", "leave it out")
-        return found
+        for field in fields:
+            if field.value is None:
+                raise field.refused("does not fit", "leave it out")
+        return fields
 
     def text(self, default: str = "") -> str:
         """A text."""
-        return self._of(str, default, "a text, in quotes")
+        return self._checked(str, default, "a text, in quotes")
 
     def truth(self) -> bool:
         """True or false, which is the default."""
-        return self._of(bool, False, "true or false")
+        return self._checked(bool, False, "true or false")
 
     def number(self, default: N, least: int, most: int) -> N:
         """A number of the type that the default has, within bounds."""
@@ -69,23 +69,23 @@ class Field(msgspec.Struct, frozen=True):
         kind = type(default)
         fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
         if not fits or not least <= self.value <= most:
-            word = {int: "an integer", float: "a number"}[kind]
-            raise self.refused("does not fit", f"write {word} from {least} to {most}")
+            expected = {int: "an integer", float: "a number"}[kind]
+            raise self.refused("does not fit", f"write {expected} from {least} to {most}")
         return kind(self.value)
 
     def one_of(self, allowed: Mapping[str, V], default: str) -> V:
-        """What one of some words stands for."""
-        found = self.text(default)
-        if found not in allowed:
+        """What the text stands for, which must be one of those that are allowed."""
+        text = self.text(default)
+        if text not in allowed:
             fix = f"write one of {', '.join(sorted(filter(None, allowed)))}"
             raise self.refused("is unknown", fix)
-        return allowed[found]
+        return allowed[text]
 
-    def _of(self, type: type[V], default: V, word: str) -> V:
+    def _checked(self, type: type[V], default: V, expected: str) -> V:
         if self.value is None:
             return default
         if not isinstance(self.value, type):
-            raise self.refused("does not fit", f"write {word}")
+            raise self.refused("does not fit", f"write {expected}")
         return self.value
 
 
@@ -95,4 +95,4 @@ def bare(obj: Any) -> Any:
         return obj.strip()
     if isinstance(obj, Mapping):
         return {key: bare(value) for key, value in obj.items() if value is not None}
-    return [bare(one) for one in obj] if isinstance(obj, list | tuple) else obj
+    return [bare(child) for child in obj] if isinstance(obj, list | tuple) else obj

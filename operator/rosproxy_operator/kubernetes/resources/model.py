@@ -209,7 +209,7 @@ class Pod(msgspec.Struct, frozen=True):
         return self.host_ports | self.udp_ports
 
     def ports_of(self, spec: RosProxySpec) -> frozenset[int]:
-        """Those that a RosProxy can't have: by the protocols that it takes ports of."""
+        """Its ports that a RosProxy can't have, by the protocols that its proxies use."""
         tcp = self.host_ports if spec.ros1 else frozenset[int]()
         return tcp | self.udp_ports if spec.takes_udp else tcp
 

@@ -59,9 +59,9 @@ _LONGEST = 63
 _SLUG = 30
 
 
-def own_labels(of: str, component: str = PROXY) -> dict[str, str]:
-    """The labels of a proxy's pod and of the Service of the RosProxy that is called ``of``."""
-    return {**_OWN, COMPONENT_LABEL: component, PROXY_OF: of}
+def own_labels(rosproxy: str, component: str = PROXY) -> dict[str, str]:
+    """The labels of a proxy's pod and of the Service of the given RosProxy."""
+    return {**_OWN, COMPONENT_LABEL: component, PROXY_OF: rosproxy}
 
 
 def is_own(labels: Mapping[str, str]) -> bool:
@@ -75,38 +75,38 @@ def is_ear(labels: Mapping[str, str]) -> bool:
     return is_own(labels) and labels[COMPONENT_LABEL] == EAR
 
 
-def service_id(of: Name) -> Name:
+def service_id(rosproxy: Name) -> Name:
     """The namespace and name of a RosProxy's Service."""
-    return Name(of.namespace, f"{_PREFIX}{of.name}")
+    return Name(rosproxy.namespace, f"{_PREFIX}{rosproxy.name}")
 
 
 @lru_cache(maxsize=8192)
-def proxy_id(of: Name, node: str) -> Name:
+def proxy_id(rosproxy: Name, node: str) -> Name:
     """The name of a RosProxy's pod on a node, always the same, so that there are never two."""
-    digest = hashlib.sha256(f"{of.name} {node}".encode()).hexdigest()[:_DIGITS]
-    room = min(_SLUG, _LONGEST - len(f"{_PREFIX}{of.name}--{digest}"))
+    digest = hashlib.sha256(f"{rosproxy.name} {node}".encode()).hexdigest()[:_DIGITS]
+    room = min(_SLUG, _LONGEST - len(f"{_PREFIX}{rosproxy.name}--{digest}"))
     slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
-    parts = (f"{_PREFIX}{of.name}", slug, digest)
-    return Name(of.namespace, "-".join(part for part in parts if part))
+    segments = (f"{_PREFIX}{rosproxy.name}", slug, digest)
+    return Name(rosproxy.namespace, "-".join(s for s in segments if s))
 
 
-def ear_id(of: Name, node: str) -> Name:
+def ear_id(rosproxy: Name, node: str) -> Name:
     """The name of the pod in which the ear of a RosProxy's proxy on a node runs."""
-    proxy = proxy_id(of, node)
+    proxy = proxy_id(rosproxy, node)
     return Name(proxy.namespace, f"{proxy.name}-ear")
 
 
-def policy_id(of: Name) -> Name:
+def policy_id(rosproxy: Name) -> Name:
     """The namespace and name of the NetworkPolicy of a RosProxy's proxies."""
-    return Name(of.namespace, f"{_PREFIX}{of.name}")
+    return Name(rosproxy.namespace, f"{_PREFIX}{rosproxy.name}")
 
 
-def pods_policy_id(of: Name) -> Name:
+def pods_policy_id(rosproxy: Name) -> Name:
     """The namespace and name of the NetworkPolicy of a RosProxy's pods.
 
     No RosProxy's name has a dot: it is never that of another one's proxies.
     """
-    return Name(of.namespace, f"{_PREFIX}{of.name}.pods")
+    return Name(rosproxy.namespace, f"{_PREFIX}{rosproxy.name}.pods")
 
 
 def token_of(key: bytes, proxy: Name, node: str) -> str:
@@ -114,8 +114,8 @@ def token_of(key: bytes, proxy: Name, node: str) -> str:
 
     It stands nowhere: the pod has its hash alone. Empty if there is no key.
     """
-    about = f"{proxy} {node}".encode()
-    return hmac.new(key, about, hashlib.sha256).hexdigest() if key else ""
+    message = f"{proxy} {node}".encode()
+    return hmac.new(key, message, hashlib.sha256).hexdigest() if key else ""
 
 
 def master_uri(cluster_ip: str) -> str:

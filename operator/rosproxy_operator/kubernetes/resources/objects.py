@@ -55,9 +55,9 @@ def node(obj: Json) -> ClusterNode:
     return ClusterNode(
         name=word(meta, "name"),
         labels=words(meta, "labels"),
-        addresses={word(one, "type"): word(one, "address") for one in addresses},
+        addresses={word(address, "type"): word(address, "address") for address in addresses},
         advertise_host=word(part(meta, "annotations"), names.ADVERTISE_HOST).strip(),
-        pod_networks=tuple(one for one in networks if one and isinstance(one, str)),
+        pod_networks=tuple(network for network in networks if network and isinstance(network, str)),
         ready=_is_ready(status),
         deleting=is_deleted(meta),
     )
@@ -82,7 +82,7 @@ def pod(obj: Json) -> Pod:
         wired=wired,
         static_peers=word(part(meta, "annotations"), names.STATIC_PEERS),
         containers=tuple(map(_container, parts(spec, "containers"))),
-        ips=tuple(filter(None, (word(one, "ip") for one in parts(status, "podIPs")))),
+        ips=tuple(filter(None, (word(pod_ip, "ip") for pod_ip in parts(status, "podIPs")))),
         controller=_controller(meta),
     )
 
@@ -92,7 +92,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     meta, status = part(obj, "metadata"), part(obj, "status")
     labels, notes = words(meta, "labels"), words(meta, "annotations")
     containers = parts(part(obj, "spec"), "containers")
-    container = next((one for one in containers if one.get("name") == names.CONTAINER), None)
+    container = next((c for c in containers if c.get("name") == names.CONTAINER), None)
     ports = port_range(notes, names.PORT_RANGE)
     on, owner = notes.get(names.NODE, ""), _owner(meta)
     if not names.is_own(labels) or names.is_ear(labels):
@@ -100,7 +100,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     if ports is None or not (on and owner and container):
         return None
     reason, message = stuck(status)
-    variables = {word(one, "name"): word(one, "value") for one in parts(container, "env")}
+    variables = {word(v, "name"): word(v, "value") for v in parts(container, "env")}
     return ProxyPod(
         pod=pod(obj),
         of=Name(word(meta, "namespace"), labels[names.PROXY_OF]),
@@ -113,7 +113,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
         ready=_is_ready(status),
         stuck=reason,
         message=message,
-        restarts=sum(number(one, "restartCount") for one in parts(status, "containerStatuses")),
+        restarts=sum(number(c, "restartCount") for c in parts(status, "containerStatuses")),
     )
 
 
@@ -143,11 +143,11 @@ def service(obj: Json) -> ProxyService | None:
     """A Service; None if the object is not one that this operator made."""
     meta, address = part(obj, "metadata"), word(part(obj, "spec"), "clusterIP")
     labels, owner = words(meta, "labels"), _owner(meta)
-    of = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
-    if not names.is_own(labels) or not owner or names.service_id(of) != name_of(meta):
+    rosproxy = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
+    if not names.is_own(labels) or not owner or names.service_id(rosproxy) != name_of(meta):
         return None
     return ProxyService(
-        of=of,
+        of=rosproxy,
         owner=owner,
         uid=word(meta, "uid"),
         cluster_ip="" if address == "None" else address,
@@ -163,7 +163,7 @@ def master_service(obj: Json) -> MasterService:
         id=name_of(part(obj, "metadata")),
         address=word(spec, "clusterIP"),
         type=word(spec, "type"),
-        ports=frozenset(number(one, "port") for one in ports),
+        ports=frozenset(number(port, "port") for port in ports),
         allowed=allowed_from(obj),
     )
 
@@ -172,20 +172,20 @@ def policy(obj: Json) -> ProxyPolicy | None:
     """A NetworkPolicy; None if the object is not one that this operator made."""
     meta = part(obj, "metadata")
     labels, owner = words(meta, "labels"), _owner(meta)
-    of = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
+    rosproxy = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
     id = name_of(meta)
     if not names.is_own(labels) or not owner:
         return None
-    if id not in (names.policy_id(of), names.pods_policy_id(of)):
+    if id not in (names.policy_id(rosproxy), names.pods_policy_id(rosproxy)):
         return None
-    return ProxyPolicy(id, of, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
+    return ProxyPolicy(id, rosproxy, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
 
 
 def allowed_from(service: Json) -> frozenset[str]:
     """The namespaces whose RosProxies may name a Service as their master; ``*`` for all."""
     text = word(part(service, "metadata", "annotations"), names.ALLOW_FROM)
-    named = (one.strip() for one in text.split(","))
-    return frozenset(one for one in named if one == "*" or is_label(one))
+    namespaces = (namespace.strip() for namespace in text.split(","))
+    return frozenset(n for n in namespaces if n == "*" or is_label(n))
 
 
 def name_of(metadata: Json) -> Name:
@@ -200,15 +200,15 @@ def is_deleted(metadata: Json) -> bool:
 
 def _is_ready(status: Json) -> bool:
     conditions = parts(status, "conditions")
-    return any(one.get("type") == "Ready" and one.get("status") == "True" for one in conditions)
+    return any(c.get("type") == "Ready" and c.get("status") == "True" for c in conditions)
 
 
 def _container(obj: Json) -> PodContainer:
     """What a container's own variables and its image say of ROS 2."""
     variables = {
-        name: ELSEWHERE if one.get("valueFrom") is not None else word(one, "value")
-        for one in parts(obj, "env")
-        if (name := word(one, "name")) in ROS2_VARIABLES
+        name: ELSEWHERE if variable.get("valueFrom") is not None else word(variable, "value")
+        for variable in parts(obj, "env")
+        if (name := word(variable, "name")) in ROS2_VARIABLES
     }
     return PodContainer(word(obj, "image"), variables)
 
@@ -219,8 +219,8 @@ def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
     That is ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
     """
     inits = parts(spec, "initContainers")
-    lasting = (one for one in inits if one.get("restartPolicy") == "Always")
-    for container in (*parts(spec, "containers"), *lasting):
+    sidecars = (c for c in inits if c.get("restartPolicy") == "Always")
+    for container in (*parts(spec, "containers"), *sidecars):
         for port in parts(container, "ports"):
             if port.get("protocol", "TCP") == protocol and (taken := number(port, "hostPort")):
                 yield taken
@@ -231,14 +231,14 @@ def _masters(spec: Json) -> Iterator[str]:
         for variable in parts(container, "env"):
             if variable.get("name") == VARIABLE:
                 value = word(variable, "value")
-                later = variable.get("valueFrom") is not None or "$(" in value
-                yield ELSEWHERE if later else value
+                is_indirect = variable.get("valueFrom") is not None or "$(" in value
+                yield ELSEWHERE if is_indirect else value
 
 
 def _controller(meta: Json) -> str:
     """The kind of the controller that made an object; empty if none did."""
     owners = parts(meta, "ownerReferences")
-    return next((word(one, "kind") for one in owners if one.get("controller") is True), "")
+    return next((word(owner, "kind") for owner in owners if owner.get("controller") is True), "")
 
 
 def _owner(meta: Json) -> str:

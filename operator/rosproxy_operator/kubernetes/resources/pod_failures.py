@@ -63,9 +63,9 @@ def stuck(status: Json) -> tuple[Stuck | None, str]:
     """
     if word(status, "phase") == "Failed":
         return _failed(word(status, "reason"), word(status, "message"))
-    for one in parts(status, "conditions"):
-        if one.get("type") == "PodScheduled" and one.get("status") == "False":
-            return _unscheduled(word(one, "reason"), word(one, "message"))
+    for condition in parts(status, "conditions"):
+        if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
+            return _unscheduled(word(condition, "reason"), word(condition, "message"))
     for container in parts(status, "containerStatuses"):
         if container.get("name") in (CONTAINER, EAR):
             return _waiting(container)
@@ -122,13 +122,13 @@ def _crashing(ended: Json) -> tuple[Stuck, str]:
     reason, message = word(ended, "reason"), word(ended, "message")
     if reason in _NOT_STARTED:
         return Stuck.SANDBOX, _text("RunContainerError", message)
-    how = f"exit code {number(ended, 'exitCode')}"
+    ending = f"exit code {number(ended, 'exitCode')}"
     if reason not in ("", "Error", "Completed"):
-        how = f"{reason}, {how}"
+        ending = f"{reason}, {ending}"
     lines = message.strip().splitlines() or [""]
-    return Stuck.CRASHING, _text(how, _STAMP.sub("", lines[-1]))
+    return Stuck.CRASHING, _text(ending, _STAMP.sub("", lines[-1]))
 
 
 def _text(reason: str, message: str) -> str:
-    text = ": ".join(one for one in (reason, " ".join(message.split())) if one)
+    text = ": ".join(s for s in (reason, " ".join(message.split())) if s)
     return bounded(clean(text), _LONGEST)

@@ -51,9 +51,9 @@ def key_of(obj: Json) -> str:
 def pod_record(obj: Json) -> PodRecord:
     """A pod, as one of the operator's if it is one."""
     if names.is_own(words(part(obj, "metadata"), "labels")):
-        own = objects.proxy_pod(obj) or objects.ear_pod(obj)
-        if own is not None:
-            return own
+        own_pod = objects.proxy_pod(obj) or objects.ear_pod(obj)
+        if own_pod is not None:
+            return own_pod
     return _shared(objects.pod(obj))
 
 
@@ -77,11 +77,11 @@ READERS: Mapping[str, Callable[[Json], Record | None]] = {
     "services": service_record,
     POLICIES: objects.policy,
 }
-"""What is watched, and how an object of it is read; None if it is nobody's business here."""
+"""By watched kind, how an object is read; None if the operator does not need the object."""
 
 
 def _shared(pod: Pod) -> Pod:
-    """The same pod, without texts of its own that others have as well."""
+    """The same pod, with texts interned that many pods have in common."""
     intern = sys.intern
     return replace(
         pod,
@@ -92,5 +92,5 @@ def _shared(pod: Pod) -> Pod:
         labels={intern(key): intern(value) for key, value in pod.labels.items()},
         # One address is most often all.
         ips=(pod.ip,) if pod.ips == (pod.ip,) else pod.ips,
-        containers=tuple(replace(one, image=intern(one.image)) for one in pod.containers),
+        containers=tuple(replace(c, image=intern(c.image)) for c in pod.containers),
     )

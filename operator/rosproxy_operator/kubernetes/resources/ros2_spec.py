@@ -8,49 +8,49 @@ from rosproxy_operator.kubernetes.resources.model import Ros2Spec
 _VERSIONS = {"1": ("1",), "2": ("2",), "1,2": ("1", "2")}
 
 
-def versions(given: Field) -> tuple[str, ...]:
+def versions(field: Field) -> tuple[str, ...]:
     """The versions of ROS: 1 (as without the field), 2, or "1,2". Raises InvalidField."""
-    value = "1" if given.value is None else given.value
-    found = str(value).replace(" ", "") if type(value) in (int, str) else ""
-    if found not in _VERSIONS:
-        raise given.refused("is unknown", "write 1, 2 or '1,2'")
-    return _VERSIONS[found]
+    value = "1" if field.value is None else field.value
+    text = str(value).replace(" ", "") if type(value) in (int, str) else ""
+    if text not in _VERSIONS:
+        raise field.refused("is unknown", "write 1, 2 or '1,2'")
+    return _VERSIONS[text]
 
 
-def ros2_spec(given: Field, wanted: bool) -> Ros2Spec | None:
+def ros2_spec(field: Field, wanted: bool) -> Ros2Spec | None:
     """The fields of ROS 2 in a spec; None if it is not ``wanted``. Raises InvalidField."""
     if not wanted:
         for name in ("domain", "peers", "multicast"):
-            if given[name].value not in (None, [], False):
+            if field[name].value not in (None, [], False):
                 fix = "leave it out, or set spec.ros: 2"
-                raise given[name].refused("is for ROS 2, which spec.ros leaves out", fix)
+                raise field[name].refused("is for ROS 2, which spec.ros leaves out", fix)
         return None
-    domain = given["domain"]
+    domain = field["domain"]
     return Ros2Spec(
         domain=None if domain.value is None else domain.number(0, 0, LAST_DOMAIN),
-        peers=_peers(given["peers"]),
-        multicast=given["multicast"].truth(),
+        peers=_peers(field["peers"]),
+        multicast=field["multicast"].truth(),
     )
 
 
-def check_ports(given: Field, ports: int, ros2: Ros2Spec | None) -> None:
+def check_ports(field: Field, ports: int, ros2: Ros2Spec | None) -> None:
     """Raise InvalidField if there are too few ports for ROS 2."""
     least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PER_DOMAIN
     if ros2 and ports < least:
         fix = f"ask for {least} at least: each participant takes three"
-        raise given.refused("are too few for ROS 2", fix)
+        raise field.refused("are too few for ROS 2", fix)
 
 
-def _peers(given: Field) -> tuple[str, ...]:
-    listed = given.each()
+def _peers(field: Field) -> tuple[str, ...]:
+    listed = field.each()
     if len(listed) > MOST_PEERS:
-        raise given.refused("are too many", f"name {MOST_PEERS} hosts at most")
-    return tuple(sorted({_peer(one) for one in listed}))
+        raise field.refused("are too many", f"name {MOST_PEERS} hosts at most")
+    return tuple(sorted({_peer(peer) for peer in listed}))
 
 
-def _peer(given: Field) -> str:
+def _peer(field: Field) -> str:
     try:
-        return read_peer_name(given.text())
+        return read_peer_name(field.text())
     except ValueError:
         fix = "write the robot's name or address, or HOST:PORT of another proxy"
-        raise given.refused("is no peer", fix) from None
+        raise field.refused("is no peer", fix) from None

@@ -72,9 +72,9 @@ _DATA_PLANE: dict[str, DataPlane] = {
 }
 _DIRECTION: dict[str, Direction] = {"Out": "out", "Both": "both"}
 _POD_EGRESS: dict[str, PodEgress] = {"Any": "any", "Proxy": "proxy"}
-_ADVERTISE = {one.value: one for one in Advertise}
+_ADVERTISE = {a.value: a for a in Advertise}
 _PULL_POLICY = {policy: policy for policy in ("", "Always", "IfNotPresent", "Never")}
-_OPERATORS = {one: one for one in ("In", "NotIn", "Exists", "DoesNotExist")}
+_OPERATORS = {operator: operator for operator in ("In", "NotIn", "Exists", "DoesNotExist")}
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _EXAMPLE = "http://robot.example:11311"
 _HIGH = (1024, 65535)
@@ -100,8 +100,8 @@ def rosproxies(
 def rosproxy(obj: Json) -> RosProxy:
     """A RosProxy. Raises InvalidField."""
     meta, status = part(obj, "metadata"), part(obj, "status")
-    id, where = name_of(meta), parse_slave_uri(word(status, "masterURI"))
-    address = where.host if where else word(status, "staticPeers")
+    id, service = name_of(meta), parse_slave_uri(word(status, "masterURI"))
+    address = service.host if service else word(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME:
         fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
         raise Field("metadata.name", id.name).refused("does not fit", fix)
@@ -125,159 +125,159 @@ def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
     return InvalidRosProxy(name_of(meta), uid, generation, str(error), status)
 
 
-def _spec(given: Field, of: Name) -> RosProxySpec:
-    ports, for_ros = given["ports"].number(32, 1, MOST_PORTS), versions(given["ros"])
+def _spec(field: Field, of: Name) -> RosProxySpec:
+    ports, for_ros = field["ports"].number(32, 1, MOST_PORTS), versions(field["ros"])
     for name in ("master", "udp"):
-        if "1" not in for_ros and given[name].value not in (None, False):
-            raise given[name].refused("is for ROS 1, which spec.ros leaves out", "leave it out")
-    ros2 = ros2_spec(given, "2" in for_ros)
-    check_ports(given["ports"], ports, ros2)
+        if "1" not in for_ros and field[name].value not in (None, False):
+            raise field[name].refused("is for ROS 1, which spec.ros leaves out", "leave it out")
+    ros2 = ros2_spec(field, "2" in for_ros)
+    check_ports(field["ports"], ports, ros2)
     return RosProxySpec(
         ros1="1" in for_ros,
         ros2=ros2,
-        master=_master(given["master"], of) if "1" in for_ros else MasterSpec(),
+        master=_master(field["master"], of) if "1" in for_ros else MasterSpec(),
         ports=ports,
-        window=_window(given["portWindow"], ports),
-        pod_selector=_selector(given["podSelector"]),
-        node_selector=given["nodeSelector"].texts(),
-        tolerations=tuple(one.map() for one in given["tolerations"].each()),
-        advertise=given["advertise"].one_of(_ADVERTISE, Advertise.INTERNAL_IP.value),
-        cleanup_after=given["cleanupAfterSeconds"].number(30.0, 0, _DAY),
-        grace=given["graceSeconds"].number(60.0, 0, _DAY),
-        slave_control=given["policy"]["slaveControl"].one_of(_SLAVE_CONTROL, "Any"),
-        policy=_policy(given["policy"], of),
-        data_plane=given["dataPlane"].one_of(_DATA_PLANE, "Auto"),
-        direction=given["direction"].one_of(_DIRECTION, "Out"),
-        pod_egress=_pod_egress(given),
-        udp=_udp(given),
-        image=given["image"].text(),
-        image_pull_policy=given["imagePullPolicy"].one_of(_PULL_POLICY, ""),
-        image_pull_secrets=tuple(one.map() for one in given["imagePullSecrets"].each()),
-        resources=given["resources"].map(RESOURCES),
-        host_aliases=tuple(_host_alias(one) for one in given["hostAliases"].each()),
+        window=_window(field["portWindow"], ports),
+        pod_selector=_selector(field["podSelector"]),
+        node_selector=field["nodeSelector"].texts(),
+        tolerations=tuple(toleration.map() for toleration in field["tolerations"].each()),
+        advertise=field["advertise"].one_of(_ADVERTISE, Advertise.INTERNAL_IP.value),
+        cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY),
+        grace=field["graceSeconds"].number(60.0, 0, _DAY),
+        slave_control=field["policy"]["slaveControl"].one_of(_SLAVE_CONTROL, "Any"),
+        policy=_policy(field["policy"], of),
+        data_plane=field["dataPlane"].one_of(_DATA_PLANE, "Auto"),
+        direction=field["direction"].one_of(_DIRECTION, "Out"),
+        pod_egress=_pod_egress(field),
+        udp=_udp(field),
+        image=field["image"].text(),
+        image_pull_policy=field["imagePullPolicy"].one_of(_PULL_POLICY, ""),
+        image_pull_secrets=tuple(secret.map() for secret in field["imagePullSecrets"].each()),
+        resources=field["resources"].map(RESOURCES),
+        host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].each()),
     )
 
 
-def _pod_egress(given: Field) -> PodEgress:
-    found, direction = given["podEgress"].one_of(_POD_EGRESS, "Any"), given["direction"]
-    if found == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
+def _pod_egress(field: Field) -> PodEgress:
+    egress, direction = field["podEgress"].one_of(_POD_EGRESS, "Any"), field["direction"]
+    if egress == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
         fix = "the pods would hear nobody outside: choose spec.direction: Both, too"
-        raise given["podEgress"].refused("does not go with spec.direction: Out", fix)
-    return found
+        raise field["podEgress"].refused("does not go with spec.direction: Out", fix)
+    return egress
 
 
-def _udp(given: Field) -> bool:
-    found = given["udp"].truth()
-    if found and given["direction"].one_of(_DIRECTION, "Out") == "out":
+def _udp(field: Field) -> bool:
+    udp = field["udp"].truth()
+    if udp and field["direction"].one_of(_DIRECTION, "Out") == "out":
         fix = "datagrams get in with both directions alone: choose spec.direction: Both, too"
-        raise given["udp"].refused("does not go with spec.direction: Out", fix)
-    return found
+        raise field["udp"].refused("does not go with spec.direction: Out", fix)
+    return udp
 
 
-def _policy(given: Field, of: Name) -> tuple[PolicyLayer, ...]:
+def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
     """The layer of its policy; none if it has no rules."""
-    mode = given["mode"].one_of(_POLICY_MODE, "Enforce")
-    rules = tuple(rule for one in given["rules"].each() for rule in _rules(one))
+    mode = field["mode"].one_of(_POLICY_MODE, "Enforce")
+    rules = tuple(rule for r in field["rules"].each() for rule in _rules(r))
     layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
     if problem := too_much(layers):
-        raise InvalidField(f"{given['rules'].path}: {problem}: join names or nodes by globs")
+        raise InvalidField(f"{field['rules'].path}: {problem}: join names or nodes by globs")
     return layers
 
 
-def _rules(given: Field) -> Iterator[Rule]:
-    """One for each of the names that are listed, with each of the nodes."""
-    action = given["action"].one_of(_ACTION, "")
-    kind = given["kind"].one_of(RULE_KINDS, "")
-    names = [_glob(one, kind is not RuleKind.SLAVE) for one in given["names"].each()]
-    nodes = [_glob(one, True) for one in given["nodes"].each()]
+def _rules(field: Field) -> Iterator[Rule]:
+    """A rule for each listed name with each listed node."""
+    action = field["action"].one_of(_ACTION, "")
+    kind = field["kind"].one_of(RULE_KINDS, "")
+    names = [_glob(name, kind is not RuleKind.SLAVE) for name in field["names"].each()]
+    nodes = [_glob(node, True) for node in field["nodes"].each()]
     if not names:
-        raise given["names"].refused("is empty", "name what the rule is about, or write ['*']")
+        raise field["names"].refused("is empty", "name what the rule is about, or write ['*']")
     for name in names:
         yield from (Rule(action, kind, name, node) for node in nodes or ["*"])
 
 
-def _glob(given: Field, ros_name: bool) -> str:
+def _glob(field: Field, ros_name: bool) -> str:
     """A glob, for a ROS name or for a method of the slave API."""
-    glob = given.text()
+    glob = field.text()
     if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
         begins = ", and begins with / or *" if ros_name else ""
         fix = f"it has 1 to 256 characters without blanks and ;{begins}"
-        raise given.refused("is no glob of names", fix)
+        raise field.refused("is no glob of names", fix)
     return glob
 
 
-def _window(given: Field, ports: int) -> PortRange:
-    window = PortRange(given["first"].number(11412, *_HIGH), given["last"].number(29999, *_HIGH))
+def _window(field: Field, ports: int) -> PortRange:
+    window = PortRange(field["first"].number(11412, *_HIGH), field["last"].number(29999, *_HIGH))
     if window.last - window.first + 1 < ports:
         raise InvalidField(
-            f"{given.path}: {window} has not the {ports} ports that spec.ports asks for: make the "
+            f"{field.path}: {window} has not the {ports} ports that spec.ports asks for: make the "
             "window larger, or spec.ports smaller"
         )
     return window
 
 
-def _host_alias(given: Field) -> Json:
-    """One that the API server takes: pods with another would not be admitted.
+def _host_alias(field: Field) -> Json:
+    """A host alias that the API server takes: with any other no pod would be admitted.
 
     That is ``ValidateHostAliases`` in k8s.io/kubernetes, pkg/apis/core/validation/validation.go.
     """
-    ip, names = given["ip"].text(), []
+    ip, names = field["ip"].text(), []
     if not is_address(ip) or "%" in ip:
         fix = "write the host's address, e.g. 192.0.2.7"
-        raise given["ip"].refused("is not an IP address", fix)
-    for one in given["hostnames"].each():
-        names.append(one.text().lower())
+        raise field["ip"].refused("is not an IP address", fix)
+    for hostname in field["hostnames"].each():
+        names.append(hostname.text().lower())
         if not is_subdomain(names[-1]):
-            raise one.refused("is not a host name", "it has letters, digits, - and dots only")
+            raise hostname.refused("is not a host name", "it has letters, digits, - and dots only")
     return {"ip": ip, "hostnames": names}
 
 
-def _selector(given: Field) -> Selector | None:
+def _selector(field: Field) -> Selector | None:
     """As strict as the API server, which is asked for pods with it and refuses what is malformed.
 
     That is k8s.io/apimachinery, pkg/labels/selector.go and pkg/util/validation/validation.go.
     """
-    if given.value is None:
+    if field.value is None:
         return None
-    labels = given["matchLabels"].texts()
+    labels = field["matchLabels"].texts()
     for key in labels:
-        _check_key(given["matchLabels"], key)
-        _check_value(given["matchLabels"][key])
-    expressions = given["matchExpressions"].each()
-    return Selector(labels=labels, expressions=tuple(_expression(one) for one in expressions))
+        _check_key(field["matchLabels"], key)
+        _check_value(field["matchLabels"][key])
+    expressions = field["matchExpressions"].each()
+    return Selector(labels=labels, expressions=tuple(_expression(e) for e in expressions))
 
 
-def _expression(given: Field) -> tuple[str, str, frozenset[str]]:
-    key, operator = given["key"].text(), given["operator"].one_of(_OPERATORS, "")
-    _check_key(given["key"], key)
-    values = [_check_value(one) for one in given["values"].each()]
+def _expression(field: Field) -> tuple[str, str, frozenset[str]]:
+    key, operator = field["key"].text(), field["operator"].one_of(_OPERATORS, "")
+    _check_key(field["key"], key)
+    values = [_check_value(value) for value in field["values"].each()]
     if bool(values) != (operator in ("In", "NotIn")):
-        wrong = f"{'is not' if values else 'is'} empty, but the operator is {operator}"
+        problem = f"{'is not' if values else 'is'} empty, but the operator is {operator}"
         fix = "leave the values out" if values else "name at least one value"
-        raise given["values"].refused(wrong, fix)
+        raise field["values"].refused(problem, fix)
     return key, operator, frozenset(values)
 
 
-def _check_key(given: Field, key: str) -> None:
+def _check_key(field: Field, key: str) -> None:
     if not is_label_key(key):
-        raise Field(given.path, key).refused("is no label's key", _AS_LABEL)
+        raise Field(field.path, key).refused("is no label's key", _AS_LABEL)
 
 
-def _check_value(given: Field) -> str:
-    if not is_label_value(given.text()):
-        raise given.refused("is no label's value", _AS_LABEL)
-    return given.text()
+def _check_value(field: Field) -> str:
+    if not is_label_value(field.text()):
+        raise field.refused("is no label's value", _AS_LABEL)
+    return field.text()
 
 
 _AS_LABEL = "write it as in the pod's labels"
 
 
-def _master(given: Field, of: Name) -> MasterSpec:
-    uri, address, service = given["uri"], given["address"], given["service"]
-    publish = given["publish"].number(0, *_HIGH)
+def _master(field: Field, of: Name) -> MasterSpec:
+    uri, address, service = field["uri"], field["address"], field["service"]
+    publish = field["publish"].number(0, *_HIGH)
     if (uri.value is None) == (service.value is None):
         raise InvalidField(
-            f"{given.path}: give either uri, for a master outside of the cluster, or service, for "
+            f"{field.path}: give either uri, for a master outside of the cluster, or service, for "
             "one in it, and not both"
         )
     if service.value is None:
@@ -288,23 +288,23 @@ def _master(given: Field, of: Name) -> MasterSpec:
     return MasterSpec(service=_service(service, of), service_port=port, publish=publish)
 
 
-def _uri(given: Field, of: Name) -> str:
+def _uri(field: Field, of: Name) -> str:
     """A master's URI in its one form: host in lower case, with a port, no slash at the end."""
-    text = given.text()
-    where = parse_slave_uri(text) or parse_slave_uri(_with_port(text))
-    path = urlsplit(text).path.rstrip("/") if where else ""
-    if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
-        raise given.refused("is not a master's URI", f"write it like {_EXAMPLE}")
-    host = where.host.lower()
+    text = field.text()
+    master = parse_slave_uri(text) or parse_slave_uri(_with_port(text))
+    path = urlsplit(text).path.rstrip("/") if master else ""
+    if master is None or not master.host.isascii() or not _PATH.fullmatch(path):
+        raise field.refused("is not a master's URI", f"write it like {_EXAMPLE}")
+    host = master.host.lower()
     if is_loopback(host):
-        raise given.refused(
+        raise field.refused(
             "would be the proxy's own pod, where no master runs",
             "give the master's host as the nodes of the cluster reach it, or, for a master in the "
             "cluster, service instead",
         )
     if _is_service(host, service_id(of)):
-        raise given.refused(_OWN_SERVICE, f"give the real master, as {_EXAMPLE}")
-    return slave_uri(HostPort(host, where.port), path)
+        raise field.refused(_OWN_SERVICE, f"give the real master, as {_EXAMPLE}")
+    return slave_uri(HostPort(host, master.port), path)
 
 
 _OWN_SERVICE = "is this RosProxy's own Service"
@@ -313,11 +313,11 @@ _OWN_SERVICE = "is this RosProxy's own Service"
 def _with_port(text: str) -> str:
     """The same URI with the master's usual port."""
     try:
-        parts = urlsplit(text)
-        bare = parts.port is None and bool(parts.netloc) and not parts.netloc.endswith(":")
+        uri = urlsplit(text)
+        lacks_port = uri.port is None and bool(uri.netloc) and not uri.netloc.endswith(":")
     except ValueError:
         return ""
-    return parts._replace(netloc=f"{parts.netloc}:{MASTER_PORT}").geturl() if bare else ""
+    return uri._replace(netloc=f"{uri.netloc}:{MASTER_PORT}").geturl() if lacks_port else ""
 
 
 def _is_service(host: str, service: Name) -> bool:
@@ -326,27 +326,27 @@ def _is_service(host: str, service: Name) -> bool:
     return host == service.name or f"{full}.".startswith(f"{host}.") or host.startswith(f"{full}.")
 
 
-def _service(given: Field, of: Name) -> Name:
-    name, namespace = given["name"], given["namespace"]
-    found = Name(namespace.text() or of.namespace, name.text())
-    if not is_label(found.name):
+def _service(field: Field, of: Name) -> Name:
+    name, namespace = field["name"], field["namespace"]
+    service = Name(namespace.text() or of.namespace, name.text())
+    if not is_label(service.name):
         raise name.refused("is not a Service's name", "write it as kubectl get service shows it")
-    if not is_label(found.namespace):
+    if not is_label(service.namespace):
         raise namespace.refused("is not a namespace's name", "leave it out or mend it")
-    if found == service_id(of):
+    if service == service_id(of):
         raise name.refused(_OWN_SERVICE, "name that of the real master")
-    return found
+    return service
 
 
-def _address(given: Field) -> str:
-    address = parse_address(given.text())
-    if given.value is not None and (address is None or is_loopback(address)):
+def _address(field: Field) -> str:
+    address = parse_address(field.text())
+    if field.value is not None and (address is None or is_loopback(address)):
         fix = "give that of the master's host, e.g. 192.0.2.7"
-        raise given.refused("is not an IP address", fix)
+        raise field.refused("is not an IP address", fix)
     return address or ""
 
 
 def _former(status: Json) -> dict[str, PortRange]:
     """The ranges in a status. What can't be read there is no range that was ever given."""
-    found = {word(line, "name"): port_range(line, "ports") for line in parts(status, "perNode")}
-    return {name: ports for name, ports in found.items() if ports is not None}
+    ranges = {word(line, "name"): port_range(line, "ports") for line in parts(status, "perNode")}
+    return {name: ports for name, ports in ranges.items() if ports is not None}

@@ -1,4 +1,4 @@
-"""What is a name, a label or a host to Kubernetes; and what JSON holds that may be anything."""
+"""Checks of names, labels and hosts by Kubernetes' rules; and typed reads from any JSON."""
 
 import re
 
@@ -34,7 +34,7 @@ def is_subdomain(text: str) -> bool:
 
 
 def is_label(text: str) -> bool:
-    """Whether a text is one part of such a DNS name."""
+    """Whether a text is one label of such a DNS name."""
     return len(text) <= 63 and "." not in text and is_subdomain(text)
 
 
@@ -52,27 +52,27 @@ def is_label_value(text: str) -> bool:
 def part(obj: Json, *keys: str) -> Json:
     """The map that is found down some keys, empty if there is none."""
     for key in keys:
-        found = obj.get(key)
-        obj = found if isinstance(found, dict) else {}
+        child = obj.get(key)
+        obj = child if isinstance(child, dict) else {}
     return obj
 
 
 def parts(obj: Json, key: str) -> list[Json]:
     """The maps in the list under a key, none if there is no list."""
-    found = obj.get(key)
-    return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
+    array = obj.get(key)
+    return [child for child in array if isinstance(child, dict)] if isinstance(array, list) else []
 
 
 def word(obj: Json, key: str) -> str:
     """The text under a key, empty if there is none."""
-    found = obj.get(key)
-    return found if isinstance(found, str) else ""
+    text = obj.get(key)
+    return text if isinstance(text, str) else ""
 
 
 def number(obj: Json, key: str) -> int:
     """The integer under a key, 0 if there is none."""
-    found = obj.get(key)
-    return found if type(found) is int else 0
+    value = obj.get(key)
+    return value if type(value) is int else 0
 
 
 def port_range(obj: Json, key: str) -> PortRange | None:

@@ -13,37 +13,37 @@ _WRONG = {
     "Ready": "False",
     "Degraded": "True",
 }
-"""With which status of a condition something is wrong; what others follow from goes first."""
+"""By condition, the status that means trouble; causes go before what follows from them."""
 
 
 def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
     """All findings of a cluster, by its RosProxies; each text once, where it is a cause."""
-    found = [one for each in rosproxies for one in _of(each)]
-    if not found:
+    findings = [finding for rosproxy in rosproxies for finding in _findings_of(rosproxy)]
+    if not findings:
         fix = "kubectl apply -f a RosProxy; kubectl get crd rosproxies.rosproxy.io"
         return [warning("rosproxy", "cluster", "there is no RosProxy", fix)]
-    return found
+    return findings
 
 
-def _of(rosproxy: Json) -> Iterator[DoctorFinding]:
+def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
     metadata, status = rosproxy["metadata"], rosproxy.get("status", {})
     subject = f"rosproxy {metadata['namespace']}/{metadata['name']}"
-    conditions = {word(one, "type"): one for one in parts(status, "conditions")}
+    conditions = {word(c, "type"): c for c in parts(status, "conditions")}
     if number(status, "observedGeneration") < metadata.get("generation", 0):
         text = "the operator has not seen it as it is now"
         fix = (
             "does the operator run? kubectl get pods -A -l app.kubernetes.io/name=rosproxy-operator"
         )
         yield error("operator", subject, text, fix)
-    told: set[str] = set()
+    messages: set[str] = set()
     for kind, bad in _WRONG.items():
-        one = conditions.get(kind, {})
-        message = word(one, "message")
-        if word(one, "status") == bad and message not in told:
-            told.add(message)
+        condition = conditions.get(kind, {})
+        message = word(condition, "message")
+        if word(condition, "status") == bad and message not in messages:
+            messages.add(message)
             fix = f"kubectl -n {metadata['namespace']} describe rosproxy {metadata['name']}"
             yield error("rosproxy", subject, f"{kind} is {bad}: {message}", fix)
-    if told:
+    if messages:
         return
     if number(status, "nodes"):
         text = f"proxies {word(status, 'proxies')} ready, {number(status, 'rosNodes')} ROS nodes"

@@ -58,35 +58,35 @@ def warnings(
     Only findings that are about an object become Events. ``reported`` is that of the last look, or
     nothing; ``now`` is on its clock, in seconds.
     """
-    found = dict.fromkeys(one for one in problems if one.about)
-    new = [one for one in found if one not in reported]
+    findings = dict.fromkeys(f for f in problems if f.about)
+    new = [f for f in findings if f not in reported]
     late = set(new[MOST:])
-    recent = {one: then for one, then in reported.items() if now - then < QUIET}
-    current = {one: now for one in found if one not in late}
-    return NewEvents(tuple(_warning(one) for one in new[:MOST]), {**recent, **current})
+    recent = {f: then for f, then in reported.items() if now - then < QUIET}
+    current = {f: now for f in findings if f not in late}
+    return NewEvents(tuple(_warning(f) for f in new[:MOST]), {**recent, **current})
 
 
 def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:
     """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
-    of = Reference(KIND, rosproxy.id, rosproxy.uid)
+    reference = Reference(KIND, rosproxy.id, rosproxy.uid)
     texts: dict[str, list[str]] = {}
     for reason, text in map(_result, actions):
         texts.setdefault(reason, []).append(text)
     texts.pop("", None)
-    for reason, told in texts.items():
-        for text in told[:MOST_RESULTS]:
-            yield Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
-        if len(told) > MOST_RESULTS:
-            text = f"and {len(told) - MOST_RESULTS} more at once, which the operator's log names"
-            yield Emit(rosproxy.id, of, "Normal", reason, text)
+    for reason, lines in texts.items():
+        for text in lines[:MOST_RESULTS]:
+            yield Emit(rosproxy.id, reference, "Normal", reason, _bounded(text))
+        if len(lines) > MOST_RESULTS:
+            text = f"and {len(lines) - MOST_RESULTS} more at once, which the operator's log names"
+            yield Emit(rosproxy.id, reference, "Normal", reason, text)
 
 
 def _result(action: Action) -> tuple[str, str]:
     """The reason and the text of an Event about an action; empty if there is to be none."""
     match action:
         case CreateProxy(body={"metadata": {"name": name, "annotations": notes}}):
-            where = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
-            return "ProxyCreated", f"created pod {name} {where}"
+            place = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
+            return "ProxyCreated", f"created pod {name} {place}"
         case SetImage(id=id, image=image):
             return "ImageSet", f"gave pod {id.name} the image {image}"
         case DeleteProxy(id=id, why=why) | DeleteEar(id=id, why=why) | EvictPod(id=id, why=why):
@@ -104,8 +104,8 @@ def event_body(event: Emit, now: float) -> Json:
     ``now`` is in seconds of Unix time.
     """
     about = event.about
-    what = "\n".join([about.uid, event.type, event.reason, event.message])
-    digest = hashlib.sha256(what.encode()).hexdigest()[:16]
+    identity = "\n".join([about.uid, event.type, event.reason, event.message])
+    digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
     name = f"{about.id.name[:_LONGEST_NAME].rstrip('.-')}.{digest}"
     return {
         "apiVersion": "v1",

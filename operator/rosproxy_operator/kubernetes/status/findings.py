@@ -38,10 +38,10 @@ def findings(
     Each has a reason; those that users are to be told by an Event have ``about``. ``failures`` is
     what the API server said of actions that it refused, by the object.
     """
-    found = [_refused(rosproxy, id, text) for id, text in failures.items()]
-    for state in sorted(states, key=lambda one: one.name):
-        found.extend(of_node(rosproxy, state))
-    return tuple(dict.fromkeys(found))
+    problems = [_refused(rosproxy, id, text) for id, text in failures.items()]
+    for state in sorted(states, key=lambda s: s.name):
+        problems.extend(of_node(rosproxy, state))
+    return tuple(dict.fromkeys(problems))
 
 
 def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
@@ -68,11 +68,11 @@ def finding(
 
 
 def pod_finding(
-    pod: Pod, of: RosProxy, reason: str, text: str, fatal: bool = True
+    pod: Pod, rosproxy: RosProxy, reason: str, text: str, fatal: bool = True
 ) -> ClusterFinding:
     """Something about a pod that a RosProxy selects, with an Event on the pod."""
     subject, about = f"pod {pod.id}", Reference("Pod", pod.id, pod.uid)
-    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
+    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=rosproxy.id, about=about)
 
 
 def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> ClusterFinding:
@@ -83,22 +83,22 @@ def _subject(proxy: ProxyPod) -> str:
     return f"proxy {proxy.pod.id.name} on node {proxy.on}"
 
 
-def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> ClusterFinding:
-    id, said = proxy.pod.id, proxy.message
-    shown = f"kubectl -n {id.namespace} describe pod {id.name}"
+def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: Stuck) -> ClusterFinding:
+    id, error = proxy.pod.id, proxy.message
+    command = f"kubectl -n {id.namespace} describe pod {id.name}"
     texts = {
-        Stuck.PORTS: f"ports {proxy.range} are not all free there ({said}); others are tried: to "
+        Stuck.PORTS: f"ports {proxy.range} are not all free there ({error}); others are tried: to "
         "keep them clear, leave ports that others take out of spec.portWindow",
-        Stuck.SCHEDULING: f"it is not admitted ({said}): make room on the node, or set "
-        f"spec.tolerations or spec.resources; {shown}",
-        Stuck.IMAGE: f"the node can't get the image {proxy.image} ({said}): load it there, or set "
+        Stuck.SCHEDULING: f"it is not admitted ({error}): make room on the node, or set "
+        f"spec.tolerations or spec.resources; {command}",
+        Stuck.IMAGE: f"the node can't get the image {proxy.image} ({error}): load it there, or set "
         "spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
-        Stuck.CRASHING: f"it ends again and again ({said}): "
+        Stuck.CRASHING: f"it ends again and again ({error}): "
         f"kubectl -n {id.namespace} logs --previous {id.name}",
-        Stuck.SANDBOX: f"the node can't start it ({said}): {shown}",
+        Stuck.SANDBOX: f"the node can't start it ({error}): {command}",
     }
-    reason = CONFLICT if why is Stuck.PORTS else STUCK
-    return _finding(rosproxy, _subject(proxy), texts[why], reason)
+    reason = CONFLICT if cause is Stuck.PORTS else STUCK
+    return _finding(rosproxy, _subject(proxy), texts[cause], reason)
 
 
 def _deaf(rosproxy: RosProxy, ear: EarPod) -> ClusterFinding:
@@ -143,20 +143,20 @@ def _master_remedy(rosproxy: RosProxy) -> str:
 
 
 def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
-    said = clean(" ".join(text.split()))
-    remedy = _remedy(said, rosproxy)
-    said = said[: _LONGEST - len(f"the API server refused it (): {remedy}")]
-    text = f"the API server refused it ({said}): {remedy}"
+    message = clean(" ".join(text.split()))
+    remedy = _remedy(message, rosproxy)
+    message = message[: _LONGEST - len(f"the API server refused it (): {remedy}")]
+    text = f"the API server refused it ({message}): {remedy}"
     return _finding(rosproxy, str(id), text, NOT_ADMITTED)
 
 
-def _remedy(said: str, rosproxy: RosProxy) -> str:
+def _remedy(message: str, rosproxy: RosProxy) -> str:
     """What to do about a refusal.
 
     The words are from k8s.io/pod-security-admission, admission/admission.go and policy/, and
     k8s.io/apiserver, pkg/admission/plugin/resourcequota/controller.go.
     """
-    low = said.lower()
+    low = message.lower()
     if "violates podsecurity" in low or "net_admin" in low or "privilegeescalation" in low:
         return _security_remedy(low, rosproxy)
     if "exceeded quota" in low or "must specify" in low:

@@ -103,7 +103,7 @@ def status_of(
 
 def participants(observed: ClusterSnapshot) -> dict[int, int]:
     """How many participants there are behind the proxies, by domain."""
-    domains = {one.uid: one.spec.ros2.number for one in observed.rosproxies if one.spec.ros2}
+    domains = {r.uid: r.spec.ros2.number for r in observed.rosproxies if r.spec.ros2}
     counts = dict.fromkeys(domains.values(), 0)
     for proxy in observed.proxies:
         answer = observed.reports.get(proxy.pod.uid)
@@ -112,18 +112,18 @@ def participants(observed: ClusterSnapshot) -> dict[int, int]:
     return counts
 
 
-def _addressed(of: RosProxy, cluster_ip: str, master: str) -> dict[str, object]:
+def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, object]:
     """Under which address pods find their proxy, and the master, if there is one.
 
     It is the former one as long as there is no Service: it is to be had again.
     """
-    found: dict[str, object] = {}
-    if of.spec.ros1:
-        uri = master_uri(cluster_ip) if cluster_ip else word(of.status, "masterURI")
-        found = {"master": master, "masterURI": uri}
-    if of.spec.ros2:
-        found["staticPeers"] = cluster_ip or of.cluster_ip
-    return found
+    fields: dict[str, object] = {}
+    if rosproxy.spec.ros1:
+        uri = master_uri(cluster_ip) if cluster_ip else word(rosproxy.status, "masterURI")
+        fields = {"master": master, "masterURI": uri}
+    if rosproxy.spec.ros2:
+        fields["staticPeers"] = cluster_ip or rosproxy.cluster_ip
+    return fields
 
 
 def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
@@ -132,10 +132,10 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     What it has goes on as it is, so that the other conditions stay.
     """
     former, text = rosproxy.status, rosproxy.text
-    others = [_read(one) for one in parts(former, "conditions")]
+    conditions = [_read(condition) for condition in parts(former, "conditions")]
     judged = [
         Condition(READY, "False", rosproxy.reason, text),
-        *(one for one in others if one.type not in (READY, DEGRADED)),
+        *(c for c in conditions if c.type not in (READY, DEGRADED)),
         Condition(DEGRADED, "True", rosproxy.reason, text),
     ]
     return {
@@ -147,12 +147,12 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
 
 def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
     """The nodes to be told, by name; those without pods are the first to be left out."""
-    first = sorted(states, key=lambda one: (not one.pods, one.proxy is None, one.name))
-    return sorted(first[:MOST_NODES], key=lambda one: one.name)
+    ranked = sorted(states, key=lambda state: (not state.pods, state.proxy is None, state.name))
+    return sorted(ranked[:MOST_NODES], key=lambda state: state.name)
 
 
 def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]:
-    proxy, wrong = state.proxy, next(of_node(rosproxy, state), None)
+    proxy, problem = state.proxy, next(of_node(rosproxy, state), None)
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,
@@ -161,27 +161,27 @@ def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]
         "ready": _serving(state),
         "pods": len(state.pods),
         **_ros(state, names, rosproxy.status),
-        "message": bounded(_one_line(wrong), _MESSAGE) if wrong else "",
+        "message": bounded(_one_line(problem), _MESSAGE) if problem else "",
     }
     return {key: value for key, value in line.items() if value != ""}
 
 
-def _ros(state: NodeState, most: int, former: Json) -> dict[str, object]:
+def _ros(state: NodeState, limit: int, former: Json) -> dict[str, object]:
     """What a proxy tells of its ROS nodes, now or when it was asked last."""
     if _has_answered(state.answer):
-        names = sorted({name for found in state.answer.nodes.values() for name in found})
-        shown = [shorten(clean(name), _NAME) for name in names[:most]]
-        told = state.answer.participants
-        members = {"participants": sum(map(len, told.values()))} if told else {}
+        names = sorted({name for group in state.answer.nodes.values() for name in group})
+        shown = [shorten(clean(name), _NAME) for name in names[:limit]]
+        by_address = state.answer.participants
+        members = {"participants": sum(map(len, by_address.values()))} if by_address else {}
         count = len(state.answer.topics)
         return {"rosNodes": len(names), "names": shown, "topics": count, **members}
     lines = parts(former, "perNode") if state.proxy is not None else ()
-    was = next((line for line in lines if line.get("name") == state.name), {})
+    last = next((line for line in lines if line.get("name") == state.name), {})
     return {
-        "rosNodes": number(was, "rosNodes"),
-        "names": list(was.get("names") or ()),
-        "topics": number(was, "topics"),
-        **({"participants": number(was, "participants")} if "participants" in was else {}),
+        "rosNodes": number(last, "rosNodes"),
+        "names": list(last.get("names") or ()),
+        "topics": number(last, "topics"),
+        **({"participants": number(last, "participants")} if "participants" in last else {}),
     }
 
 
@@ -191,16 +191,16 @@ def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
 
 def _topics(states: Sequence[NodeState], former: Json) -> int:
     answers = [state.answer for state in states if state.proxy is not None]
-    known = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
-    return known if all(map(_has_answered, answers)) else max(known, number(former, "topics"))
+    count = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
+    return count if all(map(_has_answered, answers)) else max(count, number(former, "topics"))
 
 
 def _ports(states: Sequence[NodeState]) -> str:
     """The one range of all nodes that need one, or each node's."""
-    given = {one.name: str(one.range) for one in states if one.range and (one.pods or one.proxy)}
-    if len(set(given.values())) <= 1:
-        return next(iter(given.values()), "")
-    return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(given.items())), _PORTS)
+    ranges = {s.name: str(s.range) for s in states if s.range and (s.pods or s.proxy)}
+    if len(set(ranges.values())) <= 1:
+        return next(iter(ranges.values()), "")
+    return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(ranges.items())), _PORTS)
 
 
 def _serving(state: NodeState) -> bool:
@@ -223,24 +223,24 @@ def _conditions(
     is ``stamp``, in RFC 3339.
     """
     since = {
-        (word(was, "type"), word(was, "status")): word(was, "lastTransitionTime")
-        for was in parts(former, "conditions")
+        (word(condition, "type"), word(condition, "status")): word(condition, "lastTransitionTime")
+        for condition in parts(former, "conditions")
     }
     return [
         {
-            "type": one.type,
-            "status": one.status,
+            "type": c.type,
+            "status": c.status,
             "observedGeneration": generation,
-            "lastTransitionTime": since.get((one.type, one.status)) or stamp,
-            "reason": one.reason if _REASON.fullmatch(one.reason) else "Problem",
-            "message": bounded(one.message, LONGEST),
+            "lastTransitionTime": since.get((c.type, c.status)) or stamp,
+            "reason": c.reason if _REASON.fullmatch(c.reason) else "Problem",
+            "message": bounded(c.message, LONGEST),
         }
-        for one in judged
+        for c in judged
     ]
 
 
-def _read(was: Json) -> Condition:
-    return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
+def _read(condition: Json) -> Condition:
+    return Condition(*(word(condition, key) for key in ("type", "status", "reason", "message")))
 
 
 def _one_line(problem: ClusterFinding) -> str:
@@ -263,10 +263,10 @@ def _ready(
     if blocking:
         return Condition(READY, "False", blocking[0].reason, _one_line(blocking[0]))
     name, proxy = waiting[0].name, waiting[0].proxy
-    doing = "its proxy is being created"
+    progress = "its proxy is being created"
     if proxy is not None and not proxy.pod.deleting:
-        doing = f"its proxy {proxy.pod.id.name} is starting"
-    return Condition(READY, "False", "ProxiesStarting", f"node {name}: {doing}")
+        progress = f"its proxy {proxy.pod.id.name} is starting"
+    return Condition(READY, "False", "ProxiesStarting", f"node {name}: {progress}")
 
 
 def _of_pod(problem: ClusterFinding) -> bool:
@@ -278,11 +278,11 @@ def _allocated(wanted: Sequence[NodeState], problems: Sequence[ClusterFinding]) 
     if not wanted:
         return Condition(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
     lacking = [state for state in wanted if state.range is None]
-    refused = [one for one in wanted if one.proxy is not None and one.proxy.stuck is Stuck.PORTS]
+    refused = [s for s in wanted if s.proxy is not None and s.proxy.stuck is Stuck.PORTS]
     if not lacking and not refused:
         return Condition(PORTS, "True", "Allocated", "every node with selected pods has its ports")
     reason = CONFLICT if refused else EXHAUSTED
-    lines = [_one_line(one) for one in problems if one.reason in (CONFLICT, EXHAUSTED)]
+    lines = [_one_line(p) for p in problems if p.reason in (CONFLICT, EXHAUSTED)]
     names = ", ".join(state.name for state in (*refused, *lacking))
     return Condition(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
 
@@ -290,19 +290,19 @@ def _allocated(wanted: Sequence[NodeState], problems: Sequence[ClusterFinding]) 
 def _reached(
     states: Sequence[NodeState], problems: Sequence[ClusterFinding], former: Json
 ) -> Condition:
-    """Of proxies that are not asked yet nothing is known: what was so far holds on."""
+    """Proxies that are not asked yet say nothing: for them the former condition stays."""
     proxies = [state for state in states if state.proxy is not None]
-    answers = [one.answer for one in proxies if one.answer is not None and one.answer.answered]
+    answers = [s.answer for s in proxies if s.answer is not None and s.answer.answered]
     if not all(answer.master_up for answer in answers):
-        lines = [_one_line(one) for one in problems if one.reason == NO_MASTER]
+        lines = [_one_line(p) for p in problems if p.reason == NO_MASTER]
         return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
     if not proxies:
         return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
     if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
-    was = (one for one in parts(former, "conditions") if one.get("type") == MASTER)
+    previous = (c for c in parts(former, "conditions") if c.get("type") == MASTER)
     unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
-    return next(map(_read, was), unknown)
+    return next(map(_read, previous), unknown)
 
 
 def _degraded(problems: Sequence[ClusterFinding]) -> Condition:

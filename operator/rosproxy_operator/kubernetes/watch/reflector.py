@@ -1,4 +1,4 @@
-"""Keeping up with one kind of object: list it, then watch what happens to it, in a thread.
+"""Follows one kind of object, in a thread: lists it, then watches what happens to it.
 
 A watch that ends, after a while or because the API server is started anew, goes on from where it
 was; one that can't (410 Gone) begins with a new list. Now and then everything is listed anew in any
@@ -7,8 +7,8 @@ again, with pauses that grow and differ, so that not all watches come back at on
 
 kopf's indices keep whole objects, in a task for each; the Kubernetes client's SharedInformer keeps
 them whole as well, lists them in one piece and can't be stopped while nothing happens. So these few
-lines are the operator's own. What the objects mean is the business of `records`, what has become of
-them that of `store`, which is told in the event loop.
+lines are the operator's own. `records` reads the objects, and `store`, which is called in the event
+loop, keeps them.
 """
 
 import logging
@@ -37,43 +37,43 @@ log = logging.getLogger(__name__)
 PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until the API server is asked again, the last one repeated."""
 WELL = 10.0
-"""Seconds after which a watch that was lost was a good one."""
+"""Seconds after which the loss of a watch counts as the first failure in a row."""
 CHECKED = 1800.0
 """Seconds after which everything is listed anew though nothing seems to be missing."""
 DOUBTED = 60.0
-"""Seconds between two lists that are made because something known was not so."""
+"""Least seconds between two lists that are made because the watched state was wrong."""
 SHORT = 1.0
-"""Seconds in which a watch that has told nothing must not end: it would be asked for in a loop."""
+"""Least seconds that a watch without events must last: it would be started in a loop otherwise."""
 STOPPING = 3.0
 """Seconds that a thread has to end."""
 
 
-class Told(Protocol):
-    """Who is told, in the event loop. ``place`` is a namespace, empty for all."""
+class Listener(Protocol):
+    """Gets lists and changes, in the event loop. ``place`` is a namespace, empty for all."""
 
     def changed(self, kind: str, place: str, changes: Mapping[str, Record | None]) -> None:
-        """These objects are so now, by their keys; None: gone."""
+        """These objects have changed, by their keys; None: gone."""
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
-        """These are all objects."""
+        """These are all objects of the kind."""
 
     def failed(self, kind: str, place: str, error: ApiError) -> None:
-        """They can't be listed or watched."""
+        """The kind can't be listed or watched."""
 
 
 class Reflector:
-    """Keeps up with a kind in a namespace. ``soon`` lets a function run in the event loop."""
+    """Follows a kind in a namespace. ``call_soon`` lets a function run in the event loop."""
 
     def __init__(
         self,
         api: Api,
-        what: tuple[str, str],
-        told: Told,
-        soon: Callable[..., object],
+        collection: tuple[str, str],
+        listener: Listener,
+        call_soon: Callable[..., object],
         lost: Callable[[], None],
     ) -> None:
-        self._api, self._told, self._soon, self._lost = api, told, soon, lost
-        self._kind, self._place = what
+        self._api, self._listener, self._call_soon, self._lost = api, listener, call_soon, lost
+        self._kind, self._place = collection
         self._ending = threading.Event()
         self._watch: Watch | None = None
         self._listed_at = 0.0
@@ -91,7 +91,7 @@ class Reflector:
             self._watch.stop()
 
     def doubt(self) -> None:
-        """List everything anew soon: what is known is not so."""
+        """List everything anew soon: the watched state is wrong."""
         if time.monotonic() - self._listed_at > DOUBTED:
             self._listed_at = -CHECKED
             if self._watch is not None:
@@ -128,88 +128,88 @@ class Reflector:
         log.debug("watching %s %s: %s", self._kind, self._place, error)
         self._lost()
         if not isinstance(error, ApiExpired | ApiLost):
-            self._tell(self._told.failed, error)
+            self._tell(self._listener.failed, error)
 
     def _pause(self, failures: int) -> None:
         longest = PAUSES[min(failures, len(PAUSES)) - 1]
         self._ending.wait(longest * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
 
     def _list(self) -> str:
-        """List all of it; the list's version."""
-        found: dict[str, Record] = {}
-        more = ""
+        """List all objects. Returns the list's version."""
+        records: dict[str, Record] = {}
+        token = ""
         while True:
-            page = self._api.page(self._kind, self._place, more)
+            page = self._api.page(self._kind, self._place, token)
             for obj in page.items:
                 record = self._read(obj)
                 if record is not None:
-                    found[key_of(obj)] = record
-            more = page.more
-            if not more or self._ending.is_set():
+                    records[key_of(obj)] = record
+            token = page.more
+            if not token or self._ending.is_set():
                 break
         self._listed_at = time.monotonic()
-        self._tell(self._told.listed, found)
+        self._tell(self._listener.listed, records)
         return page.version
 
     def _follow(self) -> None:
-        """Pass on what happens, until the watch ends, and keep the version that it has got to.
+        """Pass on events until the watch ends, and keep the version that it has got to.
 
-        Also of a watch that is lost: what it has told would be told again from the beginning, and
-        objects would be again as they were then.
+        Also for a watch that is lost: else all its events would come again from the beginning, and
+        set objects back to what they were then.
         """
         began, heard = time.monotonic(), False
         self._watch = watch = self._api.watch(self._kind, self._place, self._version)
-        self._tell(self._told.changed, {})  # it works again, if it did not
+        self._tell(self._listener.changed, {})  # it works again, if it did not
         if self._ending.is_set():
             watch.stop()
         for events in watch:
             if self._ending.is_set():
                 break
             if changes := self._changes(events):
-                self._tell(self._told.changed, changes)
+                self._tell(self._listener.changed, changes)
             self._version, heard = _version(events) or self._version, True
         if not heard and time.monotonic() - began < SHORT:
             raise ApiLost("a watch has ended at once")
 
     def _changes(self, events: Iterable[Event]) -> dict[str, Record | None]:
-        """What objects are now, by their keys. Raises ApiError for an event that is one."""
-        found: dict[str, Record | None] = {}
+        """The objects that have changed, by their keys. Raises ApiError for an ERROR event."""
+        changes: dict[str, Record | None] = {}
         for event in events:
             if event.type == "ERROR":
                 raise _error(event.object)
             if event.type == "BOOKMARK":
                 continue
             gone = event.type == "DELETED"
-            found[key_of(event.object)] = None if gone else self._read(event.object)
-        return found
+            changes[key_of(event.object)] = None if gone else self._read(event.object)
+        return changes
 
     def _read(self, obj: Json) -> Record | None:
         return READERS[self._kind](obj)
 
-    def _tell(self, function: Callable[..., None], what: object) -> None:
+    def _tell(self, function: Callable[..., None], payload: object) -> None:
         if not self._ending.is_set():
-            self._soon(function, self._kind, self._place, what)
+            self._call_soon(function, self._kind, self._place, payload)
 
 
 def _version(events: Iterable[Event]) -> str:
-    """The last version that events tell."""
-    told = (word(part(one.object, "metadata"), "resourceVersion") for one in events)
-    return ([one for one in told if one] or [""])[-1]
+    """The last resourceVersion among events, empty if there is none."""
+    versions = (word(part(event.object, "metadata"), "resourceVersion") for event in events)
+    return ([version for version in versions if version] or [""])[-1]
 
 
 def _error(status: Json) -> ApiError:
-    """What a watch is ended with."""
+    """The error with which a watch has ended."""
     text = word(status, "message") or "a watch has ended"
     return ApiExpired(text) if status.get("code") == 410 else ApiLost(text)
 
 
 def every_kind(api: Api) -> list[tuple[str, str]]:
-    """What is to be kept up with, and where; RosProxies first."""
+    """The kinds to be followed, each with a namespace (empty for all); RosProxies first."""
     return [(kind, place) for kind in READERS for place in api.places(kind)]
 
 
 def crd_missing(kind: str) -> str:
-    """What a list says that is not there at all; empty where that can't be."""
+    """What to do about a kind that does not exist at all; empty for those that always do."""
     if kind != PLURAL:
         return ""
     return (

@@ -1,8 +1,8 @@
 """The cluster as its watches tell it: what a look sees, and what has changed since the last one.
 
-All of it lives in the event loop: reflectors tell (`changed`, `listed`, `failed`), the controller
-asks (`snapshot`, `touched`). It may lag behind, and be wrong where a watch has lost something: a
-later look puts right what follows from that, and nothing is deleted by it alone (`confirm`).
+All of it lives in the event loop: reflectors write (`changed`, `listed`, `failed`), the controller
+reads (`snapshot`, `touched`). It may lag behind, and be wrong where a watch has lost something: a
+later look corrects the consequences, and nothing is deleted by it alone (`confirm`).
 """
 
 import asyncio
@@ -40,7 +40,7 @@ from rosproxy_operator.kubernetes.watch.reflector import crd_missing
 log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Record)
-Where = tuple[str, str]
+Collection = tuple[str, str]
 """A kind, and a namespace, empty for all."""
 
 
@@ -53,14 +53,14 @@ class Touched:
 
 
 class ClusterStore:
-    """What is known. ``kinds`` are what is to be known, ``places`` the namespaces looked after.
+    """The objects that are watched: of ``kinds``; ``places`` are the namespaces looked after.
 
-    ``wake`` is called when a look is due, ``back`` when something is kept up with again.
+    ``wake`` is called when a look is due, ``back`` when a watch that had failed works again.
     """
 
     def __init__(
         self,
-        kinds: Iterable[Where],
+        kinds: Iterable[Collection],
         places: tuple[str, ...],
         wake: Callable[[], None],
         back: Callable[[], None],
@@ -68,108 +68,108 @@ class ClusterStore:
     ) -> None:
         self._wake, self._back, self._corrected = wake, back, corrected
         self._places = places
-        self._tables: dict[Where, dict[str, Record]] = {where: {} for where in kinds}
-        self._errors: dict[Where, ApiError] = {}
-        self._listed: set[Where] = set()
-        self._pending, self._told = set(self._tables), asyncio.Event()
+        self._tables: dict[Collection, dict[str, Record]] = {collection: {} for collection in kinds}
+        self._errors: dict[Collection, ApiError] = {}
+        self._listed: set[Collection] = set()
+        self._pending, self._all_heard = set(self._tables), asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
-        self._own: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
+        self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
         self._ears: dict[str, dict[str, EarPod]] = defaultdict(dict)
-        self._with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
+        self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
         self._touched = Touched()
 
-    # what reflectors tell
+    # what reflectors call
 
     def changed(self, kind: str, place: str, changes: Mapping[str, Record | None]) -> None:
-        """Some objects are so now, by their keys; None: gone. And the watch works."""
-        where = kind, place
-        self._heard(where)
-        if self._errors.pop(where, None):
+        """Some objects have changed, by their keys; None: gone. And the watch works."""
+        collection = kind, place
+        self._note_heard(collection)
+        if self._errors.pop(collection, None):
             self._back()
         for key, record in changes.items():
-            self._put(where, key, record)
+            self._put(collection, key, record)
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
         """These are all objects of a kind; the watch is yet to begin."""
-        where, before = (kind, place), dict(self._tables[kind, place])
-        gone = dict.fromkeys(before.keys() - records.keys())
-        differ = [key for key, one in records.items() if before.get(key) != one]
+        collection, former = (kind, place), dict(self._tables[kind, place])
+        gone = dict.fromkeys(former.keys() - records.keys())
+        differ = [key for key, record in records.items() if former.get(key) != record]
         for key, record in {**gone, **records}.items():
-            self._put(where, key, record)
-        if where in self._listed and (gone or differ):
+            self._put(collection, key, record)
+        if collection in self._listed and (gone or differ):
             log.info("a list of the %s corrects %d", kind, len(gone) + len(differ))
             self._corrected(len(gone) + len(differ))
-        self._listed.add(where)
+        self._listed.add(collection)
 
     def failed(self, kind: str, place: str, error: ApiError) -> None:
-        """A kind can't be kept up with for now."""
+        """A kind can't be listed or watched for now."""
         if isinstance(error, ApiGone) and (text := crd_missing(kind)):
             error = ApiGone(text)
         fresh = (kind, place) not in self._errors
         self._errors[kind, place] = error
-        self._heard((kind, place))
+        self._note_heard((kind, place))
         if fresh:
             self._wake()
 
-    def _heard(self, where: Where) -> None:
-        self._pending.discard(where)
+    def _note_heard(self, collection: Collection) -> None:
+        self._pending.discard(collection)
         if not self._pending:
-            self._told.set()
+            self._all_heard.set()
 
-    # what the controller asks
+    # what the controller calls
 
     async def check(self) -> None:
-        """Wait until all has been listed once; ApiError if something can't be kept up with.
+        """Wait until all has been listed once; ApiError if a kind can't be listed or watched.
 
-        Without NetworkPolicies all else goes on, where the operator has no right to them.
+        NetworkPolicies may be missing, where the operator has no right to them.
         """
-        await self._told.wait()
-        for (kind, _), error in sorted(self._errors.items(), key=lambda one: one[0][0] != PLURAL):
+        await self._all_heard.wait()
+        for (kind, _), error in sorted(self._errors.items(), key=lambda pair: pair[0][0] != PLURAL):
             if kind != POLICIES or isinstance(error, ApiAway):
                 raise error
 
     def touched(self) -> Touched:
-        """What has changed since this was asked last."""
-        found, self._touched = self._touched, Touched()
-        return found
+        """What has changed since the last call."""
+        touched, self._touched = self._touched, Touched()
+        return touched
 
     def snapshot(self, key: bytes = b"") -> ClusterSnapshot:
-        """The cluster as it is known."""
-        rosproxies = tuple(self._of(PLURAL, RosProxy))
-        masters, own = self._masters(rosproxies), self._of("services", ProxyService)
-        seen = ClusterSnapshot(
+        """The cluster as far as it is known."""
+        rosproxies = tuple(self._records_of(PLURAL, RosProxy))
+        masters, services = self._masters(rosproxies), self._records_of("services", ProxyService)
+        snapshot = ClusterSnapshot(
             rosproxies=rosproxies,
-            unusable={one.id: one for one in self._of(PLURAL, InvalidRosProxy)},
-            nodes={one.name: one for one in self._of("nodes", ClusterNode)},
-            services={one.of: one for one in own if self._looked_after(one.of.namespace)},
-            masters={id: read_master(one, id, ports) for id, (one, ports) in masters.items()},
-            consents={id: one.allowed if one else frozenset() for id, (one, _) in masters.items()},
-            policies={one.id: one for one in self._of(POLICIES, ProxyPolicy)},
-            no_policies=next((str(one) for one in self._refused(POLICIES)), ""),
+            unusable={r.id: r for r in self._records_of(PLURAL, InvalidRosProxy)},
+            nodes={node.name: node for node in self._records_of("nodes", ClusterNode)},
+            services={s.of: s for s in services if self._is_looked_after(s.of.namespace)},
+            masters={id: read_master(s, id, ports) for id, (s, ports) in masters.items()},
+            consents={id: s.allowed if s else frozenset() for id, (s, _) in masters.items()},
+            policies={policy.id: policy for policy in self._records_of(POLICIES, ProxyPolicy)},
+            no_policies=next((str(error) for error in self._errors_of(POLICIES)), ""),
             key=key,
         )
-        return self._with_pods(seen)
+        return self._with_pods(snapshot)
 
-    def _with_pods(self, seen: ClusterSnapshot) -> ClusterSnapshot:
-        proxies = [one for some in self._own.values() for one in some.values()]
-        ears = [one for some in self._ears.values() for one in some.values()]
-        namespaces = {*self._rosproxies, *self._own, *self._ears}
-        namespaces |= {id.namespace for id in seen.unusable}
-        others = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
-        found, own = [pod for pod in others if self._is_selected(pod)], own_pods(proxies, ears)
-        on = {pod.node for pod in found} | {node for one in own for node in (one.on, one.pod.node)}
-        pods = {pod.uid: pod for pod in others if pod.node in on}
-        pods |= {pod.uid: pod for pod in found}
-        for node in on & self._with_ports.keys():
-            pods |= self._with_ports[node]
-        pods |= {one.pod.uid: one.pod for one in own}
+    def _with_pods(self, snapshot: ClusterSnapshot) -> ClusterSnapshot:
+        proxies = [proxy for group in self._proxies.values() for proxy in group.values()]
+        ears = [ear for group in self._ears.values() for ear in group.values()]
+        namespaces = {*self._rosproxies, *self._proxies, *self._ears}
+        namespaces |= {id.namespace for id in snapshot.unusable}
+        candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
+        selected, own = [p for p in candidates if self._is_selected(p)], own_pods(proxies, ears)
+        nodes = {p.node for p in selected} | {node for p in own for node in (p.on, p.pod.node)}
+        pods = {p.uid: p for p in candidates if p.node in nodes}
+        pods |= {pod.uid: pod for pod in selected}
+        for node in nodes & self._pods_with_ports.keys():
+            pods |= self._pods_with_ports[node]
+        pods |= {p.pod.uid: p.pod for p in own}
         return replace(
-            seen,
+            snapshot,
             pods=tuple(pods.values()),
             proxies=tuple(proxies),
             ears=tuple(ears),
-            selected=frozenset(pod.uid for pod in found if not pod.ended),
+            selected=frozenset(pod.uid for pod in selected if not pod.ended),
         )
 
     def _masters(
@@ -177,49 +177,49 @@ class ClusterStore:
     ) -> dict[Name, tuple[MasterService | None, set[int]]]:
         """The Services that RosProxies name as their masters, and the ports that they name."""
         ports: dict[Name, set[int]] = defaultdict(set)
-        for each in rosproxies:
-            if each.spec.master.service is not None:
-                ports[each.spec.master.service].add(each.spec.master.service_port)
+        for rosproxy in rosproxies:
+            if rosproxy.spec.master.service is not None:
+                ports[rosproxy.spec.master.service].add(rosproxy.spec.master.service_port)
         if not ports:
             return {}
-        there = {one.id: one for one in self._of("services", MasterService)}
-        return {id: (there.get(id), some) for id, some in ports.items()}
+        services = {service.id: service for service in self._records_of("services", MasterService)}
+        return {id: (services.get(id), numbers) for id, numbers in ports.items()}
 
-    def _refused(self, kind: str) -> list[ApiError]:
-        return [error for where, error in self._errors.items() if where[0] == kind]
+    def _errors_of(self, kind: str) -> list[ApiError]:
+        return [error for collection, error in self._errors.items() if collection[0] == kind]
 
-    def _of(self, kind: str, wanted: type[R]) -> Iterator[R]:
-        for where, table in self._tables.items():
-            if where[0] == kind:
-                yield from (one for one in table.values() if isinstance(one, wanted))
+    def _records_of(self, kind: str, record_type: type[R]) -> Iterator[R]:
+        for collection, table in self._tables.items():
+            if collection[0] == kind:
+                yield from (record for record in table.values() if isinstance(record, record_type))
 
-    def _looked_after(self, namespace: str) -> bool:
+    def _is_looked_after(self, namespace: str) -> bool:
         return self._places == ("",) or namespace in self._places
 
     def _is_selected(self, pod: Pod) -> bool:
-        there = self._rosproxies.get(pod.id.namespace)
-        return there is not None and any(selects(one, pod) for one in there.values())
+        rosproxies = self._rosproxies.get(pod.id.namespace)
+        return rosproxies is not None and any(selects(r, pod) for r in rosproxies.values())
 
     # what a change means
 
-    def _put(self, where: Where, key: str, record: Record | None) -> None:
-        table = self._tables[where]
-        before = table.get(key)
-        record = self._as_others(record)
-        if before == record:
+    def _put(self, collection: Collection, key: str, record: Record | None) -> None:
+        table = self._tables[collection]
+        former = table.get(key)
+        record = self._as_foreign(record)
+        if former == record:
             return
         if record is None:
             del table[key]
         else:
             table[key] = record
-        self._index(before, key, add=False)
-        self._touch(before, record)
+        self._index(former, key, add=False)
+        self._touch(former, record)
         self._index(record, key, add=True)
-        self._touch(record, before)
+        self._touch(record, former)
 
-    def _as_others(self, record: Record | None) -> Record | None:
-        """Pods of another operator, which looks after other namespaces, are like anybody's."""
-        if isinstance(record, ProxyPod | EarPod) and not self._looked_after(record.of.namespace):
+    def _as_foreign(self, record: Record | None) -> Record | None:
+        """Turn pods of an operator that looks after other namespaces into ordinary pods."""
+        if isinstance(record, ProxyPod | EarPod) and not self._is_looked_after(record.of.namespace):
             return record.pod
         return record
 
@@ -227,22 +227,22 @@ class ClusterStore:
         if isinstance(record, RosProxy):
             _set(self._rosproxies, record.id.namespace, key, record if add else None)
         elif isinstance(record, ProxyPod):
-            _set(self._own, record.of.namespace, key, record if add else None)
+            _set(self._proxies, record.of.namespace, key, record if add else None)
         elif isinstance(record, EarPod):
             _set(self._ears, record.of.namespace, key, record if add else None)
         elif isinstance(record, Pod):
             _set(self._pods, record.id.namespace, key, record if add else None)
             if record.every_port and record.node:
-                _set(self._with_ports, record.node, key, record if add else None)
+                _set(self._pods_with_ports, record.node, key, record if add else None)
 
-    def _touch(self, record: Record | None, other: Record | None) -> None:
-        """Note whom it concerns that a record has come, or is another one, or is gone."""
+    def _touch(self, record: Record | None, counterpart: Record | None) -> None:
+        """Note whom a change concerns that brings or takes a record in place of its counterpart."""
         match record:
             case None:
                 return
             case RosProxy() | InvalidRosProxy():
-                if _asked(record) == _asked(other):
-                    return  # its status alone: the operator's own words
+                if _requested(record) == _requested(counterpart):
+                    return  # its status alone, which the operator writes
                 self._touched.namespaces.add(record.id.namespace)
             case ClusterNode():
                 self._touched.nodes.add(record.name)
@@ -254,12 +254,12 @@ class ClusterStore:
                 return
             case _:
                 self._touched.namespaces.add(record.of.namespace)
-                if other is None and isinstance(record, ProxyPod | EarPod):
+                if counterpart is None and isinstance(record, ProxyPod | EarPod):
                     self._touched.nodes.add(record.on)  # others may wait for its ports
         self._wake()
 
     def _touch_pod(self, pod: Pod) -> None:
-        """One of others matters if a RosProxy selects it, or if it takes ports."""
+        """A pod of others matters if a RosProxy selects it, or if it takes ports."""
         selected = self._is_selected(pod)
         if selected:
             self._touched.namespaces.add(pod.id.namespace)
@@ -269,13 +269,13 @@ class ClusterStore:
 
     def _touch_users(self, service: Name) -> None:
         """A Service matters if a RosProxy names it as its master."""
-        for namespace, there in self._rosproxies.items():
-            if any(one.spec.master.service == service for one in there.values()):
+        for namespace, rosproxies in self._rosproxies.items():
+            if any(rosproxy.spec.master.service == service for rosproxy in rosproxies.values()):
                 self._touched.namespaces.add(namespace)
                 self._wake()
 
 
-def _asked(record: Record | None) -> object:
+def _requested(record: Record | None) -> object:
     """What a RosProxy asks for, without its status."""
     if isinstance(record, RosProxy):
         return record.uid, record.generation, record.deleting, record.spec, record.remakes
@@ -308,7 +308,7 @@ def read_master(service: MasterService | None, id: Name, ports: Iterable[int]) -
         )
     if service.ports.isdisjoint(ports):
         has, wanted = (
-            ", ".join(sorted(map(str, some))) or "none" for some in (service.ports, ports)
+            ", ".join(sorted(map(str, numbers))) or "none" for numbers in (service.ports, ports)
         )
         text = f"has no port {wanted} (it has {has}): set spec.master.service.port"
         return "", f"the Service {id} {text}"

@@ -46,9 +46,9 @@ class KeyPair(msgspec.Struct, frozen=True):
 
     def due(self, now: datetime) -> bool:
         """Whether it is time for another one."""
-        found = self._read()
-        life = found.not_valid_after_utc - found.not_valid_before_utc
-        return now >= found.not_valid_before_utc + life * RENEW_AFTER
+        certificate = self._read()
+        life = certificate.not_valid_after_utc - certificate.not_valid_before_utc
+        return now >= certificate.not_valid_before_utc + life * RENEW_AFTER
 
     def names(self) -> set[str]:
         """The DNS names that it is for."""
@@ -63,8 +63,8 @@ class KeyPair(msgspec.Struct, frozen=True):
 
     def secret(self) -> dict[str, str]:
         """The ``data`` of a Secret that holds it."""
-        held = {CERTIFICATE: self.certificate, KEY: self.key, CA: self.ca}
-        return {name: base64.b64encode(text).decode() for name, text in held.items()}
+        entries = {CERTIFICATE: self.certificate, KEY: self.key, CA: self.ca}
+        return {name: base64.b64encode(text).decode() for name, text in entries.items()}
 
 
 def service_names(namespace: str, name: str) -> list[str]:
@@ -76,8 +76,8 @@ def service_names(namespace: str, name: str) -> list[str]:
 def make(names: Iterable[str], now: datetime, before: bytes = b"") -> KeyPair:
     """A new certificate for DNS names, with a new CA.
 
-    ``before`` are the CAs until now: those that are valid stay trusted for the time in which the
-    certificate before is still served.
+    ``before`` are the former CAs: those that are valid stay trusted for the time in which the
+    former certificate is still served.
     """
     authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
     # A name of its own: of two CAs that are called the same, some clients try only the first.
@@ -95,7 +95,7 @@ def make(names: Iterable[str], now: datetime, before: bytes = b"") -> KeyPair:
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    signed, trusted = (one.sign(authority_key, hashes.SHA256()) for one in (certificate, ca))
+    signed, trusted = (b.sign(authority_key, hashes.SHA256()) for b in (certificate, ca))
     return KeyPair(_pem(signed), private, _pem(trusted) + _still_valid(before, now))
 
 
@@ -103,12 +103,12 @@ def read(data: Mapping[str, str]) -> KeyPair:
     """A pair from the ``data`` of a Secret. Raises InvalidCertificate."""
     names = (CERTIFICATE, KEY, CA)
     try:
-        found = [base64.b64decode(data[name], validate=True) for name in names]
+        decoded = [base64.b64decode(data[name], validate=True) for name in names]
     except KeyError as error:
         raise InvalidCertificate(f"it has no {error.args[0]}") from None
     except ValueError:
         raise InvalidCertificate("it is no base64") from None
-    return checked(KeyPair(*found))
+    return checked(KeyPair(*decoded))
 
 
 def checked(pair: KeyPair) -> KeyPair:
@@ -136,12 +136,12 @@ def load(context: ssl.SSLContext, pair: KeyPair) -> None:
 
 
 def _still_valid(authorities: bytes, now: datetime) -> bytes:
-    """Those of some certificates that are valid; nothing if they can't be read."""
+    """The certificates among these that are still valid; empty if they can't be read."""
     try:
-        found = x509.load_pem_x509_certificates(authorities)
+        certificates = x509.load_pem_x509_certificates(authorities)
     except ValueError:
         return b""
-    return b"".join(_pem(one) for one in found if one.not_valid_after_utc > now)
+    return b"".join(_pem(c) for c in certificates if c.not_valid_after_utc > now)
 
 
 def now() -> datetime:

@@ -66,12 +66,12 @@ class Injector:
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
         """What a pod needs. Never raises. A ``dry_run`` does not wait for a Service."""
-        until = time.monotonic() + LONGEST
+        deadline = time.monotonic() + LONGEST
         try:
-            found, hold = await self._patiently(body, dry_run, until)
-            await asyncio.sleep(min(hold, until - time.monotonic()))
-            self._metrics.admissions.labels("wired" if found.spec is not None else "left").inc()
-            return found
+            wiring, hold = await self._wiring_by(body, dry_run, deadline)
+            await asyncio.sleep(min(hold, deadline - time.monotonic()))
+            self._metrics.admissions.labels("wired" if wiring.spec is not None else "left").inc()
+            return wiring
         except (ApiError, NotWired) as error:
             text = str(error)
         except Exception as error:
@@ -81,15 +81,15 @@ class Injector:
         log.warning("a pod at admission: %s", text)
         return Wiring(warnings=(NOT_WIRED + text,))
 
-    async def _patiently(self, body: Json, dry_run: bool, until: float) -> tuple[Wiring, float]:
-        """What a pod needs, and how long to wait then.
+    async def _wiring_by(self, body: Json, dry_run: bool, deadline: float) -> tuple[Wiring, float]:
+        """What a pod needs, and for how many seconds to hold it up; tried until the deadline.
 
-        Also from an API server that is just starting, and before the Service is there.
+        For an API server may be just starting, or the Service not be there yet.
         """
         missing = f"the API server did not answer within {LONGEST:g} s; create the pod anew"
         while True:
             try:
-                async with asyncio.timeout(until - time.monotonic()):
+                async with asyncio.timeout(deadline - time.monotonic()):
                     return await in_thread(self._wiring, body, dry_run)
             except ApiAway as error:
                 log.debug("a pod at admission: %s; trying again", error)
@@ -104,56 +104,56 @@ class Injector:
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
         pod = objects.pod(body)
-        found, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
-        usable = [each for each in found.values() if not each.deleting]
-        of = chosen(pod, usable)
-        if isinstance(of, RosProxy):
-            address, hold = self._address(of, dry_run)
-            return wire(body, target_of(of, address), of.spec.host_aliases), hold
-        if of is not None:
-            return Wiring(warnings=(NOT_WIRED + of.text,)), 0.0
+        readable, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
+        usable = [r for r in readable.values() if not r.deleting]
+        rosproxy = chosen(pod, usable)
+        if isinstance(rosproxy, RosProxy):
+            address, hold = self._address(rosproxy, dry_run)
+            return wire(body, target_of(rosproxy, address), rosproxy.spec.host_aliases), hold
+        if rosproxy is not None:
+            return Wiring(warnings=(NOT_WIRED + rosproxy.text,)), 0.0
         text = nobody(pod, usable)
-        why = [f"RosProxy {one.id.name}: {one.text}" for one in unusable.values()]
-        return Wiring(warnings=("; ".join([NOT_WIRED + text, *why]),) if text else ()), 0.0
+        reasons = [f"RosProxy {r.id.name}: {r.text}" for r in unusable.values()]
+        return Wiring(warnings=("; ".join([NOT_WIRED + text, *reasons]),) if text else ()), 0.0
 
-    def _address(self, of: RosProxy, dry_run: bool) -> tuple[str, float]:
+    def _address(self, rosproxy: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and in how many seconds it works everywhere.
 
         Raises NotWired.
         """
-        id = service_id(of.id)
+        id = service_id(rosproxy.id)
         try:
-            there = self._api.get("services", id, SOON)
+            manifest = self._api.get("services", id, SOON)
         except ApiGone:
-            if dry_run and of.cluster_ip:
-                return of.cluster_ip, 0.0
-            raise self._missing(of) from None
-        found = objects.service(there)
-        if found is None:
+            if dry_run and rosproxy.cluster_ip:
+                return rosproxy.cluster_ip, 0.0
+            raise self._missing(rosproxy) from None
+        service = objects.service(manifest)
+        if service is None:
             raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
-        if found.owner != of.uid or found.deleting or not found.cluster_ip:
-            raise self._missing(of)
+        if service.owner != rosproxy.uid or service.deleting or not service.cluster_ip:
+            raise self._missing(rosproxy)
         if dry_run:
-            return found.cluster_ip, 0.0
-        made = datetime.fromisoformat(there["metadata"]["creationTimestamp"]).timestamp()
-        return found.cluster_ip, min(max(made + YOUNG - time.time(), 0.0), YOUNG)
+            return service.cluster_ip, 0.0
+        created_at = datetime.fromisoformat(manifest["metadata"]["creationTimestamp"]).timestamp()
+        return service.cluster_ip, min(max(created_at + YOUNG - time.time(), 0.0), YOUNG)
 
-    def _missing(self, of: RosProxy) -> NotWired:
+    def _missing(self, rosproxy: RosProxy) -> NotWired:
         """Why a RosProxy has no Service: it asks for more than it may, or the Service is to come.
 
-        For one that is not to come no pod waits.
+        Pods wait for the latter alone (NoService).
         """
-        if refused := objection(of, self._consents(of), self._settings):
-            return NotWired(f"RosProxy {of.id.name}: {refused}; create the pod anew then")
-        id = service_id(of.id)
+        if refused := objection(rosproxy, self._consents(rosproxy), self._settings):
+            return NotWired(f"RosProxy {rosproxy.id.name}: {refused}; create the pod anew then")
+        id = service_id(rosproxy.id)
         return NoService(
             f"the Service {id} has no cluster IP yet: kubectl -n {id.namespace} describe rosproxy "
-            f"{of.id.name} says why; create the pod anew then"
+            f"{rosproxy.id.name} says why; create the pod anew then"
         )
 
-    def _consents(self, of: RosProxy) -> Consents:
-        """Whose RosProxies may name the Service that a RosProxy names as its master."""
-        service = of.spec.master.service
+    def _consents(self, rosproxy: RosProxy) -> Consents:
+        """The namespaces whose RosProxies may name the Service that is this one's master."""
+        service = rosproxy.spec.master.service
         if service is None:
             return {}
         try:

@@ -47,11 +47,11 @@ class CertificateDirectory:
         self._directory = Path(directory)
 
     def refresh(self) -> KeyPair:
-        """What is there now. Raises InvalidCertificate."""
+        """The certificate that is there now. Raises InvalidCertificate."""
         names = certificates.CERTIFICATE, certificates.KEY
         try:
-            found = [(self._directory / name).read_bytes() for name in names]
-            return certificates.checked(KeyPair(*found))
+            contents = [(self._directory / name).read_bytes() for name in names]
+            return certificates.checked(KeyPair(*contents))
         except OSError as error:
             text = f"--webhook-cert-dir: {error.filename}: {error.strerror}"
             raise InvalidCertificate(text) from None
@@ -60,7 +60,7 @@ class CertificateDirectory:
 
 
 class NotMadeYet(Exception):
-    """There is no certificate, and it is for the operator that leads to make it."""
+    """There is no certificate yet, and only the operator that leads makes one."""
 
 
 class SelfSigned:
@@ -96,7 +96,7 @@ class SelfSigned:
         Raises ApiError, and NotMadeYet.
         """
         self.problems = []
-        now, self._pair = self._now(), self._kept()
+        now, self._pair = self._now(), self._kept_pair()
         trusted = self._trust(self._pair.ca)
         if self._serving is None or self._serving.expires <= now or not self._configuration:
             self._serving = self._pair
@@ -107,52 +107,52 @@ class SelfSigned:
                 self._serving, self._trusted_at = self._pair, None
         return self._serving
 
-    def _kept(self) -> KeyPair:
-        """The pair in the Secret, else this process's own; a new one if it does not do (any more).
+    def _kept_pair(self) -> KeyPair:
+        """The pair in the Secret, else this process's own; a new one if it isn't usable (any more).
 
-        It does if it is for our names and has not lived too long.
+        Raises ApiError, and NotMadeYet.
         """
-        there: Json | None = None
+        manifest: Json | None = None
         try:
-            there = self._api.get("secrets", self._secret) if self._secret else None
+            manifest = self._api.get("secrets", self._secret) if self._secret else None
         except ApiError as error:
             if self._pair is None and isinstance(error, ApiAway):
                 raise
-            if not isinstance(error, ApiAway):  # of that the operator's looks tell
+            if not isinstance(error, ApiAway):  # which the operator's looks report
                 self._complain(error)
-        found = self._pair if there is None else self._read(there)
-        if found and self._does(found):
+        kept = self._pair if manifest is None else self._read(manifest)
+        if kept and self._is_usable(kept):
             self._unsaved = None
-            return found
+            return kept
         if not self._leads():
-            if found and found.expires > self._now():
-                return found
+            if kept and kept.expires > self._now():
+                return kept
             raise NotMadeYet
-        pair = self._made(found or self._pair)
-        if self._secret and there is not None:
-            self._put(self._secret, pair, there)
+        pair = self._new_pair(kept or self._pair)
+        if self._secret and manifest is not None:
+            self._put(self._secret, pair, manifest)
         return pair
 
-    def _made(self, before: KeyPair | None) -> KeyPair:
-        """A new pair, in place of one before, or the one that could not be written yet.
+    def _new_pair(self, previous: KeyPair | None) -> KeyPair:
+        """A new pair in place of the previous one; the same again while it can't be written.
 
-        With another one each time, API servers would have to learn of a CA each time, and those
-        that are trusted would grow in number.
+        With another pair at each try, API servers would have to learn of a new CA each time, and
+        the trusted CAs would grow in number.
         """
-        if self._unsaved is None or not self._does(self._unsaved):
-            trusted = before.ca if before else b""
+        if self._unsaved is None or not self._is_usable(self._unsaved):
+            trusted = previous.ca if previous else b""
             self._unsaved = certificates.make(self._names, self._now(), trusted)
             log.info("webhook: made a certificate that is valid until %s", self._unsaved.expires)
         return self._unsaved
 
-    def _does(self, pair: KeyPair) -> bool:
+    def _is_usable(self, pair: KeyPair) -> bool:
         """Whether a pair is for our names and has not lived too long."""
         return not pair.due(self._now()) and pair.names() >= set(self._names)
 
-    def _put(self, secret: Name, pair: KeyPair, there: Json) -> None:
-        """Write a pair into the Secret. Whoever was faster has the right one."""
+    def _put(self, secret: Name, pair: KeyPair, manifest: Json) -> None:
+        """Write a pair into the Secret. If somebody else was faster, theirs counts."""
         try:
-            self._api.fill_secret(secret, there, pair.secret())
+            self._api.fill_secret(secret, manifest, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
             self._unsaved = None
             raise ApiAway(f"somebody else writes {secret}: {error}") from None
@@ -162,7 +162,7 @@ class SelfSigned:
             self._complain(error)
 
     def _complain(self, error: ApiError) -> None:
-        """Tell that the Secret can't be used: the certificate is then this process's alone."""
+        """Report that the Secret can't be used: the certificate is then in this process alone."""
         text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
         if isinstance(error, ApiGone):
             text += "; create an empty Secret of this name (the chart does)"
@@ -179,7 +179,7 @@ class SelfSigned:
             return None
 
     def _trust(self, authorities: bytes) -> bool:
-        """Write the CAs where the API server looks for them; whether they are there."""
+        """Write the CAs into the webhook's configuration. Returns whether they are there."""
         if not self._configuration:
             return True
         try:
@@ -206,10 +206,10 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
     operations: list[Json] = []
     for index, webhook in enumerate(parts(configuration, "webhooks")):
         if part(webhook, "clientConfig").get("caBundle") != bundle:
-            where = f"/webhooks/{index}"
+            path = f"/webhooks/{index}"
             operations += [
-                {"op": "test", "path": f"{where}/name", "value": webhook.get("name")},
-                {"op": "add", "path": f"{where}/clientConfig/caBundle", "value": bundle},
+                {"op": "test", "path": f"{path}/name", "value": webhook.get("name")},
+                {"op": "add", "path": f"{path}/clientConfig/caBundle", "value": bundle},
             ]
     return operations
 
@@ -217,8 +217,8 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
 class CertificateRotation:
     """Holds the certificate that is to be served. `pair` may be read from any thread.
 
-    ``not_made_yet``: the operator that leads is yet to make it. One without a webhook, whose place
-    this one is about to take, never will.
+    ``not_made_yet``: the operator that leads is yet to make it. If that one has no webhook, it
+    never will: this one is about to replace it.
     """
 
     def __init__(self, source: CertificateDirectory | SelfSigned, metrics: ClusterMetrics) -> None:

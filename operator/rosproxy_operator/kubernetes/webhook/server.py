@@ -43,14 +43,14 @@ class WebhookServer:
     def unready(self) -> str | None:
         """Why pods are not wired here; None if they are. May be asked from any thread.
 
-        As long as there is no certificate nobody wires any, and whoever leads may have to go first.
+        While there is no certificate no operator wires pods, and the leader may have to end first.
         """
         if self._serving or self._rotation.not_made_yet:
             return None
         return "the webhook is not served yet"
 
     def drain(self) -> None:
-        """Let API servers open no more than one request on each connection: it ends soon."""
+        """Close each connection after its next response: serving ends soon."""
         self._draining = True
 
     async def __call__(self, fn: kopf.WebhookFn) -> AsyncIterator[kopf.WebhookClientConfig]:
@@ -70,7 +70,7 @@ class WebhookServer:
             log.info("wiring pods at https://%s", bind)
             self._serving = True
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
-            await self._keep(context, pair)
+            await self._exchange(context, pair)
         finally:
             self._serving = False
             await runner.cleanup()
@@ -79,7 +79,7 @@ class WebhookServer:
         if self._draining:
             response.force_close()
 
-    async def _keep(self, context: ssl.SSLContext, served: KeyPair) -> None:
+    async def _exchange(self, context: ssl.SSLContext, served: KeyPair) -> None:
         """Serve another certificate as soon as there is one."""
         while True:
             await asyncio.sleep(CHECK)

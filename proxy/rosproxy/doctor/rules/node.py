@@ -21,24 +21,26 @@ _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """All findings about nodes; about those asked for only, if there are names."""
-    found = _cause_first([*_inside(facts), *_registered(facts), *_services(facts), *_clock(facts)])
+    findings = _cause_first(
+        [*_inside(facts), *_registered(facts), *_services(facts), *_clock(facts)]
+    )
     if not facts.names:
-        yield from _counts(facts, found)
+        yield from _counts(facts, findings)
     wanted = facts.scope.nodes
-    yield from (f for f in found if not facts.names or not f.subject or f.subject in wanted)
+    yield from (f for f in findings if not facts.names or not f.subject or f.subject in wanted)
 
 
-def _cause_first(found: list[DoctorFinding]) -> list[DoctorFinding]:
+def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
     """While two proxies take each other's nodes away, none that seems dead is cleaned up."""
-    first = [one for one in found if one.check == TWO_PROXIES]
+    first = [f for f in findings if f.check == TWO_PROXIES]
     if not first:
-        return found
-    others = [one for one in found if one.check != TWO_PROXIES]
+        return findings
+    rest = [f for f in findings if f.check != TWO_PROXIES]
     wait = "part the two proxies first, then ask again"
-    return first + [replace(one, fix=wait) if CLEANUP in one.fix else one for one in others]
+    return first + [replace(f, fix=wait) if CLEANUP in f.fix else f for f in rest]
 
 
-def _counts(facts: DoctorFacts, found: list[DoctorFinding]) -> Iterator[DoctorFinding]:
+def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[DoctorFinding]:
     states = [node.state for node in facts.proxy.nodes]
     if states:
         yield ok(INSIDE, "inside nodes", f"{states.count('ok')} of {len(states)} answer")
@@ -46,8 +48,8 @@ def _counts(facts: DoctorFacts, found: list[DoctorFinding]) -> Iterator[DoctorFi
         text = "none has registered through the proxy"
         yield warning(INSIDE, "inside nodes", text, _start_inside(facts, "them"))
     if facts.graph is not None:
-        bad = {f.subject for f in found if f.severity is Severity.ERROR}
-        faults = len(bad & set(facts.nodes))
+        faulty = {f.subject for f in findings if f.severity is Severity.ERROR}
+        faults = len(faulty & set(facts.nodes))
         text = f"{len(facts.nodes)} registered, {faults or 'none'} with faults"
         yield (note if faults else ok)(OUTSIDE, "nodes at the master", text)
 
@@ -67,9 +69,9 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
         yield error(INSIDE, name, text, fix)
     elif state == "refused":
         after = facts.proxy.settings.cleanup_after
-        own = f"the proxy unregisters it {after:g} s after that" if after else CLEANUP
+        cleanup = f"the proxy unregisters it {after:g} s after that" if after else CLEANUP
         text = f"has ended without unregistering: {address} refuses connections"
-        yield error(INSIDE, name, text, f"restart it; {own}")
+        yield error(INSIDE, name, text, f"restart it; {cleanup}")
     elif state == "failing":
         text = f"did not answer the last probe at {address}"
         yield warning(INSIDE, name, text, "look again in some seconds")
@@ -89,15 +91,18 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
 
 def _only_on_loopback(node: EndpointStatus) -> bool:
     """Whether a node gives a loopback address, and is somewhere else than the proxy."""
-    named, placed = parse_slave_uri(node.uri), parse_host_port(node.address)
-    return bool(named and placed and is_loopback(named.host) and not is_loopback(placed.host))
+    claimed, actual = parse_slave_uri(node.uri), parse_host_port(node.address)
+    return bool(claimed and actual and is_loopback(claimed.host) and not is_loopback(actual.host))
 
 
 def _namesakes(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[DoctorFinding]:
     """Another node of the same name took over at the master."""
-    known = facts.nodes.get(name)
-    if known and known.uri and known.uri != node.advertised_uri:
-        text = f"two nodes have this name: the master has {known.uri}, behind the proxy {node.uri}"
+    registered = facts.nodes.get(name)
+    if registered and registered.uri and registered.uri != node.advertised_uri:
+        text = (
+            f"two nodes have this name: the master has {registered.uri}, "
+            f"behind the proxy {node.uri}"
+        )
         yield error(INSIDE, name, text, "give one another name: __name:=OTHER")
 
 
@@ -109,7 +114,7 @@ def _registered(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     """A node whose address is in this proxy's range."""
     lease = facts.lease(node.where)
-    if lease is None and _of_another(facts, node):
+    if lease is None and _is_of_another_proxy(facts, node):
         text = (
             f"lives, registered as {node.uri}, and this proxy knows no such node: another rosproxy "
             "advertises the same host and ports, and nodes get now the one's, now the other's"
@@ -128,21 +133,21 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
         yield error(STALE, node.name, text, f"restart it, or {CLEANUP}")
 
 
-def _of_another(facts: DoctorFacts, node: NodeFacts) -> bool:
-    """Whether a node at a port of this proxy's that nobody here holds has answered all the same."""
+def _is_of_another_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
+    """Whether a node answers at a port of this proxy that no node here holds."""
     answered = node.attempt.reach is Reach.ANSWERED
     return answered and facts.ours(node.where) and facts.lease(node.where) is None
 
 
 def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
-    where, reach = node.where, node.attempt.reach
-    if where is None:
+    slave, reach = node.where, node.attempt.reach
+    if slave is None:
         text = f"the master gives no usable address for it: {node.uri!r}"
         yield error(OUTSIDE, node.name, text, "restart it")
     elif node.attempt.failed and node.inside:
         text = f"registered through a rosproxy as {node.uri}: {reach.value}"
-        yield error(OUTSIDE, node.name, text, _fix_proxied(facts, node, where))
-    elif is_loopback(where.host) and not (local_master(facts) and not node.attempt.failed):
+        yield error(OUTSIDE, node.name, text, _fix_proxied(facts, node, slave))
+    elif is_loopback(slave.host) and not (local_master(facts) and not node.attempt.failed):
         text = f"registered as {node.uri}: to every other machine that is the machine itself"
         fix = (
             "where it runs: ROS_IP=ADDRESS with its address in the network of the master "
@@ -150,14 +155,14 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
         )
         yield error(OUTSIDE, node.name, text, fix)
     elif reach is Reach.UNRESOLVABLE:
-        yield _unresolvable(facts, node, where)
+        yield _unresolvable(facts, node, slave)
     elif reach is Reach.SILENT:
         text = f"no answer at {node.uri}: it hangs, or its machine is off or cut off"
-        fix = f"from here: nc -vz {where.host} {where.port}; if it is gone: {CLEANUP}"
+        fix = f"from here: nc -vz {slave.host} {slave.port}; if it is gone: {CLEANUP}"
         yield error(OUTSIDE, node.name, text, fix)
     elif node.attempt.failed:
-        who = f" ({node.attempt.reason})" if node.attempt.reason else ""
-        text = f"registered as {node.uri}, but gone: {reach.value}{who}"
+        reason = f" ({node.attempt.reason})" if node.attempt.reason else ""
+        text = f"registered as {node.uri}, but gone: {reach.value}{reason}"
         yield error(STALE, node.name, text, CLEANUP)
     elif _past_the_proxy(facts, node):
         text = (
@@ -167,29 +172,29 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
         yield warning(OUTSIDE, node.name, text, _start_inside(facts))
 
 
-def _unresolvable(facts: DoctorFacts, node: NodeFacts, where: HostPort) -> DoctorFinding:
-    text = f"registered as {node.uri}; the host name {where.host} can't be resolved here"
-    if _CONTAINER_ID.fullmatch(where.host):
+def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> DoctorFinding:
+    text = f"registered as {node.uri}; the host name {slave.host} can't be resolved here"
+    if _CONTAINER_ID.fullmatch(slave.host):
         text += ". It looks like a container that uses the real master, past the proxy"
         return error(OUTSIDE, node.name, text, _start_inside(facts))
     fix = (
-        f"where it runs: ROS_IP=ADDRESS, then restart it; or make {where.host} known to proxy and "
-        f"inside nodes: docker run --add-host {where.host}:ADDRESS"
+        f"where it runs: ROS_IP=ADDRESS, then restart it; or make {slave.host} known to proxy and "
+        f"inside nodes: docker run --add-host {slave.host}:ADDRESS"
     )
     return error(OUTSIDE, node.name, text, fix)
 
 
-def _fix_proxied(facts: DoctorFacts, node: NodeFacts, where: HostPort) -> str:
+def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
     """Cleaning up would lose nodes that a proxy takes back when it starts again."""
     if node.attempt.reach is Reach.UNRESOLVABLE:
-        return f"start its proxy with --advertise-host ADDRESS instead of the name {where.host}"
+        return f"start its proxy with --advertise-host ADDRESS instead of the name {slave.host}"
     if facts.status is None:
         return (
-            f"on {where.host}: rosproxy doctor. Does the proxy run there, does the firewall let "
+            f"on {slave.host}: rosproxy doctor. Does the proxy run there, does the firewall let "
             "its ports through? Started again with the same ports it takes its nodes back"
         )
     return (
-        f"if this proxy had {where} before, start it with its old --advertise-host and "
+        f"if this proxy had {slave} before, start it with its old --advertise-host and "
         f"--port-range, or restart the node; if it is of another proxy, look there; else {CLEANUP}"
     )
 
@@ -203,18 +208,18 @@ def _past_the_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
     return any(is_inside(address, apart) for address in node.addresses)
 
 
-def _start_inside(facts: DoctorFacts, who: str = "it") -> str:
+def _start_inside(facts: DoctorFacts, pronoun: str = "it") -> str:
     port = facts.proxy.settings.master_port
-    return f"start {who} with ROS_MASTER_URI=http://PROXY:{port}, the proxy's address inside"
+    return f"start {pronoun} with ROS_MASTER_URI=http://PROXY:{port}, the proxy's address inside"
 
 
 def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """Services that are registered with a port of this proxy which nobody holds."""
     for service, uri in facts.service_uris.items():
-        where = parse_service_uri(uri)
-        if facts.ours(where) and not facts.lease(where):
+        provider = parse_service_uri(uri)
+        if facts.ours(provider) and not facts.lease(provider):
             subject = next(iter(facts.system.services.get(service, ())), service)
-            if subject in facts.nodes and _of_another(facts, facts.nodes[subject]):
+            if subject in facts.nodes and _is_of_another_proxy(facts, facts.nodes[subject]):
                 continue
             text = f"its service {service} is registered as {uri}, a port that no node holds"
             yield error(STALE, subject, text, f"restart it, or {CLEANUP}")

@@ -34,9 +34,9 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     graph = facts.system
-    known = sorted(graph.names() | graph.topics | {*graph.services})
-    alike = get_close_matches(name, known, 3, 0.7)
-    alike += [other for other in known if other.endswith(name) and other not in alike][:3]
+    names = sorted(graph.names() | graph.topics | {*graph.services})
+    alike = get_close_matches(name, names, 3, 0.7)
+    alike += [n for n in names if n.endswith(name) and n not in alike][:3]
     hint = f"; there is {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
     fix = "rosnode list; rostopic list; look for a namespace or a remapping too many"
@@ -46,10 +46,10 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
 def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
     graph = facts.system
     published = bool(graph.publishers.get(topic))
-    who, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
-    text = f"{who} by {listed(graph.sides(topic))}; nobody {lacks} it"
-    others = sorted(graph.topics - {topic})
-    alike = [o for o in others if o.rpartition("/")[2] == topic.rpartition("/")[2]]
+    verb, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
+    text = f"{verb} by {listed(graph.sides(topic))}; nobody {lacks} it"
+    topics = sorted(graph.topics - {topic})
+    alike = [t for t in topics if t.rpartition("/")[2] == topic.rpartition("/")[2]]
     fix = f"there is also {listed(alike)}: a namespace or remapping? " if alike else ""
     fix += f"rostopic info {topic}; after a restart of roscore, restart the nodes outside"
     return (error if topic in facts.names else note)(PAIR, topic, text, fix)
@@ -57,48 +57,55 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
 
 def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
     """Whether a publisher and a subscriber are connected, else why not."""
-    giver, taker = facts.nodes[publisher], facts.nodes[subscriber]
+    publisher_node, subscriber_node = facts.nodes[publisher], facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
-    if connected(topic, giver, taker):
-        return ok(PAIR, label, "connected" + _traffic(facts, topic, giver, taker))
-    text, fix = _why(facts, topic, giver, taker)
+    if connected(topic, publisher_node, subscriber_node):
+        return ok(
+            PAIR, label, "connected" + _traffic(facts, topic, publisher_node, subscriber_node)
+        )
+    text, fix = _why(facts, topic, publisher_node, subscriber_node)
     return error(PAIR, label, f"not connected: {text}", fix)
 
 
-def connected(topic: str, giver: NodeFacts, taker: NodeFacts) -> bool:
+def connected(topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> bool:
     """Whether a publisher says that a subscriber is connected.
 
     The publisher knows best: a subscriber lists connections that it only tries to make. Where the
     publisher can't be asked, the subscriber's word has to do.
     """
-    if giver.report is not None:
-        return ("o", topic, taker.name) in giver.report.peers
-    return taker.report is not None and ("i", topic, giver.uri) in taker.report.peers
+    if publisher.report is not None:
+        return ("o", topic, subscriber.name) in publisher.report.peers
+    return subscriber.report is not None and ("i", topic, publisher.uri) in subscriber.report.peers
 
 
-def _traffic(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> str:
-    lease = facts.lease(giver.where)
+def _traffic(facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> str:
+    lease = facts.lease(publisher.where)
     for connection in lease.connections if lease else ():
-        if (connection.name, connection.caller_id) == (topic, taker.name):
+        if (connection.name, connection.caller_id) == (topic, subscriber.name):
             sent, rate = size(connection.sent), size(connection.sent_rate)
             return f", {sent} so far, {rate}/s just now"
     return ""
 
 
-def _why(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> tuple[str, str]:
+def _why(
+    facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts
+) -> tuple[str, str]:
     """Why a pair is not connected, the most certain reason first, and what mends it."""
-    for node in (giver, taker):
+    for node in (publisher, subscriber):
         if _unreachable(facts, node):
             return f"{node.name} can't be reached from here", "see what is said of it"
-    offered = giver.report.publishes.get(topic) if giver.report else ANY
-    wanted = taker.report.subscribes.get(topic) if taker.report else ANY
+    offered = publisher.report.publishes.get(topic) if publisher.report else ANY
+    wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY
     if offered is None:
-        return f"{giver.name} says that it does not publish it", f"restart {giver.name}"
+        return f"{publisher.name} says that it does not publish it", f"restart {publisher.name}"
     if wanted is None:
-        return f"{taker.name} says that it is not subscribed to it", f"restart {taker.name}"
+        return (
+            f"{subscriber.name} says that it is not subscribed to it",
+            f"restart {subscriber.name}",
+        )
     if ANY not in (offered, wanted) and offered != wanted:
         return f"types differ, {offered} and {wanted}", "use the same message type on both sides"
-    return _why_no_transport(facts, topic, giver, taker)
+    return _why_no_transport(facts, topic, publisher, subscriber)
 
 
 def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
@@ -109,50 +116,54 @@ def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
 
 
 def _why_no_transport(
-    facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts
+    facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
-    address, attempt = facts.data_ports.get((giver.name, topic), ("", Attempt()))
-    where = parse_host_port(address)
-    restart = f"restart {taker.name}"
+    address, attempt = facts.data_ports.get((publisher.name, topic), ("", Attempt()))
+    target = parse_host_port(address)
+    restart = f"restart {subscriber.name}"
     if attempt.failed:
-        what = f"{giver.name} gives {address or 'nothing'} as its data port, {attempt.reach.value}"
-        set_ip = f"where {giver.name} runs: ROS_IP=ADDRESS and no firewall, then restart it"
-        return f"{what} ({attempt.reason})" if attempt.reason else what, set_ip
-    elsewhere = not facts.ours(giver.where) and not local_master(facts)
-    if where and is_loopback(where.host) and elsewhere:
-        text = f"{giver.name} gives {address} as its data port, which is loopback"
-        return text, f"where {giver.name} runs: ROS_IP=ADDRESS, then restart it"
-    if facts.ours(giver.where) and not facts.ours(taker.where) and giver.where:
-        port = giver.where
-        return (
-            f"{giver.name} is behind the proxy and fine; {taker.name} has not come to {port}",
-            f"on the machine of {taker.name}: nc -vz {port.host} {port.port}; then {restart}",
+        description = (
+            f"{publisher.name} gives {address or 'nothing'} as its data port, {attempt.reach.value}"
         )
-    if facts.ours(taker.where) and not facts.ours(giver.where):
-        return _why_not_from_inside(facts, address, giver, taker)
+        set_ip = f"where {publisher.name} runs: ROS_IP=ADDRESS and no firewall, then restart it"
+        return f"{description} ({attempt.reason})" if attempt.reason else description, set_ip
+    elsewhere = not facts.ours(publisher.where) and not local_master(facts)
+    if target and is_loopback(target.host) and elsewhere:
+        text = f"{publisher.name} gives {address} as its data port, which is loopback"
+        return text, f"where {publisher.name} runs: ROS_IP=ADDRESS, then restart it"
+    if facts.ours(publisher.where) and not facts.ours(subscriber.where) and publisher.where:
+        slave = publisher.where
+        return (
+            f"{publisher.name} is behind the proxy and fine; "
+            f"{subscriber.name} has not come to {slave}",
+            f"on the machine of {subscriber.name}: "
+            f"nc -vz {slave.host} {slave.port}; then {restart}",
+        )
+    if facts.ours(subscriber.where) and not facts.ours(publisher.where):
+        return _why_not_from_inside(facts, address, publisher, subscriber)
     text = "both answer and their types fit; perhaps their message definitions differ (md5sum)"
-    return text, f"look into the log of {taker.name}; {restart}"
+    return text, f"look into the log of {subscriber.name}; {restart}"
 
 
 def _why_not_from_inside(
-    facts: DoctorFacts, address: str, giver: NodeFacts, taker: NodeFacts
+    facts: DoctorFacts, address: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
     """Why a subscriber behind the proxy has not come to a publisher that is well."""
-    text = f"{giver.name} is fine; {taker.name}, behind the proxy, has not come to"
+    text = f"{publisher.name} is fine; {subscriber.name}, behind the proxy, has not come to"
     differ = "or their message definitions differ (md5sum)"
-    log = f"look into the log of {taker.name}"
+    log = f"look into the log of {subscriber.name}"
     if facts.proxy.settings.direction == "both":
-        text = f"{text} the proxy's port for {giver.uri}, {differ}"
-        fix = f"{log} and of the proxy; restart {taker.name}"
+        text = f"{text} the proxy's port for {publisher.uri}, {differ}"
+        fix = f"{log} and of the proxy; restart {subscriber.name}"
         if not facts.proxy.settings.udp:
             fix += "; if it wants UDP alone: --udp (label rosproxy.udp=true, spec.udp: true)"
         return text, fix
-    where = parse_host_port(address)
-    test = f"nc -vz {where.host} {where.port}" if where else f"a connection to {giver.uri}"
+    target = parse_host_port(address)
+    test = f"nc -vz {target.host} {target.port}" if target else f"a connection to {publisher.uri}"
     return (
-        f"{text} {address or giver.uri} by itself, {differ}",
-        f"where {taker.name} runs: {test}; if there is no route outwards, the proxy can be the "
-        "way: --direction both (label rosproxy.direction=both, spec.direction: Both); else "
+        f"{text} {address or publisher.uri} by itself, {differ}",
+        f"where {subscriber.name} runs: {test}; if there is no route outwards, the proxy can be "
+        "the way: --direction both (label rosproxy.direction=both, spec.direction: Both); else "
         f"{log}",
     )
 

@@ -28,7 +28,7 @@ def setup(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def running(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """What can be said again and again, without a try of the range (`rosproxy.app.self_check`)."""
+    """Rules that run again and again, without a try of the range (`rosproxy.app.self_check`)."""
     yield from _master(facts)
     yield from _ports(facts)
 
@@ -57,9 +57,9 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     else:
         trip = f" in {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
         yield ok("master", "master", f"{master.uri} answers{trip}")
-        seen = facts.proxy.master
-        if not seen.up and seen.error:
-            text = f"{master.uri} answers here, but the proxy says: {seen.error}"
+        status = facts.proxy.master
+        if not status.up and status.error:
+            text = f"{master.uri} answers here, but the proxy says: {status.error}"
             fix = "wait some seconds; if it stays, run this where the proxy runs"
             yield warning("master", "master", text, fix)
         if facts.graph is None:
@@ -69,8 +69,8 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 def _unanswered(master: MasterFacts) -> tuple[str, str]:
     """What is wrong with a master that does not answer as one, and what mends it."""
-    uri, parts = master.uri, urlsplit(master.uri)
-    host, port = parts.hostname or "", parts.port
+    uri, split_uri = master.uri, urlsplit(master.uri)
+    host, port = split_uri.hostname or "", split_uri.port
     by_address = f"--master-uri http://ADDRESS:{port}"
     match master.attempt.reach:
         case Reach.UNRESOLVABLE:
@@ -78,10 +78,10 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
             add_host = f"docker run --add-host {host}:ADDRESS, in Kubernetes hostAliases"
             return text, f"{add_host}; or {by_address}"
         case Reach.STRANGER if master.at_root:
-            text = f"a master answers there, but not at the path {parts.path}"
+            text = f"a master answers there, but not at the path {split_uri.path}"
             return (
                 f"{uri}: {text} (it knows only / and /RPC2)",
-                f"--master-uri http://{parts.netloc}/",
+                f"--master-uri http://{split_uri.netloc}/",
             )
         case Reach.STRANGER:
             text = f"{uri}: what answers there is no ROS master ({master.attempt.reason})"
@@ -104,8 +104,8 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
             fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
             yield note(HOST, HOST, "not checked: it is not known", fix)
         return
-    tried = facts.probe.probes if facts.probe else ()
-    if not is_loopback(host) and any(probe.from_master == "ok" for probe in tried):
+    probes = facts.probe.probes if facts.probe else ()
+    if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
         return  # others find this host by it, whatever it means here
     if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
         all_here = facts.all_here or local_master(facts)
@@ -126,10 +126,10 @@ def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.probe is None:
         yield warning(RANGE, RANGE, f"not tried: {facts.probe_error}")
         return
-    known = bool(facts.advertised_addresses)
-    for found in published_range(facts.probe, facts.advertise_host, facts.proxy.ports):
-        if known or found.severity is Severity.OK:  # else it has been told that it is unknown
-            yield found
+    is_resolvable = bool(facts.advertised_addresses)
+    for finding in published_range(facts.probe, facts.advertise_host, facts.proxy.ports):
+        if is_resolvable or finding.severity is Severity.OK:  # else told already: unknown host
+            yield finding
 
 
 def _ports(facts: DoctorFacts) -> Iterator[DoctorFinding]:

@@ -1,7 +1,7 @@
 """Rules about ROS 2: whether participants of both sides can meet, as far as the proxy sees it.
 
 Most of it the proxy knows itself (`rosproxy.admin.domain_problems`). The doctor knows besides who
-is on the networks inside and is not heard by the proxy, and which topics and services it is about.
+is on the networks inside but not heard by the proxy, and which topics and services were asked for.
 """
 
 from collections.abc import Iterator
@@ -31,17 +31,17 @@ _REFUSED = {
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
     """What is to be said of the domains."""
     domains = facts.proxy.domains
-    found = [finding for domain in domains for finding in _domain(domain)]
+    findings = [finding for domain in domains for finding in _domain(domain)]
     if facts.proxy.uptime >= SETTLED:
-        found += [finding for one in facts.heard for finding in _heard(one, domains)]
-    found += [
-        warning("refused", one.subject, one.text, _REFUSED[one.subject])
-        for one in facts.proxy.problems
-        if domains and one.subject in _REFUSED and one.age < RECENT
+        findings += [finding for heard in facts.heard for finding in _heard(heard, domains)]
+    findings += [
+        warning("refused", problem.subject, problem.text, _REFUSED[problem.subject])
+        for problem in facts.proxy.problems
+        if domains and problem.subject in _REFUSED and problem.age < RECENT
     ]
     if not facts.proxy.settings.for_ros1:
-        found += [finding for name in facts.names for finding in _asked_for(name, domains)]
-    return found
+        findings += [finding for name in facts.names for finding in _name_in_domains(name, domains)]
+    return findings
 
 
 def _domain(domain: DomainStatus) -> Iterator[DoctorFinding]:
@@ -71,64 +71,74 @@ def _domain(domain: DomainStatus) -> Iterator[DoctorFinding]:
 
 
 def _finding(problem: DomainProblem) -> DoctorFinding:
-    say = error if problem.grave else warning
-    return say(problem.check, problem.subject, problem.text, problem.fix)
+    report = error if problem.grave else warning
+    return report(problem.check, problem.subject, problem.text, problem.fix)
 
 
-def _heard(one: HeardParticipant, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
+def _heard(
+    participant: HeardParticipant, domains: tuple[DomainStatus, ...]
+) -> Iterator[DoctorFinding]:
     """What is to be said of a participant on a network inside that the proxy has not heard."""
     served = [domain.domain for domain in domains]
-    known = {seen.guid_prefix for domain in domains for seen in (*domain.inside, *domain.outside)}
-    where = f"at {one.address} ({one.vendor}, inside)"
-    if one.domain not in served:
-        text = f"{where}: it is in domain {one.domain}; this proxy serves "
+    prefixes = {p.guid_prefix for domain in domains for p in (*domain.inside, *domain.outside)}
+    label = f"at {participant.address} ({participant.vendor}, inside)"
+    if participant.domain not in served:
+        text = f"{label}: it is in domain {participant.domain}; this proxy serves "
         fix = (
-            f"ROS_DOMAIN_ID={served[0]} for it, or --ros2-domain {one.domain} for the proxy as well"
+            f"ROS_DOMAIN_ID={served[0]} for it, or --ros2-domain {participant.domain} for the "
+            "proxy as well"
         )
-        yield warning("domain", one.guid_prefix, text + listed(map(str, served)), fix)
-    elif one.guid_prefix not in known:
-        text = f"{where}: it answers, but does not announce itself to the network, so that the "
+        yield warning("domain", participant.guid_prefix, text + listed(map(str, served)), fix)
+    elif participant.guid_prefix not in prefixes:
+        text = f"{label}: it answers, but does not announce itself to the network, so that the "
         text += "proxy does not hear it: its discovery range is its own machine"
         fix = (
             "where it runs: ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, and unset ROS_LOCALHOST_ONLY; or "
         )
         fix += "ROS_STATIC_PEERS with the proxy's address"
-        yield warning("range", one.guid_prefix, text, fix)
+        yield warning("range", participant.guid_prefix, text, fix)
 
 
-def _asked_for(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
+def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
     """Who has a topic or service, and whether the two sides match."""
-    everybody = [one for domain in domains for side in _sides(domain) for one in side]
-    if not any(name in (*one.publishes, *one.subscribes, *one.services) for one in everybody):
+    participants = [p for domain in domains for side in _sides(domain) for p in side]
+    if not any(name in (*p.publishes, *p.subscribes, *p.services) for p in participants):
         text = "no participant has a topic or service of this name"
         yield error("name", name, text, "compare with those that rosproxy status lists")
     for domain in domains:
-        yield from _name_in(domain, name)
+        yield from _name_in_domain(domain, name)
 
 
-def _name_in(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
-    everybody = [(one, side is domain.inside) for side in _sides(domain) for one in side]
-    publishers = [one for one in everybody if name in one[0].publishes]
-    subscribers = [one for one in everybody if name in one[0].subscribes]
-    for one, is_inside in everybody:
-        if name in one.services:
-            yield ok("service", name, f"served by {one.guid_prefix} {named(one, is_inside)}")
-    for these, others, lack in (
+def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
+    participants = [(p, side is domain.inside) for side in _sides(domain) for p in side]
+    publishers = [p for p in participants if name in p[0].publishes]
+    subscribers = [p for p in participants if name in p[0].subscribes]
+    for participant, is_inside in participants:
+        if name in participant.services:
+            yield ok(
+                "service",
+                name,
+                f"served by {participant.guid_prefix} {named(participant, is_inside)}",
+            )
+    for own_side, other_side, lacks in (
         (publishers, subscribers, "subscribes to"),
         (subscribers, publishers, "publishes"),
     ):
-        if these and not others:
-            yield note("topic", name, f"nobody {lack} it", "see the name, and that it runs")
-    pairs = [(one, other) for one in publishers for other in subscribers]
-    if pairs and all(one[1] is other[1] for one, other in pairs):
+        if own_side and not other_side:
+            yield note("topic", name, f"nobody {lacks} it", "see the name, and that it runs")
+    pairs = [(p, s) for p in publishers for s in subscribers]
+    if pairs and all(p[1] is s[1] for p, s in pairs):
         text = "all that have it are on one side, so that it does not pass the proxy"
         yield note("topic", name, text)
     troubled = {problem.subject for problem in domain_problems(domain) if problem.grave}
-    bad = {(one.writer, one.reader) for one in domain.mismatches if one.name == name}
-    for (one, here), (other, there) in pairs:
-        both = one.guid_prefix, other.guid_prefix
-        if here is not there and both not in bad and not troubled & {*both}:
-            text = f"{both[0]} {named(one, here)} to {both[1]} {named(other, there)}: they match"
+    mismatched = {(m.writer, m.reader) for m in domain.mismatches if m.name == name}
+    for (participant, from_inside), (peer, to_inside) in pairs:
+        guids = participant.guid_prefix, peer.guid_prefix
+        if from_inside is not to_inside and guids not in mismatched and not troubled & {*guids}:
+            text = (
+                f"{guids[0]} {named(participant, from_inside)} to "
+                f"{guids[1]} {named(peer, to_inside)}: they match"
+            )
             yield ok("topic", name, text)
 
 
@@ -137,5 +147,5 @@ def _sides(domain: DomainStatus) -> tuple[tuple[ParticipantStatus, ...], ...]:
 
 
 def _counted(participants: tuple[ParticipantStatus, ...]) -> str:
-    vendors = sorted({one.vendor for one in participants})
+    vendors = sorted({p.vendor for p in participants})
     return f"{plural(len(participants), 'participant')} of {', '.join(vendors)}"

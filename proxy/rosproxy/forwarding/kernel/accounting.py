@@ -9,7 +9,7 @@ from rosproxy.forwarding.kernel.nft import Counters, Counts
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
 SILENCE_WINDOW = 2.0
-"""Seconds at least over which it is told whether anything goes back through a port."""
+"""Seconds at least that a port is watched to see whether anything goes back through it."""
 
 
 @dataclass(slots=True)
@@ -30,18 +30,18 @@ class CounterDeltas:
     """What was counted by port, from counters that begin anew when their table is made again."""
 
     def __init__(self) -> None:
-        self._last: Counters = {}
+        self._last_counters: Counters = {}
 
     def take(self, counters: Counters) -> dict[int, Counts]:
         """What has been counted since the last time, by port; ports without anything left out."""
-        grown = {}
-        for port, now in counters.items():
-            before = self._last.get(port, Counts())
-            if any(one < former for one, former in zip(now, before, strict=True)):
-                before = Counts()
-            grown[port] = Counts(*(one - b for one, b in zip(now, before, strict=True)))
-        self._last = counters
-        return {port: more for port, more in grown.items() if any(more)}
+        deltas = {}
+        for port, current in counters.items():
+            previous = self._last_counters.get(port, Counts())
+            if any(c < p for c, p in zip(current, previous, strict=True)):
+                previous = Counts()
+            deltas[port] = Counts(*(c - p for c, p in zip(current, previous, strict=True)))
+        self._last_counters = counters
+        return {port: delta for port, delta in deltas.items() if any(delta)}
 
 
 class UnansweredPorts:
@@ -52,21 +52,21 @@ class UnansweredPorts:
     """
 
     def __init__(self) -> None:
-        self._began = 0.0
+        self._window_start = 0.0
         self._bytes: dict[int, tuple[int, int]] = {}
-        self._before: set[int] = set()
+        self._silent_before: set[int] = set()
 
-    def look(self, grown: Counters, now: float) -> list[int]:
-        """The ports that were silent in two windows in a row, by what was counted of late."""
-        for port, (sent, received, _) in grown.items():
-            out, into = self._bytes.get(port, (0, 0))
-            self._bytes[port] = out + sent, into + received
-        if now - self._began < SILENCE_WINDOW:
+    def look(self, deltas: Counters, now: float) -> list[int]:
+        """The ports silent in two windows in a row; ``deltas`` were counted since the last look."""
+        for port, (sent, received, _) in deltas.items():
+            total_sent, total_received = self._bytes.get(port, (0, 0))
+            self._bytes[port] = total_sent + sent, total_received + received
+        if now - self._window_start < SILENCE_WINDOW:
             return []
         silent = {port for port, (sent, received) in self._bytes.items() if received and not sent}
-        found, self._before = silent & self._before, silent
-        self._began, self._bytes = now, {}
-        return sorted(found)
+        unanswered, self._silent_before = silent & self._silent_before, silent
+        self._window_start, self._bytes = now, {}
+        return sorted(unanswered)
 
 
 class KernelAccounts:
@@ -86,10 +86,10 @@ class KernelAccounts:
 
     def note_owners(self, endpoints: LeaseHolders[LeaseHolder]) -> None:
         """Take in who holds which fast port now."""
-        there = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
-        self.owners = there | {e.fast_port: e for e in endpoints if e.fast_port is not None}
-        known = set(self.owners.values())
-        self._accounts = {e: account for e, account in self._accounts.items() if e in known}
+        remaining = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
+        self.owners = remaining | {e.fast_port: e for e in endpoints if e.fast_port is not None}
+        holders = set(self.owners.values())
+        self._accounts = {e: account for e, account in self._accounts.items() if e in holders}
 
     def owns(self, endpoint: LeaseHolder) -> bool:
         """Whether an endpoint had a fast port when that was last looked at."""
@@ -97,20 +97,20 @@ class KernelAccounts:
 
     def count(self, counters: Counters, now: float) -> list[tuple[str, Counts]]:
         """Take in counters; what was sent and received since the last time, by node name."""
-        passed, self._counted_at = now - self._counted_at, now
+        elapsed, self._counted_at = now - self._counted_at, now
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
-        grown, by_port = [], self._deltas.take(counters)
+        by_name, by_port = [], self._deltas.take(counters)
         self.unanswered = self._silence.look(by_port, now)
-        for port, (back, there, packets) in by_port.items():
+        for port, (from_node, to_node, packets) in by_port.items():
             endpoint = self.owners.get(port)
             outwards = endpoint is not None and not endpoint.inside
-            more = Counts(*((there, back) if outwards else (back, there)), packets)
+            delta = Counts(*((to_node, from_node) if outwards else (from_node, to_node)), packets)
             if endpoint is not None:
-                self._add(endpoint, more, passed)
+                self._add(endpoint, delta, elapsed)
             names = endpoint.caller_ids if endpoint else []
-            grown.append((names[0] if names else "unnamed", more))
-        return grown
+            by_name.append((names[0] if names else "unnamed", delta))
+        return by_name
 
     def note_peers(self, flows: Sequence[Flow]) -> None:
         """Take in all connections that the kernel tracks now.
@@ -118,13 +118,13 @@ class KernelAccounts:
         Those to a node that is down don't count: if its host vanished without a word, the kernel
         takes them for open for days.
         """
-        found: dict[LeaseHolder, list[Flow]] = {endpoint: [] for endpoint in self.owners.values()}
+        by_owner: dict[LeaseHolder, list[Flow]] = {e: [] for e in self.owners.values()}
         for flow in flows:
             owner = self.owners.get(flow.port)
             if owner is not None and not owner.is_down:
-                found[owner].append(flow)
-        for endpoint, mine in found.items():
-            endpoint.fast_peers = conntrack.peers(mine, endpoint.address)
+                by_owner[owner].append(flow)
+        for endpoint, own_flows in by_owner.items():
+            endpoint.fast_peers = conntrack.peers(own_flows, endpoint.address)
 
     def account(self, endpoint: LeaseHolder) -> Account:
         """What went through an endpoint's fast ports so far."""
@@ -134,11 +134,11 @@ class KernelAccounts:
         """The fast ports that connections to an endpoint may go through."""
         return [port for port, owner in self.owners.items() if owner is endpoint]
 
-    def _add(self, endpoint: LeaseHolder, more: Counts, passed: float) -> None:
+    def _add(self, endpoint: LeaseHolder, delta: Counts, elapsed: float) -> None:
         account = self._accounts.setdefault(endpoint, Account())
-        account.sent += more.sent
-        account.received += more.received
-        account.packets += more.packets
-        out, into = account.rates
-        if passed > 0:
-            account.rates = out + more.sent / passed, into + more.received / passed
+        account.sent += delta.sent
+        account.received += delta.received
+        account.packets += delta.packets
+        sent, received = account.rates
+        if elapsed > 0:
+            account.rates = sent + delta.sent / elapsed, received + delta.received / elapsed

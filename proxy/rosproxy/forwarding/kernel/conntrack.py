@@ -33,8 +33,8 @@ class Flow(msgspec.Struct, frozen=True):
 
 def read(text: str, marks: Marks) -> list[Flow]:
     """The connections of one proxy, by its marks. Lines that make no sense are left out."""
-    found = ((one, marks.port(one.mark)) for one in _entries(text) if one.transport == "tcp")
-    return [Flow(one.state, one.peer, port, one.answers) for one, port in found if port is not None]
+    marked = ((e, marks.port(e.mark)) for e in _entries(text) if e.transport == "tcp")
+    return [Flow(e.state, e.peer, port, e.reply_source) for e, port in marked if port is not None]
 
 
 class Astray(NamedTuple):
@@ -51,25 +51,25 @@ class Astray(NamedTuple):
 def astray(text: str, forwards: Forwards, marks: Marks) -> Astray:
     """The ports whose datagrams the kernel leads as it did when their first one came.
 
-    It has noted for each sender where that one went, and asks no rule again, as long as no pause
-    between them is longer than half a minute.
+    It notes where each sender's first datagram went, and asks no rule again, as long as no pause
+    between datagrams is longer than half a minute.
     """
-    found = Astray(set(), set())
-    for one in _entries(text):
-        port = marks.port(one.mark)
-        if one.transport != Transport.UDP:
+    stray = Astray(set(), set())
+    for entry in _entries(text):
+        port = marks.port(entry.mark)
+        if entry.transport != Transport.UDP:
             continue
-        if port is not None and forwards.get(port) != one.answers:
-            found.misled.add(port)
-        elif port is None and one.reached.port in forwards and one.answers == one.reached:
-            found.unled.add(one.reached)
-    return found
+        if port is not None and forwards.get(port) != entry.reply_source:
+            stray.misled.add(port)
+        elif port is None and entry.target.port in forwards and entry.reply_source == entry.target:
+            stray.unled.add(entry.target)
+    return stray
 
 
 def peers(flows: Iterable[Flow], address: str) -> dict[str, int]:
     """How many open connections each peer has with the node at an address; empty: at any."""
-    there = (flow for flow in flows if address in ("", flow.node.host))
-    return dict(Counter(flow.peer.host for flow in there if flow.state == "ESTABLISHED"))
+    matching = (flow for flow in flows if address in ("", flow.node.host))
+    return dict(Counter(flow.peer.host for flow in matching if flow.state == "ESTABLISHED"))
 
 
 class Watch:
@@ -87,13 +87,13 @@ class Watch:
 
 
 class _Entry(NamedTuple):
-    """A line: who sends where, and who answers."""
+    """A line: ``peer`` sends to ``target``, and ``reply_source`` answers."""
 
     transport: str
     state: str
     peer: HostPort
-    reached: HostPort
-    answers: HostPort
+    target: HostPort
+    reply_source: HostPort
     mark: int
 
 
@@ -102,16 +102,16 @@ def _entries(text: str) -> Iterator[_Entry]:
     return filter(None, (_entry(line.split()) for line in text.splitlines()))
 
 
-def _entry(words: list[str]) -> _Entry | None:
-    said: defaultdict[str, list[str]] = defaultdict(list)
-    for key, equals, value in (word.partition("=") for word in words):
+def _entry(fields: list[str]) -> _Entry | None:
+    values: defaultdict[str, list[str]] = defaultdict(list)
+    for key, equals, value in (field.partition("=") for field in fields):
         if equals:
-            said[key].append(value)
-    state = next((word for word in words[1:] if word.isupper() and word[0].isalpha()), "")
+            values[key].append(value)
+    state = next((field for field in fields[1:] if field.isupper() and field[0].isalpha()), "")
     try:
-        mark = int(said["mark"][0])
-        peer, answers = (HostPort(said["src"][i], int(said["sport"][i])) for i in range(2))
-        reached = HostPort(said["dst"][0], int(said["dport"][0]))
+        mark = int(values["mark"][0])
+        peer, reply_source = (HostPort(values["src"][i], int(values["sport"][i])) for i in range(2))
+        target = HostPort(values["dst"][0], int(values["dport"][0]))
     except (IndexError, ValueError):
         return None
-    return _Entry(words[0], state, peer, reached, answers, mark)
+    return _Entry(fields[0], state, peer, target, reply_source, mark)

@@ -50,26 +50,28 @@ def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
     return HostPort(address, next(iter(ports)))
 
 
-def kept(now: Forwards, endpoints: Iterable[LeaseHolder], recovered: bool) -> dict[int, HostPort]:
+def kept(
+    current: Forwards, endpoints: Iterable[LeaseHolder], recovered: bool
+) -> dict[int, HostPort]:
     """The forwards from before a restart that nothing is known against yet.
 
     Until the registry is rebuilt these are all; after that those of endpoints whose node has not
     been heard yet, if they lead to the address where it is looked for.
     """
     if not recovered:
-        return dict(now)
+        return dict(current)
     waiting = {e.fast_port: e.address for e in endpoints if not e.trusted and e.fast_port}
-    return {port: where for port, where in now.items() if waiting.get(port) == where.host}
+    return {port: target for port, target in current.items() if waiting.get(port) == target.host}
 
 
 def unchanged(
-    now: Forwards, owners: Mapping[int, LeaseHolder], changed: Collection[LeaseHolder]
+    current: Forwards, owners: Mapping[int, LeaseHolder], changed: Collection[LeaseHolder]
 ) -> dict[int, HostPort]:
     """The forwards of all endpoints that still have them, without those that have changed."""
-    found = ((port, where, owners.get(port)) for port, where in now.items())
+    owned = ((port, target, owners.get(port)) for port, target in current.items())
     return {
-        port: where
-        for port, where, owner in found
+        port: target
+        for port, target, owner in owned
         if owner is not None and owner.fast_port == port and owner not in changed
     }
 
@@ -85,15 +87,15 @@ class Changes(msgspec.Struct, frozen=True):
         return bool(self.removed or self.added)
 
 
-def changes(now: Forwards, wanted: Forwards) -> Changes:
-    """What makes ``now`` what is ``wanted``."""
-    return Changes(_besides(now, wanted), _besides(wanted, now))
+def changes(current: Forwards, wanted: Forwards) -> Changes:
+    """What turns the ``current`` forwards into those that are ``wanted``."""
+    return Changes(_difference(current, wanted), _difference(wanted, current))
 
 
-def _besides(these: Forwards, others: Forwards) -> dict[int, HostPort]:
-    """What is not also among the others; identity first, since nearly all of a thousand is."""
-    pairs = ((port, where, others.get(port)) for port, where in these.items())
-    return {port: where for port, where, other in pairs if where is not other and where != other}
+def _difference(forwards: Forwards, subtracted: Forwards) -> dict[int, HostPort]:
+    """The forwards that are not in ``subtracted``; identity first: nearly all of them are."""
+    triples = ((p, t, subtracted.get(p)) for p, t in forwards.items())
+    return {p: t for p, t, s in triples if t is not s and t != s}
 
 
 class Pauses:
@@ -102,15 +104,15 @@ class Pauses:
     def __init__(self) -> None:
         self._until: dict[tuple[int, HostPort], tuple[float, float, str]] = {}
 
-    def note(self, port: int, where: HostPort, why: str, now: float) -> None:
+    def note(self, port: int, target: HostPort, why: str, now: float) -> None:
         """Note that a forward failed at a time; for longer each time."""
-        _, pause, _ = self._until.get((port, where), (0.0, FIRST_PAUSE / 2, ""))
+        _, pause, _ = self._until.get((port, target), (0.0, FIRST_PAUSE / 2, ""))
         pause = min(2 * pause, LONGEST_PAUSE)
-        self._until[port, where] = now + pause, pause, why
+        self._until[port, target] = now + pause, pause, why
 
-    def why(self, port: int, where: HostPort, now: float) -> str | None:
+    def why(self, port: int, target: HostPort, now: float) -> str | None:
         """Why a forward is not made now; None if it may be."""
-        until, _, why = self._until.get((port, where), (now, 0.0, ""))
+        until, _, why = self._until.get((port, target), (now, 0.0, ""))
         return why if now < until else None
 
     def keep(self, ports: Collection[int]) -> None:

@@ -41,7 +41,7 @@ class Transport(StrEnum):
 
 
 class Counts(NamedTuple):
-    """Bytes of IP packets from the node to who has connected to it, and back; the latter's packets.
+    """Bytes of IP packets from the node to its peers, and back; the number of packets back.
 
     A packet of UDP is a datagram.
     """
@@ -57,7 +57,7 @@ Counters = Mapping[int, Counts]
 _MAPS = ("marks", "hosts4", "hosts6", "ports")
 _SETS = ("sent", "received")
 _NOTHING = 0, 0
-_MADE = Template("""\
+_TABLE_DOCUMENT = Template("""\
 add table inet $name
 delete table inet $name
 table inet $name {
@@ -92,7 +92,7 @@ $reset
 }
 """)
 _RESET = "    ct direction original ct mark @cut reject with tcp reset"
-_ENDED = Template("""\
+_END_DOCUMENT = Template("""\
 flush map inet $name marks
 flush map inet $name hosts4
 flush map inet $name hosts6
@@ -127,11 +127,11 @@ class Marks(msgspec.Struct, frozen=True):
 
     @property
     def all(self) -> str:
-        """All of them, as conntrack's ``--mark`` takes it."""
+        """All marks of the table, as conntrack's ``--mark`` takes it."""
         return f"{self.of(0):#x}/0xffff0000"
 
     def one(self, port: int) -> str:
-        """One of them, as conntrack's ``--mark`` takes it."""
+        """The mark of one port, as conntrack's ``--mark`` takes it."""
         return f"{self.of(port):#x}/0xffffffff"
 
 
@@ -153,27 +153,27 @@ class Table:
         return self.transport is Transport.TCP
 
     def made(self, forwards: Forwards, counted: Collection[int] = (), near: Near = ()) -> str:
-        """The whole table, in place of one that may be there.
+        """The document that makes the whole table, in place of one that may be there.
 
         ``counted`` are further ports whose connections are counted, though no new ones come.
         """
         reset = _RESET if self.has_connections else ""
-        made = _MADE.substitute(name=self.name, transport=self.transport, reset=reset)
-        made += self._near("add", near)
-        return made + self._counting({*counted, *forwards}) + self._forwarding("add", forwards)
+        document = _TABLE_DOCUMENT.substitute(name=self.name, transport=self.transport, reset=reset)
+        document += self._near("add", near)
+        return document + self._counting({*counted, *forwards}) + self._forwarding("add", forwards)
 
     def opened(self, near: Near) -> str:
-        """Others that may use the fast ports of nodes outside from now on."""
+        """The document that replaces those who may use the fast ports of nodes outside."""
         flushed = (f"flush set inet {self.name} {name}\n" for name in ("near4", "near6"))
         return "".join(flushed) + self._near("add", near)
 
     def changed(self, change: Changes) -> str:
-        """Forwards taken out and put in."""
+        """The document that takes forwards out and puts others in."""
         removed = self._forwarding("delete", change.removed)
         return removed + self._counting(change.added) + self._forwarding("add", change.added)
 
     def cut(self, ports: Collection[int], verb: str = "add") -> str:
-        """Whoever sends something to a node through these ports gets a reset; or no more."""
+        """Whoever sends to a node through these ports gets a reset; with verb "delete" no more."""
         return self._elements(verb, "cut", [str(self.marks.of(port)) for port in sorted(ports)])
 
     def ended(self) -> str:
@@ -181,10 +181,10 @@ class Table:
 
         Some clients (rospy) try again only when they see their connection end.
         """
-        return _ENDED.substitute(name=self.name)
+        return _END_DOCUMENT.substitute(name=self.name)
 
     def removed(self) -> str:
-        """No table."""
+        """The document that deletes the table."""
         return f"delete table inet {self.name}\n"
 
     def read(self, text: str) -> TableState:
@@ -206,29 +206,29 @@ class Table:
             and parse_address(str(host))
             and marks.get(port) == self.marks.of(port)
         }
-        out, into = _counted(elements["sent"]), _counted(elements["received"])
-        counted = {mark: self.marks.port(mark) for mark in out | into}
+        sent, received = _counted(elements["sent"]), _counted(elements["received"])
+        port_by_mark = {mark: self.marks.port(mark) for mark in sent | received}
         counters = {
-            port: Counts(out.get(mark, _NOTHING)[0], *into.get(mark, _NOTHING))
-            for mark, port in counted.items()
+            port: Counts(sent.get(mark, _NOTHING)[0], *received.get(mark, _NOTHING))
+            for mark, port in port_by_mark.items()
             if port is not None
         }
         return TableState(forwards, counters)
 
     def _forwarding(self, verb: str, forwards: Forwards) -> str:
-        pairs: dict[str, list[str]] = {name: [] for name in _MAPS}
-        for port, where in forwards.items():
-            # A host that is no address, which can't be, makes no sense to nft: it refuses all.
-            host = where.host if is_address(where.host) and "%" not in where.host else "?"
-            pairs["marks"].append(f"{port} : {self.marks.of(port)}")
-            pairs["hosts6" if ":" in host else "hosts4"].append(f"{port} : {host}")
-            pairs["ports"].append(f"{port} : {where.port}")
-        pairs["inward"] = [str(port) for port in forwards if port not in self._leases]
-        return "".join(self._elements(verb, name, held) for name, held in pairs.items() if held)
+        by_name: dict[str, list[str]] = {name: [] for name in _MAPS}
+        for port, target in forwards.items():
+            # No host should be other than an address: for "?" nft refuses the whole document.
+            host = target.host if is_address(target.host) and "%" not in target.host else "?"
+            by_name["marks"].append(f"{port} : {self.marks.of(port)}")
+            by_name["hosts6" if ":" in host else "hosts4"].append(f"{port} : {host}")
+            by_name["ports"].append(f"{port} : {target.port}")
+        by_name["inward"] = [str(port) for port in forwards if port not in self._leases]
+        return "".join(self._elements(verb, name, e) for name, e in by_name.items() if e)
 
     def _near(self, verb: str, near: Near) -> str:
-        by_set = {f"near{v}": [str(one) for one in near if one.version == v] for v in (4, 6)}
-        return "".join(self._elements(verb, name, held) for name, held in by_set.items() if held)
+        by_set = {f"near{v}": [str(n) for n in near if n.version == v] for v in (4, 6)}
+        return "".join(self._elements(verb, name, e) for name, e in by_set.items() if e)
 
     def _counting(self, ports: Iterable[int]) -> str:
         marks = [str(self.marks.of(port)) for port in sorted(ports)]
@@ -253,10 +253,10 @@ def dropping_chains(text: str) -> list[str]:
 def _objects(text: str, kind: str) -> list[dict[str, Json]]:
     try:
         listed = json.loads(text)["nftables"]
-        found = [item[kind] for item in listed if kind in item]
+        bodies = [item[kind] for item in listed if kind in item]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise NftError(f"nft printed {text[:200]!r}: {error}") from None
-    return [body for body in found if isinstance(body, dict)]
+    return [body for body in bodies if isinstance(body, dict)]
 
 
 def _pairs(elements: Json) -> dict[int, Json]:

@@ -1,10 +1,10 @@
 """What the kernel forwards, as the rest of the proxy sees it: started, asked, looked at.
 
 An endpoint's *fast port* (`rosproxy.leases.fast_ports`) is what the kernel may forward straight to
-the node's TCPROS port; for ROS 2 a lease's own port, straight to a participant's locator. `policy`
-decides where to, `syncer` keeps the kernel's `table` so, and `accounting` tells what went through
-it. It is an acceleration only: whatever the kernel does not forward arrives at the socket of the
-same port, and is relayed.
+the node's TCPROS port; for ROS 2 a lease's own port, straight to a participant's locator. Where to
+is up to `decisions`, `syncer` keeps the kernel's `table` so, and `accounting` tells what went
+through it. It is an acceleration only: whatever the kernel does not forward arrives at the socket
+of the same port, and is relayed.
 
 There is a plane for TCP and one for UDP, alike but for this: nobody answers a datagram. So nothing
 tells that a filter on the way drops what is forwarded, and nobody has to be told of an end.
@@ -61,9 +61,9 @@ class KernelPlane:
         self.syncer = ForwardSyncer(endpoints, table, self._accounts, problems, clock, near)
         self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
         self.traffic, self.total = Traffic(), Counts()
-        self._wanted = settings.data_plane in ("auto", "kernel")
-        connections = table.table.has_connections
-        copies = settings.data_plane == "copy" or not hasattr(os, "splice") or not connections
+        self._is_wanted = settings.data_plane in ("auto", "kernel")
+        has_connections = table.table.has_connections
+        copies = settings.data_plane == "copy" or not hasattr(os, "splice") or not has_connections
         self.user_plane = "copy" if copies else "splice"
 
     async def start(self) -> None:
@@ -74,7 +74,7 @@ class KernelPlane:
         """
         mode = self._settings.data_plane
         self.syncer.look_around()
-        if not self._wanted:
+        if not self._is_wanted:
             self.syncer.why_not = f"{OPTION} {mode}"
             return
         if why := await why_not(mode, self._table.tools):
@@ -91,10 +91,10 @@ class KernelPlane:
 
         To be called when no task runs any more.
         """
-        was = self.syncer.usable
+        was_usable = self.syncer.usable
         self.syncer.why_not = "the proxy has stopped"
         await self._table.tools.settled()
-        if was:
+        if was_usable:
             await self._table.remove()
 
     @property
@@ -107,7 +107,7 @@ class KernelPlane:
 
         Also where the kernel may not forward now: subscribers may be connected to them.
         """
-        if self._wanted:
+        if self._is_wanted:
             for endpoint in endpoints:
                 fast_ports.claim(self.holders.pool, endpoint)
         self.syncer.recovered = True
@@ -153,13 +153,13 @@ class KernelPlane:
         }
 
     async def _look(self) -> None:
-        seen = await self.syncer.read_kernel()
-        if seen is None:
+        reading = await self.syncer.read_kernel()
+        if reading is None:
             return
-        counters, flows = seen
-        for name, more in self._accounts.count(counters, self._clock()):
-            self.traffic.add("node", name, more.sent, more.received)
-            self.total = Counts(*map(sum, zip(self.total, more, strict=True)))
+        counters, flows = reading
+        for name, delta in self._accounts.count(counters, self._clock()):
+            self.traffic.add("node", name, delta.sent, delta.received)
+            self.total = Counts(*map(sum, zip(self.total, delta, strict=True)))
         if not self._table.table.has_connections:
             return
         self._accounts.note_peers(flows)
@@ -169,13 +169,13 @@ class KernelPlane:
         )
 
     def _report(self) -> None:
-        plane, why, what = self.user_plane, self.syncer.why_not, self.syncer.what
-        if why is None:
-            log.info("the kernel forwards %s: nftables table %s", what, self._table.table.name)
+        plane, reason, traffic = self.user_plane, self.syncer.why_not, self.syncer.what
+        if reason is None:
+            log.info("the kernel forwards %s: nftables table %s", traffic, self._table.table.name)
             self._problems.solved(self.syncer.subject)
         elif self._settings.data_plane == "kernel":
-            text = f"the kernel forwards no {what}, the proxy does ({plane}): {why}"
+            text = f"the kernel forwards no {traffic}, the proxy does ({plane}): {reason}"
             log.error("%s kernel: %s", OPTION, text)
             self._problems.add(self.syncer.subject, text)
         else:
-            log.info("the proxy forwards %s (%s), not the kernel: %s", what, plane, why)
+            log.info("the proxy forwards %s (%s), not the kernel: %s", traffic, plane, reason)

@@ -65,10 +65,10 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
 def _hardware() -> str | None:
     """A network interface that is a device: containers have only virtual ones."""
     try:
-        names = sorted(_INTERFACES.iterdir())
+        interfaces = sorted(_INTERFACES.iterdir())
     except OSError:
         return None
-    return next((path.name for path in names if (path / "device").exists()), None)
+    return next((path.name for path in interfaces if (path / "device").exists()), None)
 
 
 def _read(path: Path) -> str:

@@ -5,7 +5,7 @@ at a time (`run_once`) compares what is wanted with what the kernel has, and cha
 transaction. All endpoints are gone through every few seconds; in between only those that changed,
 so that a thousand that come one by one don't make a million.
 
-Where an endpoint may be forwarded to is decided in `policy`. What that depends on is kept here:
+Where an endpoint may be forwarded to is decided in `decisions`. What that depends on is kept here:
 what this network namespace forwards, which addresses are the proxy's own, forwards that failed of
 late, and why the kernel may forward nothing at all (``why_not``). That is changed by `begin`, by a
 table that can't be made any more, by `plane` when it starts and stops, and by nobody else.
@@ -67,16 +67,16 @@ class ForwardSyncer:
     ) -> None:
         self._endpoints, self._table, self._accounts = endpoints, table, accounts
         self._problems, self._clock, self._near = problems, clock, near
-        self._lock, self._wake, self._done = asyncio.Lock(), asyncio.Event(), asyncio.Event()
+        self._lock, self._wake, self._synced = asyncio.Lock(), asyncio.Event(), asyncio.Event()
         self._changed: set[LeaseHolder] = set()
-        self._all = True
+        self._all_changed = True
         self._host, self._pauses = HostForwarding(), decisions.Pauses()
         self._own: dict[str, bool] = {}
         self._own_until, self._retry_at = 0.0, float("inf")
         self._logged: dict[LeaseHolder, str] = {}
-        connections = table.table.has_connections
-        self.what = "topics" if connections else "datagrams"
-        self.subject = OPTION if connections else f"{OPTION} for UDP"
+        has_connections = table.table.has_connections
+        self.what = "topics" if has_connections else "datagrams"
+        self.subject = OPTION if has_connections else f"{OPTION} for UDP"
         self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
 
@@ -104,9 +104,9 @@ class ForwardSyncer:
         return self.usable
 
     def look_around(self) -> None:
-        """Take in who is left, what this network namespace forwards, at times its addresses."""
-        there = set(self._endpoints)
-        self._logged = {e: why for e, why in self._logged.items() if e in there}
+        """Take in which endpoints there are, what is forwarded here, at times own addresses."""
+        endpoints = set(self._endpoints)
+        self._logged = {e: why for e, why in self._logged.items() if e in endpoints}
         self._host = read_forwarding()
         if self._clock() > self._own_until:
             self._own, self._own_until = {}, self._clock() + OWN_TTL
@@ -114,7 +114,7 @@ class ForwardSyncer:
     def note_change(self, endpoint: LeaseHolder | None = None) -> None:
         """Note that an endpoint has changed, or any."""
         if endpoint is None or not self.usable:
-            self._all = True
+            self._all_changed = True
         elif endpoint.fast_port is None and not self._accounts.owns(endpoint):
             return  # nothing of it is forwarded, nor may be
         else:
@@ -132,13 +132,13 @@ class ForwardSyncer:
 
     def reason(self, endpoint: LeaseHolder) -> str:
         """Why an endpoint's topics are not forwarded by the kernel; nothing if they are."""
-        where = self._target(endpoint)
-        if isinstance(where, str):
-            return where
+        target = self._target(endpoint)
+        if isinstance(target, str):
+            return target
         if endpoint.fast_port is None:
             return fast_ports.why_none(self._endpoints.pool, endpoint)
-        made = self._table.forwards.get(endpoint.fast_port) == where
-        return "" if made else "about to be forwarded"
+        is_forwarded = self._table.forwards.get(endpoint.fast_port) == target
+        return "" if is_forwarded else "about to be forwarded"
 
     def log_reason(self, endpoint: LeaseHolder) -> None:
         """Log why an endpoint's topics are not forwarded, if that has not been said yet."""
@@ -151,8 +151,8 @@ class ForwardSyncer:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
 
         def leads() -> bool:
-            where, port = HostPort(endpoint.address, tcpros_port), endpoint.fast_port
-            return self.usable and port is not None and self._table.forwards.get(port) == where
+            target, port = HostPort(endpoint.address, tcpros_port), endpoint.fast_port
+            return self.usable and port is not None and self._table.forwards.get(port) == target
 
         if not leads():
             self.note_change(endpoint)
@@ -172,19 +172,19 @@ class ForwardSyncer:
                 return await self._table.look(ipv6)
             except (ToolError, NftError) as error:
                 log.warning("%s; making the table again", error)
-                self._all = True
+                self._all_changed = True
                 await self._make(self._wanted())
         return None
 
     async def take_back(self, ports: Collection[int]) -> None:
         """Let user space serve the connections through ports behind which no node answers."""
         for port in ports:
-            where = self._table.forwards.get(port)
-            if where is not None:
-                why = f"nothing came back from the node at {where} through the kernel"
-                self._pauses.note(port, where, why, self._clock())
+            target = self._table.forwards.get(port)
+            if target is not None:
+                why = f"nothing came back from the node at {target} through the kernel"
+                self._pauses.note(port, target, why, self._clock())
         if ports:
-            self._all = True
+            self._all_changed = True
             await self._sync()
             families = itertools.product(ports, (False, True))
             await self._table.forget(families, "SYN_SENT")
@@ -202,17 +202,17 @@ class ForwardSyncer:
         if address not in self._own:
             self._own[address] = address_towards(address) == address
         own = {address} if self._own[address] else ()
-        where = decisions.destination(endpoint, replace(self._host, own=own))
-        if isinstance(where, str) or endpoint.fast_port is None:
-            return where
-        return self._pauses.why(endpoint.fast_port, where, self._clock()) or where
+        target = decisions.destination(endpoint, replace(self._host, own=own))
+        if isinstance(target, str) or endpoint.fast_port is None:
+            return target
+        return self._pauses.why(endpoint.fast_port, target, self._clock()) or target
 
-    async def _wait_until(self, is_so: Callable[[], bool]) -> None:
-        """Wait a moment for the worker, which may make something so."""
+    async def _wait_until(self, condition: Callable[[], bool]) -> None:
+        """Wait a moment for the worker to make a condition true."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SYNC_PATIENCE):
-                while not is_so():
-                    await self._done.wait()
+                while not condition():
+                    await self._synced.wait()
 
     async def _sync(self) -> None:
         async with self._lock:
@@ -221,8 +221,8 @@ class ForwardSyncer:
             self._pauses.keep(self._accounts.owners)
             if self.usable:
                 await self._change()
-            done, self._done = self._done, asyncio.Event()
-            done.set()
+            synced, self._synced = self._synced, asyncio.Event()
+            synced.set()
 
     async def _change(self) -> None:
         wanted = self._wanted()
@@ -236,7 +236,7 @@ class ForwardSyncer:
         try:
             await self._table.make(wanted)
         except ToolError as error:
-            self._all, self.why_not = True, str(error)
+            self._all_changed, self.why_not = True, str(error)
             self._retry_at = self._clock() + RETRY_LOST
             self._accounts.note_peers([])
             text = f"{self.what} are no longer forwarded by the kernel: {error}"
@@ -244,27 +244,27 @@ class ForwardSyncer:
             self._problems.add(self.subject, text)
 
     def _wanted(self) -> dict[int, HostPort]:
-        now = self._table.forwards
+        current = self._table.forwards
         changed, self._changed = self._changed, set()
-        if self._all or not self.recovered:
-            self._all, changed = False, set(self._endpoints)
-            wanted = decisions.kept(now, changed, self.recovered)
+        if self._all_changed or not self.recovered:
+            self._all_changed, changed = False, set(self._endpoints)
+            wanted = decisions.kept(current, changed, self.recovered)
         else:
-            wanted = decisions.unchanged(now, self._accounts.owners, changed)
+            wanted = decisions.unchanged(current, self._accounts.owners, changed)
         by_port = self._endpoints.by_port
         for endpoint in changed:
             if endpoint.fast_port and by_port.get(endpoint.port) is endpoint:
-                where = self._target(endpoint)
-                if isinstance(where, HostPort):
-                    wanted[endpoint.fast_port] = where
+                target = self._target(endpoint)
+                if isinstance(target, HostPort):
+                    wanted[endpoint.fast_port] = target
         return wanted
 
     def _log(self, change: Changes) -> None:
         for port in {**change.removed, **change.added}:
-            endpoint, where = self._accounts.owners.get(port), change.added.get(port)
+            endpoint, target = self._accounts.owners.get(port), change.added.get(port)
             name = endpoint.label if endpoint else "a node that is gone"
-            if where:
-                log.info("%s: the kernel forwards port %d to %s", name, port, where)
+            if target:
+                log.info("%s: the kernel forwards port %d to %s", name, port, target)
             else:
                 why = self.reason(endpoint) if endpoint else "its endpoint has ended"
                 log.info("%s: the kernel no longer forwards port %d: %s", name, port, why)

@@ -12,7 +12,7 @@ from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Table, Tabl
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from rosproxy.net.interfaces import address_towards
 
-ENDING = 0.3
+RESET_TIME = 0.3
 """Seconds for which connections are reset before the kernel forgets them."""
 
 log = logging.getLogger(__name__)
@@ -37,13 +37,13 @@ class KernelTable:
         Connections under way go on: the kernel has noted for each of them where it leads.
         """
         try:
-            before = await self._read()
+            former = await self._read()
         except (ToolError, NftError) as error:
             log.debug("no table of a former process: %s", error)
-            before = TableState()
-        self.counted = set(before.counters)
+            former = TableState()
+        self.counted = set(former.counters)
         await self._list_flows(False, "--mark", self.table.marks.all)
-        await self.make(before.forwards)
+        await self.make(former.forwards)
 
     async def make(self, wanted: Forwards) -> None:
         """Put the whole table in place of the one that may be there. Raises ToolError."""
@@ -67,16 +67,16 @@ class KernelTable:
         state, marks = await self._read(), self.table.marks
         self.forwards = state.forwards
         if not self.table.has_connections:
-            await self._put_right(ipv6)
+            await self._forget_stray(ipv6)
             return state.counters, []
         text = await self._list_flows(ipv6, "--mark", marks.all)
         return state.counters, conntrack.read(text, marks)
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
         """Forget connections through ports, each of IPv6 or not; those of one state if given."""
-        more = ("--state", state) if state else ()
+        state_options = ("--state", state) if state else ()
         for port, ipv6 in ports:
-            await self._forget(ipv6, "--mark", self.table.marks.one(port), *more)
+            await self._forget(ipv6, "--mark", self.table.marks.one(port), *state_options)
 
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
         """End the connections through ports, each of IPv6 or not, so that both ends learn of it.
@@ -88,7 +88,7 @@ class KernelTable:
         numbers = {port for port, _ in ports}
         try:
             await self.tools.nft("-f", "-", document=self.table.cut(numbers))
-            await asyncio.sleep(ENDING)
+            await asyncio.sleep(RESET_TIME)
             await self.forget(ports)
             await self.tools.nft("-f", "-", document=self.table.cut(numbers, "delete"))
         except ToolError as error:
@@ -99,7 +99,7 @@ class KernelTable:
         try:
             if self.forwards and self.table.has_connections:
                 await self.tools.nft("-f", "-", document=self.table.ended())
-                await asyncio.sleep(ENDING)
+                await asyncio.sleep(RESET_TIME)
             await self.tools.nft("-f", "-", document=self.table.removed())
         except ToolError as error:
             log.warning("table %s can't be removed: %s", self.table.name, error)
@@ -109,35 +109,35 @@ class KernelTable:
 
     async def _apply(self, document: str, forwards: Forwards) -> None:
         await self.tools.nft("-f", "-", document=document)
-        hosts = {where.host for where in (*self.forwards.values(), *forwards.values())}
+        hosts = {target.host for target in (*self.forwards.values(), *forwards.values())}
         self.forwards = dict(forwards)
         self.counted |= set(forwards)
         if not self.table.has_connections:
-            await self._put_right(any(":" in host for host in hosts))
+            await self._forget_stray(any(":" in host for host in hosts))
 
-    async def _put_right(self, ipv6: bool) -> None:
-        """Have all datagrams go by the rules that there are now. Raises ToolError."""
+    async def _forget_stray(self, ipv6: bool) -> None:
+        """Forget where stray datagrams go, so that they go by the rules. Raises ToolError."""
         text = await self._list_flows(ipv6)
         unled, misled = conntrack.astray(text, self.forwards, self.table.marks)
-        for at in unled:
-            if address_towards(at.host) == at.host:
-                port = str(at.port)
-                which = "--orig-dst", at.host, "--orig-port-dst", port, "--reply-port-src", port
-                await self._forget(":" in at.host, *which)
+        for dst in unled:
+            if address_towards(dst.host) == dst.host:
+                port = str(dst.port)
+                args = "--orig-dst", dst.host, "--orig-port-dst", port, "--reply-port-src", port
+                await self._forget(":" in dst.host, *args)
         await self.forget((port, six) for port in misled for six in {False, ipv6})
 
-    async def _list_flows(self, ipv6: bool, *which: str) -> str:
+    async def _list_flows(self, ipv6: bool, *options: str) -> str:
         """The connections of IPv4 and maybe IPv6, as conntrack prints them. Raises ToolError."""
         families, transport = (False, True) if ipv6 else (False,), self.table.transport
-        texts = [await self.tools.list_flows(transport, family, *which) for family in families]
+        texts = [await self.tools.list_flows(transport, family, *options) for family in families]
         return "".join(texts)
 
     async def _read(self) -> TableState:
         listed = await self.tools.nft("-j", "list", "table", "inet", self.table.name)
         return self.table.read(listed)
 
-    async def _forget(self, ipv6: bool, *which: str) -> None:
+    async def _forget(self, ipv6: bool, *options: str) -> None:
         try:
-            await self.tools.forget_flows(self.table.transport, ipv6, *which)
+            await self.tools.forget_flows(self.table.transport, ipv6, *options)
         except ToolError as error:
             log.warning("connections can't be ended: %s", error)

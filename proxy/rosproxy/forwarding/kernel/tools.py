@@ -38,25 +38,25 @@ class Tools:
         if self._running:
             await asyncio.wait(self._running)
 
-    async def nft(self, *words: str, document: str = "") -> str:
+    async def nft(self, *arguments: str, document: str = "") -> str:
         """Run nft, with a document on its standard input; what it prints. Raises ToolError."""
-        return await self._run("nft", *words, document=document)
+        return await self._run("nft", *arguments, document=document)
 
-    async def list_flows(self, transport: str, ipv6: bool, *which: str) -> str:
-        """The tracked connections of TCP, or of UDP: all, or which. Raises ToolError."""
-        return await self._run("conntrack", "-L", *_selection(transport, ipv6), *which)
+    async def list_flows(self, transport: str, ipv6: bool, *options: str) -> str:
+        """The tracked connections of TCP or UDP: all, or as options select. Raises ToolError."""
+        return await self._run("conntrack", "-L", *_selection(transport, ipv6), *options)
 
-    async def forget_flows(self, transport: str, ipv6: bool, *which: str) -> None:
+    async def forget_flows(self, transport: str, ipv6: bool, *options: str) -> None:
         """Delete the same. Raises ToolError."""
         try:
-            await self._run("conntrack", "-D", *_selection(transport, ipv6), *which)
+            await self._run("conntrack", "-D", *_selection(transport, ipv6), *options)
         except ToolError as error:
             if "0 flow entries" not in str(error):
                 raise
 
-    async def _run(self, name: str, *words: str, document: str = "") -> str:
+    async def _run(self, name: str, *arguments: str, document: str = "") -> str:
         loop = asyncio.get_running_loop()
-        run = loop.run_in_executor(None, _run, [_find(name), *words], document)
+        run = loop.run_in_executor(None, _run, [_find(name), *arguments], document)
         self._running.add(run)
         run.add_done_callback(self._ended)
         await asyncio.wait({run})
@@ -84,7 +84,7 @@ def _find(name: str) -> str:
 
 def _run(command: list[str], document: str) -> str:
     try:
-        done = subprocess.run(  # noqa: S603 - a program found by its own name, no shell
+        completed = subprocess.run(  # noqa: S603 - a program found by its own name, no shell
             command,
             input=document,
             capture_output=True,
@@ -100,8 +100,8 @@ def _run(command: list[str], document: str) -> str:
         raise ToolError(f"{command[0]} may not run ({error.strerror}): {REMEDY}") from None
     except OSError as error:
         raise ToolError(f"{command[0]} can't run: {error.strerror}") from None
-    if done.returncode != 0:
-        said = " ".join(done.stderr.split())[:300]
-        refused = "not permitted" in said or "you must be root" in said
-        raise ToolError(f"{command[0]}: {said}" + (f": {REMEDY}" if refused else ""))
-    return done.stdout
+    if completed.returncode != 0:
+        message = " ".join(completed.stderr.split())[:300]
+        is_refused = "not permitted" in message or "you must be root" in message
+        raise ToolError(f"{command[0]}: {message}" + (f": {REMEDY}" if is_refused else ""))
+    return completed.stdout

@@ -68,8 +68,8 @@ class MasterApi:
         self._refuse_loop(call)
         caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics, upstream = self._context.metrics, self._context.upstream
-        judged = self._access.judges_parameters(call.source)
-        if not judged and await _is_long_and_passes(call.body):
+        judges_params = self._access.judges_parameters(call.source)
+        if not judges_params and await _is_long_and_passes(call.body):
             return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
         try:
             request = master_calls.read_request(call.body, caller, self._context.master_call)
@@ -87,20 +87,20 @@ class MasterApi:
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
-        denied = self._access.judge_long(long_call.method, call.body, call.source)
-        if denied is not None:
+        local_reply = self._access.judge_long(long_call.method, call.body, call.source)
+        if local_reply is not None:
             self._context.metrics.count("master", long_call.method, "refused")
-            return xmlrpc.dump_reply(denied.triple())
+            return xmlrpc.dump_reply(local_reply.triple())
         reply = self._context.upstream.pass_to_master(long_call)
         return await counted(self._context.metrics, "master", long_call.method, reply)
 
     def _refuse_loop(self, call: IncomingCall) -> None:
         """Refuse a call that the proxy itself has made. Raises XmlRpcError."""
         if call.comes_from(self._context.instance):
-            what = "a node's address"
+            name = "a node's address"
             if call.loop_id == self._context.instance:
-                what = f"--master-uri {self._context.settings.master_uri}"
-            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
+                name = f"--master-uri {self._context.settings.master_uri}"
+            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{name} leads back to the proxy itself")
 
     async def _answer(self, request: Request, call: IncomingCall) -> bytes | LongReply:
         """The reply to a request that was read; what needs no change passes untouched."""
@@ -115,7 +115,7 @@ class MasterApi:
     async def _rewrite(
         self, request: Request, replies: Sequence[LocalReply | None], call: IncomingCall
     ) -> bytes:
-        """Admit, export, call the master, note, import."""
+        """Admit nodes, export URIs, call the master, note what it accepted, import its URIs."""
         addressing, version = self._context.addressing, self._context.policy.version
         async with self._admitted(request, replies, call) as admitted:
             admissions = self._judge_registrations(request, admitted)
@@ -140,7 +140,7 @@ class MasterApi:
         """The admissions, with the proxy's own replies to what the master does not get."""
         judge, now = self._access.judge_registration, self._context.now()
         pairs = zip(request.calls, admissions, strict=True)
-        return [judge(call, one, request.caller, now) if call else one for call, one in pairs]
+        return [judge(c, outcome, request.caller, now) if c else outcome for c, outcome in pairs]
 
     @asynccontextmanager
     async def _admitted(
@@ -183,39 +183,41 @@ class MasterApi:
 
     def _refuse(self, reason: str, call: Call, caller: Caller, text: str) -> Refusal:
         """Refuse a call that is over a bound, and tell of it."""
-        what = f"{call.method} of {caller.caller_id}: {text}"
-        self._context.refusals.note(reason, caller.address, what)
+        description = f"{call.method} of {caller.caller_id}: {text}"
+        self._context.refusals.note(reason, caller.address, description)
         return Refusal(f"rosproxy: {text}")
 
     def _note(self, facts: Iterable[RegistryChange], source: str) -> None:
-        """Take in what the master accepted, and what it is not told.
+        """Note what the master has accepted, and what the policy keeps from it.
 
         A service's port is believed only from the node's own address: anybody may register a
         service in another node's name, and its port would be opened to outside.
         """
         registry = self._context.registry
         for fact in facts:
-            held = fact.registration
+            registration = fact.registration
             if fact.endpoint is None:
-                registry.unregister(held.kind, held.name, held.caller_id)
+                registry.unregister(registration.kind, registration.name, registration.caller_id)
             elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
                 own = source == fact.endpoint.location.address
-                held = self._as_known(fact.endpoint, held)
-                registry.register(fact.endpoint, held if own else replace(held, service_api=None))
-            self._publisher_updates.note(held)
+                registration = self._keep_shown(fact.endpoint, registration)
+                registry.register(
+                    fact.endpoint, registration if own else replace(registration, service_api=None)
+                )
+            self._publisher_updates.note(registration)
 
-    def _as_known(self, endpoint: Endpoint, held: Registration) -> Registration:
-        """A registration to note; one that is hidden from now on is shown until it is taken back.
+    def _keep_shown(self, endpoint: Endpoint, registration: Registration) -> Registration:
+        """A registration to note: one that the master has stays shown until it is taken back.
 
-        So the policy may have changed a moment ago; and where anything of a node is hidden, no
-        topic of it may bypass the proxy.
+        A policy that hides it now has just changed, and no topic of a node that hides anything may
+        bypass the proxy: in both cases the enforcer looks again.
         """
-        known = endpoint.registrations.get(held.key)
-        shown = known is not None and not known.hidden
-        if held.hidden and (shown or endpoint.fast_port is not None):
+        previous = endpoint.registrations.get(registration.key)
+        was_shown = previous is not None and not previous.hidden
+        if registration.hidden and (was_shown or endpoint.fast_port is not None):
             self._enforcer.look_again()
-        hidden = held.hidden and not shown
-        return held if held.hidden is hidden else replace(held, hidden=hidden)
+        hide = registration.hidden and not was_shown
+        return registration if registration.hidden is hide else replace(registration, hidden=hide)
 
 
 @dataclass(slots=True, eq=False)
@@ -270,6 +272,6 @@ async def _is_long_and_passes(body: bytes) -> bool:
             watch.see(piece)
             await asyncio.sleep(0)
         watch.end()
-    except xmlrpc.XmlRpcError:  # it is read, which tells what is wrong with it
+    except xmlrpc.XmlRpcError:  # it is read then, which tells the error
         return False
     return True

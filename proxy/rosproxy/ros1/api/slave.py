@@ -38,7 +38,7 @@ NOT_THE_MASTER = "only the master may call this"
 
 
 class SlaveApi:
-    """Answers at the ports of nodes inside; TCPROS, for topics and services, by ``tcpros``."""
+    """Serves the ports of nodes inside: XML-RPC itself, topics and services by ``tcpros``."""
 
     def __init__(
         self,
@@ -68,20 +68,20 @@ class SlaveApi:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
         endpoint = self._endpoint(call)
         method = passing.method_of(call.body)
-        if method is not None and not await self._is_for(method, call.source):
-            return self._refused(method, NOT_THE_MASTER)  # before it is read
+        if method is not None and not await self._may_call(method, call.source):
+            return self._refuse(method, NOT_THE_MASTER)  # before it is read
         try:
             parsed = xmlrpc.parse_call(call.body, self._context.lease_call)
         except xmlrpc.XmlRpcError:
             self._context.metrics.count("slave", "other", "malformed")
             raise
         if parsed.method != multicall.MULTICALL:
-            return await self._one(endpoint, parsed, call.body, call)
+            return await self._reply_to_call(endpoint, parsed, call.body, call)
         results = []
         for inner in multicall.inner_calls(parsed):
             if call.gone:
                 raise Unreachable("the caller has gone")
-            results.append(await self._result(endpoint, inner, call))
+            results.append(await self._multicall_result(endpoint, inner, call))
             call.hold(len(results[-1]))
         return multicall.results_reply(results)
 
@@ -93,13 +93,13 @@ class SlaveApi:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         endpoint, method = self._endpoint(call), long_call.method
         caller_id, parameter, *_ = *passing.first_strings(call.body, 2), None, None
-        why = await self._why_not(endpoint, method, caller_id or "", call.source)
-        if why is None and caller_id is None and not self._access.idle:
-            why = NO_CALLER_ID
-        if why is None and method == "paramUpdate":
-            why = await self._not_subscribed(endpoint, parameter)
-        if why is not None:
-            return self._refused(method, why)
+        reason = await self._why_not(endpoint, method, caller_id or "", call.source)
+        if reason is None and caller_id is None and not self._access.idle:
+            reason = NO_CALLER_ID
+        if reason is None and method == "paramUpdate":
+            reason = await self._not_subscribed(endpoint, parameter)
+        if reason is not None:
+            return self._refuse(method, reason)
         reply = self._pass(endpoint, long_call)
         return await counted(self._context.metrics, "slave", method, reply)
 
@@ -108,27 +108,27 @@ class SlaveApi:
         endpoint = self._context.registry.by_port.get(call.local.port)
         if call.comes_from(self._context.instance):
             raise Unreachable("a node's address leads back to the proxy itself")
-        if endpoint is None or not self._means(endpoint, call.path):
+        if endpoint is None or not self._matches_path(endpoint, call.path):
             raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
         return endpoint
 
-    def _means(self, endpoint: Endpoint, path: str) -> bool:
-        """Whether a request's path names this endpoint, or none, as roscpp's.
+    def _matches_path(self, endpoint: Endpoint, path: str) -> bool:
+        """Whether a request's path names this endpoint, or no node at all, as roscpp's.
 
         A port may serve another node by now; the master's ``shutdown`` for a former one must not
         end it.
         """
-        said = parse_inside_path(path)
-        return said is None or said.slave == endpoint.slave
+        inside_path = parse_inside_path(path)
+        return inside_path is None or inside_path.slave == endpoint.slave
 
-    async def _result(
+    async def _multicall_result(
         self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: IncomingCall
     ) -> bytes:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""
         if inner is None:
             return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
         body = multicall.single_call(inner)
-        reply = await self._one(
+        reply = await self._reply_to_call(
             endpoint, xmlrpc.parse_call(body, self._context.lease_call), body, call
         )
         if isinstance(reply, LongReply):
@@ -137,16 +137,16 @@ class SlaveApi:
             return multicall.fault_value(xmlrpc.SYSTEM_ERROR, f"rosproxy: {text}")
         return multicall.result_value(reply)
 
-    async def _one(
+    async def _reply_to_call(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
     ) -> bytes | LongReply:
-        """The reply to one call, whose document is ``body``, of those that came as ``call``."""
+        """The reply to a single call with the document ``body``, which came as or in ``call``."""
         caller_id = parsed.string(0) or ""
-        why = await self._why_not(endpoint, parsed.method, caller_id, call.source)
-        if why is None and parsed.method == "paramUpdate":
-            why = await self._not_subscribed(endpoint, parsed.string(1))
-        if why is not None:
-            return self._refused(parsed.method, why)
+        reason = await self._why_not(endpoint, parsed.method, caller_id, call.source)
+        if reason is None and parsed.method == "paramUpdate":
+            reason = await self._not_subscribed(endpoint, parsed.string(1))
+        if reason is not None:
+            return self._refuse(parsed.method, reason)
         if too_long := too_long_to_ask(parsed):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
@@ -158,15 +158,15 @@ class SlaveApi:
         reply = self._forward(endpoint, parsed, body, call)
         return await counted(self._context.metrics, "slave", parsed.method, reply)
 
-    def _refused(self, method: str, why: str) -> bytes:
+    def _refuse(self, method: str, reason: str) -> bytes:
         """The reply to a call that its caller may not make."""
         self._context.metrics.count("slave", method, "refused")
-        return xmlrpc.dump_reply([-1, f"rosproxy: {why}", 0])
+        return xmlrpc.dump_reply([-1, f"rosproxy: {reason}", 0])
 
     async def _forward(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
     ) -> bytes | LongReply:
-        if await self._is_void(endpoint, parsed):
+        if await self._is_absorbed(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
         if not slave_api.rewritten(parsed.method):
             return await self._pass(endpoint, body)
@@ -179,7 +179,7 @@ class SlaveApi:
                 await self._context.yield_to_others()
             body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
-        addressing, near = self._context.addressing, call.reached_locally
+        addressing, is_local = self._context.addressing, call.reached_locally
         node = self._context.caller_at(endpoint)
         view = slave_api.from_outside(node, self._context.settings.master_uri, addressing)
         if self._context.stand_ins.both:
@@ -187,12 +187,12 @@ class SlaveApi:
         else:
             body = self._stand_ins.with_address(body, parsed)
         reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
-        port, said = endpoint.port, slave_api.topic_port(parsed, reply)
-        if said is not None:
-            endpoint.note_topic_port(parsed.string(1) or "", said)
+        port, topic_port = endpoint.port, slave_api.topic_port(parsed, reply)
+        if topic_port is not None:
+            endpoint.note_topic_port(parsed.string(1) or "", topic_port)
             if self._access.may_bypass(endpoint):
-                port = await self._leases.fast_port(endpoint, said) or port
-        reached = HostPort(call.local.host, port) if near else addressing.outside(port)
+                port = await self._leases.fast_port(endpoint, topic_port) or port
+        reached = HostPort(call.local.host, port) if is_local else addressing.outside(port)
         return slave_api.rewrite_reply(parsed, reply, reached, view)
 
     def _with_hidden(
@@ -200,14 +200,14 @@ class SlaveApi:
     ) -> tuple[bytes, xmlrpc.Call]:
         """A publisherUpdate with what the node is to hear of; as it came if that is the same."""
         topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
-        found = policing.publishers_for(endpoint, topic, announced, self._context.addressing)
-        if found == [*dict.fromkeys(announced)]:
+        publishers = policing.publishers_for(endpoint, topic, announced, self._context.addressing)
+        if publishers == [*dict.fromkeys(announced)]:
             return body, parsed
-        body = xmlrpc.dump_call(parsed.method, parsed.string(0) or "", topic, found)
+        body = xmlrpc.dump_call(parsed.method, parsed.string(0) or "", topic, publishers)
         return body, xmlrpc.parse_call(body)
 
-    async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
-        """Whether a call only follows from how a node came to be behind the proxy."""
+    async def _is_absorbed(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
+        """Whether a node is spared a needless ``shutdown`` or outdated ``publisherUpdate``."""
         if parsed.method == "shutdown":
             caller_id, reason = parsed.string(0) or "", parsed.string(1) or ""
             return await self._adopter.absorb_shutdown(endpoint, caller_id, reason)
@@ -216,16 +216,16 @@ class SlaveApi:
         return slave_api.is_outdated(parsed, self._context.addressing, self._context.now())
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
-        return await self._heard(
+        return await self._note_health(
             endpoint, self._context.upstream.post_to_node(endpoint.slave, body)
         )
 
     async def _pass(self, endpoint: Endpoint, body: bytes | LongCall) -> bytes | LongReply:
-        return await self._heard(
+        return await self._note_health(
             endpoint, self._context.upstream.pass_to_node(endpoint.slave, body)
         )
 
-    async def _heard(self, endpoint: Endpoint, answer: Awaitable[_Answer]) -> _Answer:
+    async def _note_health(self, endpoint: Endpoint, answer: Awaitable[_Answer]) -> _Answer:
         """An answer of a node; what it tells of the node's health is noted. Raises Unreachable."""
         health = endpoint.health
         try:
@@ -245,7 +245,7 @@ class SlaveApi:
         self, endpoint: Endpoint, method: str, caller_id: str, source: str
     ) -> str | None:
         """Why a caller may not call a method of a node; None if he may."""
-        if not await self._is_for(method, source):
+        if not await self._may_call(method, source):
             return NOT_THE_MASTER
         return await self._access.outside_may_not_call(method, endpoint, source, caller_id)
 
@@ -261,7 +261,7 @@ class SlaveApi:
             return None
         return f"{endpoint.label} has not subscribed to {parameter}"
 
-    async def _is_for(self, method: str, source: str) -> bool:
+    async def _may_call(self, method: str, source: str) -> bool:
         """Whether ``--slave-control`` lets a source call a method."""
         anybody = self._context.settings.slave_control == "any"
         if anybody or method not in slave_api.MASTER_ONLY:

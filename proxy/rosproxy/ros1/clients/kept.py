@@ -36,18 +36,18 @@ _K = TypeVar("_K")
 
 
 @dataclass(slots=True, eq=False)
-class _Kept:
-    """A connection; ``body`` is that of all answers.
+class _Connection:
+    """A connection to a node; ``body`` is that of its latest answer.
 
-    ``question`` is what has not been sent yet of the last one, which was ``asked`` at a time, and
-    ``received`` what has come of its answer.
+    ``question`` is what has not been sent yet of the last request, which was made at ``asked_at``,
+    and ``received`` what has come of its answer.
     """
 
     sock: socket.socket
-    where: HostPort
+    slave: HostPort
     pid: int
     body: bytes = b""
-    asked: float = 0.0
+    asked_at: float = 0.0
     question: bytes = b""
     received: bytes = b""
 
@@ -58,7 +58,7 @@ class _Kept:
 
 
 class KeptConnections(Generic[_K]):
-    """At most one connection for each of those who are to be asked, ``most`` in all.
+    """At most one connection for each node to be asked, ``most`` in all, by keys of the caller's.
 
     An answer has to come ``within`` so many seconds. Times are seconds of a monotonic clock.
     """
@@ -66,117 +66,117 @@ class KeptConnections(Generic[_K]):
     def __init__(self, nodes: NodeClient, within: float) -> None:
         self._nodes, self._within = nodes, within
         self.most = 0
-        self._kept: dict[_K, _Kept] = {}
-        self._waiting: dict[_K, _Kept] = {}
-        self._by_number: dict[int, _K] = {}
-        self._ended = select.epoll()
+        self._connections: dict[_K, _Connection] = {}
+        self._waiting: dict[_K, _Connection] = {}
+        self._key_by_fd: dict[int, _K] = {}
+        self._epoll = select.epoll()
 
-    def ask(self, who: _K, where: HostPort, pid: int, now: float) -> bool:
+    def ask(self, key: _K, slave: HostPort, pid: int, now: float) -> bool:
         """Ask a node for its pid, unless an answer is waited for; False if there is no way to.
 
         The connection is made with the first question, and given up if the node is to be another
         process, or elsewhere.
         """
-        kept = self._kept.get(who)
-        if kept is not None and (kept.where, kept.pid) != (where, pid):
-            self.close(who)
-            kept = None
-        if who in self._waiting:
+        conn = self._connections.get(key)
+        if conn is not None and (conn.slave, conn.pid) != (slave, pid):
+            self.close(key)
+            conn = None
+        if key in self._waiting:
             return True
         try:
-            kept = kept or self._connect(who, where, pid)
+            conn = conn or self._connect(key, slave, pid)
         except OSError:
             return False
-        if kept is None:
+        if conn is None:
             return False
-        kept.asked, kept.question, kept.received = now, self._nodes.pid_question(where), b""
-        self._waiting[who] = kept
+        conn.asked_at, conn.question, conn.received = now, self._nodes.pid_question(slave), b""
+        self._waiting[key] = conn
         with contextlib.suppress(OSError):  # `collect` finds out
-            kept.send()
+            conn.send()
         return True
 
     def collect(self, now: float) -> dict[_K, ProbeResult | None]:
-        """What has become of the connections since the last time, by those who were asked.
+        """What has become of the connections since the last time, by their keys.
 
-        They have answered, have been SILENT for too long, or (None) refused or ended the
+        Their nodes have answered, have been SILENT for too long, or (None) refused or ended the
         connection, or sent something else.
         """
-        found = dict(self._answers(now))
-        found.update({self._by_number[number]: None for number, _ in self._ended.poll(0)})
-        for who, result in found.items():
+        results = dict(self._answers(now))
+        results.update({self._key_by_fd[fd]: None for fd, _ in self._epoll.poll(0)})
+        for key, result in results.items():
             if result is ProbeResult.ANSWERED:
-                del self._waiting[who]
+                del self._waiting[key]
             elif result is ProbeResult.SILENT:
-                self._leave(who)
+                self._leave(key)
             else:
-                self.close(who)
-        return found
+                self.close(key)
+        return results
 
-    def keep(self, those: set[_K]) -> None:
-        """Close the connections of all others."""
-        for who in [one for one in self._kept if one not in those]:
-            self.close(who)
+    def keep(self, keys: set[_K]) -> None:
+        """Close the connections of all other keys."""
+        for key in [key for key in self._connections if key not in keys]:
+            self.close(key)
 
-    def close(self, who: _K) -> None:
-        """Close the connection of somebody who is not to be asked any more."""
-        kept = self._kept.pop(who, None)
-        self._waiting.pop(who, None)
-        if kept is not None:
-            del self._by_number[kept.sock.fileno()]
-            kept.sock.close()
+    def close(self, key: _K) -> None:
+        """Close the connection of a node that is not to be asked any more."""
+        conn = self._connections.pop(key, None)
+        self._waiting.pop(key, None)
+        if conn is not None:
+            del self._key_by_fd[conn.sock.fileno()]
+            conn.sock.close()
 
-    def _leave(self, who: _K) -> None:
+    def _leave(self, key: _K) -> None:
         """Give up a connection on which an answer is due."""
-        kept = self._kept.pop(who)
-        del self._waiting[who], self._by_number[kept.sock.fileno()]
-        self._ended.unregister(kept.sock)
-        self._nodes.leave(kept.sock)
+        conn = self._connections.pop(key)
+        del self._waiting[key], self._key_by_fd[conn.sock.fileno()]
+        self._epoll.unregister(conn.sock)
+        self._nodes.leave(conn.sock)
 
     def close_all(self) -> None:
         """Close all connections, for good."""
         self.most = 0
         self.keep(set())
-        self._ended.close()
+        self._epoll.close()
 
-    def _connect(self, who: _K, where: HostPort, pid: int) -> _Kept | None:
+    def _connect(self, key: _K, slave: HostPort, pid: int) -> _Connection | None:
         """Begin to connect; None if there are as many as there may be. Raises OSError."""
-        if len(self._kept) >= self.most:
+        if len(self._connections) >= self.most:
             return None
-        sock = self._nodes.connect(where)
-        self._ended.register(sock, select.EPOLLRDHUP)
-        self._by_number[sock.fileno()] = who
-        self._kept[who] = kept = _Kept(sock, where, pid)
-        return kept
+        sock = self._nodes.connect(slave)
+        self._epoll.register(sock, select.EPOLLRDHUP)
+        self._key_by_fd[sock.fileno()] = key
+        self._connections[key] = conn = _Connection(sock, slave, pid)
+        return conn
 
     def _answers(self, now: float) -> Iterator[tuple[_K, ProbeResult | None]]:
-        for who, kept in self._waiting.items():
+        for key, conn in self._waiting.items():
             try:
-                kept.send()
-                yield who, self._read(kept)
+                conn.send()
+                yield key, self._read(conn)
             except BlockingIOError:
-                if now - kept.asked > self._within:
-                    yield who, ProbeResult.SILENT
+                if now - conn.asked_at > self._within:
+                    yield key, ProbeResult.SILENT
             except OSError:
-                yield who, None
+                yield key, None
 
-    def _read(self, kept: _Kept) -> ProbeResult | None:
+    def _read(self, conn: _Connection) -> ProbeResult | None:
         """ANSWERED by the answer that is expected, None by anything else.
 
         Raises BlockingIOError while it has not come, or not all of it, and OSError.
         """
-        part = kept.sock.recv(LONGEST_ANSWER)
-        kept.received += part
-        head, end, body = kept.received.partition(b"\r\n\r\n")
-        if part and not end and len(head) < LONGEST_ANSWER:
+        chunk = conn.sock.recv(LONGEST_ANSWER)
+        conn.received += chunk
+        head, end, body = conn.received.partition(b"\r\n\r\n")
+        if chunk and not end and len(head) < LONGEST_ANSWER:
             raise BlockingIOError
         length = _length(head)
-        if not part or not head.startswith(_OK) or len(body) > length:
+        if not chunk or not head.startswith(_OK) or len(body) > length:
             return None
         if len(body) < length:
             raise BlockingIOError
-        if body != kept.body and not self._is_from(kept.pid, body):
+        if body != conn.body and not self._is_from(conn.pid, body):
             return None
-        kept.body, kept.received = body, b""
+        conn.body, conn.received = body, b""
         return ProbeResult.ANSWERED
 
     def _is_from(self, pid: int, body: bytes) -> bool:
@@ -188,5 +188,5 @@ class KeptConnections(Generic[_K]):
 
 def _length(head: bytes) -> int:
     """How long a body is, by its header; -1 if that does not tell."""
-    found = _LENGTH.search(head)
-    return int(found[1]) if found and int(found[1]) <= LONGEST_ANSWER else -1
+    match = _LENGTH.search(head)
+    return int(match[1]) if match and int(match[1]) <= LONGEST_ANSWER else -1

@@ -90,12 +90,12 @@ class MasterClient:
     ) -> None:
         self.master_uri, self.master_address = master_uri, master_address
         self._metrics = metrics
-        parts = urlsplit(master_uri)
-        self._master_path, self._netloc = parts.path or "/", parts.netloc
-        self._master_where = HostPort(parts.hostname or "", parts.port or 80)
-        own, node = {LOOP_HEADER: instance}, {LOOP_HEADER: f"{instance} node"}
-        self._master = HttpClient(own, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
-        self._nodes = HttpClient(node, NODE_KEEPALIVE, NODE_CONNECTIONS, longest, NODES)
+        uri = urlsplit(master_uri)
+        self._master_path, self._netloc = uri.path or "/", uri.netloc
+        self._master_host_port = HostPort(uri.hostname or "", uri.port or 80)
+        master_headers, node_headers = {LOOP_HEADER: instance}, {LOOP_HEADER: f"{instance} node"}
+        self._master = HttpClient(master_headers, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
+        self._nodes = HttpClient(node_headers, NODE_KEEPALIVE, NODE_CONNECTIONS, longest, NODES)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -104,41 +104,41 @@ class MasterClient:
     @property
     def reached_at(self) -> str | None:
         """The address at which the master is looked for; None before its name was resolved."""
-        host = self._master_where.host
+        host = self._master_host_port.host
         return self.master_address or (host if is_address(host) else self._master.last)
 
     async def master_addresses(self) -> list[str]:
         """The addresses of the master's host; empty if its name can't be resolved."""
         if self.master_address:
             return [self.master_address]
-        return await resolve(self._master_where.host)
+        return await resolve(self._master_host_port.host)
 
-    def reach(self, where: HostPort) -> HostPort:
+    def reach(self, host_port: HostPort) -> HostPort:
         """Where to connect to for a host and port that a URI from outside names.
 
         That differs only for the master's host while its address is given.
         """
-        if self.master_address and where.host.lower() == self._master_where.host:
-            return HostPort(self.master_address, where.port)
-        return where
+        if self.master_address and host_port.host.lower() == self._master_host_port.host:
+            return HostPort(self.master_address, host_port.port)
+        return host_port
 
     async def post_to_master(self, body: bytes, limits: Limits = REPLY) -> bytes:
         """The master's reply to a call, within such limits. Raises Unreachable.
 
         Kept connections are told apart by address, so a new address means new connections.
         """
-        where, path, name = self.reach(self._master_where), self._master_path, self._netloc
-        with _told_of(f"master {self.master_uri}"):
-            return await self._master.post(where, path, name, body, MASTER_TIMEOUT, limits.size)
+        target, path, name = self.reach(self._master_host_port), self._master_path, self._netloc
+        with _failures_of(f"master {self.master_uri}"):
+            return await self._master.post(target, path, name, body, MASTER_TIMEOUT, limits.size)
 
     async def pass_to_master(self, body: bytes | LongBody) -> bytes | LongReply:
         """The master's reply to a call, neither of which is read here.
 
         Raises Unreachable, and XmlRpcError as a long body does.
         """
-        where, path, name = self.reach(self._master_where), self._master_path, self._netloc
-        with _told_of(f"master {self.master_uri}"):
-            return await self._master.pass_on(where, path, name, body, MASTER_TIMEOUT)
+        target, path, name = self.reach(self._master_host_port), self._master_path, self._netloc
+        with _failures_of(f"master {self.master_uri}"):
+            return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT)
 
     async def call_master(self, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to the master. Raises Unreachable, MasterError."""
@@ -155,24 +155,24 @@ class MasterClient:
         """
         values: list[Any] = []
         for start in range(0, len(calls), MULTICALL_SIZE):
-            part = calls[start : start + MULTICALL_SIZE]
-            body = [{"methodName": method, "params": params} for method, params in part]
+            batch = calls[start : start + MULTICALL_SIZE]
+            body = [{"methodName": method, "params": params} for method, params in batch]
             call = xmlrpc.dump_call("system.multicall", body)
             results = parsed(await self.post_to_master(call, OWN_REPLY))
-            if not isinstance(results, list) or len(results) != len(part):
+            if not isinstance(results, list) or len(results) != len(batch):
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_result_of(result) for result in results]
         return values
 
-    async def read_changes(self, seen: bytes) -> tuple[bytes, dict[str, list[Registration]] | None]:
-        """What each node has registered, without types, and what to give as ``seen`` next time.
+    async def read_changes(self, last: bytes) -> tuple[bytes, dict[str, list[Registration]] | None]:
+        """What each node has registered, without types, and what to give as ``last`` next time.
 
         None if nothing has changed since then: to read the names of ten thousand topics takes half
         a second, to see that they are the same a hundredth. Raises Unreachable, MasterError.
         """
         reply = await self.post_to_master(xmlrpc.dump_call("getSystemState", CALLER_ID), OWN_REPLY)
         digest = blake2b(reply).digest()
-        if digest == seen:
+        if digest == last:
             return digest, None
         return digest, _read_state(read_value("getSystemState", reply, OWN_REPLY), [])
 
@@ -185,8 +185,8 @@ class MasterClient:
 
     async def read_graph(self) -> Graph:
         """What each node has registered, and where it is. Raises Unreachable, MasterError."""
-        held = await self.read_registrations()
-        return Graph(held, await self.look_up("lookupNode", held))
+        registrations = await self.read_registrations()
+        return Graph(registrations, await self.look_up("lookupNode", registrations))
 
     async def look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
         """The URIs of those nodes (``lookupNode``) or services (``lookupService``) that it knows.
@@ -195,55 +195,55 @@ class MasterClient:
         """
         wanted = sorted(names)
         uris = await self.multicall([(method, [CALLER_ID, name]) for name in wanted])
-        found = zip(wanted, uris, strict=True)
-        return {name: uri for name, uri in found if isinstance(uri, str)}
+        pairs = zip(wanted, uris, strict=True)
+        return {name: uri for name, uri in pairs if isinstance(uri, str)}
 
     async def post_to_node(
-        self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
+        self, slave: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
     ) -> bytes:
         """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
-        with _told_of(f"node at {where}"):
-            reached, name = self.reach(where), str(where)
-            return await self._nodes.post(reached, path, name, body, within, REPLY.size)
+        with _failures_of(f"node at {slave}"):
+            target, name = self.reach(slave), str(slave)
+            return await self._nodes.post(target, path, name, body, within, REPLY.size)
 
-    async def pass_to_node(self, where: HostPort, body: bytes | LongBody) -> bytes | LongReply:
+    async def pass_to_node(self, slave: HostPort, body: bytes | LongBody) -> bytes | LongReply:
         """A node's reply to a call, neither of which is read here.
 
         Raises Unreachable, and XmlRpcError as a long body does.
         """
-        with _told_of(f"node at {where}"):
-            reached, name = self.reach(where), str(where)
-            return await self._nodes.pass_on(reached, "/", name, body, NODE_TIMEOUT)
+        with _failures_of(f"node at {slave}"):
+            target, name = self.reach(slave), str(slave)
+            return await self._nodes.pass_on(target, "/", name, body, NODE_TIMEOUT)
 
-    async def call_node(self, where: HostPort, within: float, method: str, *params: Any) -> Any:
+    async def call_node(self, slave: HostPort, within: float, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
-        return read_value(method, await self.post_to_node(where, body, within))
+        return read_value(method, await self.post_to_node(slave, body, within))
 
     def leave_node(self, sock: socket.socket) -> None:
         """Close a connection to a node on which an answer is due, once that has come."""
         self._nodes.leave(sock)
 
-    def node_request(self, where: HostPort, body: bytes) -> bytes:
+    def node_request(self, slave: HostPort, body: bytes) -> bytes:
         """A call to a node as HTTP, for whoever has a connection of his own."""
-        return self._nodes.request("/", str(where), body)
+        return self._nodes.request("/", str(slave), body)
 
 
 _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
 
 
 @contextmanager
-def _told_of(who: str) -> Iterator[None]:
-    """Tell failures as those of a peer."""
+def _failures_of(peer: str) -> Iterator[None]:
+    """Raise failures as Unreachable, with the name of the peer."""
     try:
         yield
     except xmlrpc.XmlRpcError:  # of a long body: no failure of the peer's
         raise
     except _FAILURES as error:
-        raise _unreachable(who, error) from error
+        raise _unreachable(peer, error) from error
 
 
-def _unreachable(who: str, error: BaseException) -> Unreachable:
+def _unreachable(peer: str, error: BaseException) -> Unreachable:
     probe = ProbeResult.SILENT
     if isinstance(error, ConnectionRefusedError):
         probe = ProbeResult.REFUSED
@@ -255,11 +255,11 @@ def _unreachable(who: str, error: BaseException) -> Unreachable:
         reason = error.strerror.lower()
     else:
         reason = brief(error, LONGEST_TEXT) or type(error).__name__
-    return Unreachable(f"{who}: {reason}", probe)
+    return Unreachable(f"{peer}: {reason}", probe)
 
 
 def parsed(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
-    """A reply's value, a fault's too."""
+    """A reply's value, a fault's too. Raises Unreachable."""
     try:
         return xmlrpc.read_response(reply, limits)
     except xmlrpc.XmlRpcError as error:

@@ -54,25 +54,25 @@ class NodeClient:
     def __init__(self, upstream: MasterClient, within: float) -> None:
         self._upstream, self._within = upstream, within
 
-    async def probe(self, where: HostPort, within: float | None = None) -> ProbeAnswer:
+    async def probe(self, slave: HostPort, within: float | None = None) -> ProbeAnswer:
         """Call ``getPid``. Whatever answers in HTTP lives, even if it does not know that call."""
         try:
-            body = await self._upstream.post_to_node(where, _PID_CALL, within or self._within)
+            body = await self._upstream.post_to_node(slave, _PID_CALL, within or self._within)
             return ProbeAnswer(ProbeResult.ANSWERED, self.read_pid(body))
         except Unreachable as error:
             return ProbeAnswer(error.probe, reason=str(error))
 
-    def connect(self, where: HostPort) -> socket.socket:
+    def connect(self, slave: HostPort) -> socket.socket:
         """A connection to the slave API at an address that is about to be made. Raises OSError."""
-        return sockets.begin_to_dial(self._upstream.reach(where))
+        return sockets.begin_to_dial(self._upstream.reach(slave))
 
     def leave(self, sock: socket.socket) -> None:
         """Close such a connection once the answer that is due on it has come."""
         self._upstream.leave_node(sock)
 
-    def pid_question(self, where: HostPort) -> bytes:
+    def pid_question(self, slave: HostPort) -> bytes:
         """The HTTP request by which the node at an address is asked for its pid."""
-        return self._upstream.node_request(where, _PID_CALL)
+        return self._upstream.node_request(slave, _PID_CALL)
 
     def read_pid(self, body: bytes) -> int | None:
         """The pid that a reply's body gives, whatever its status; None if it gives none.
@@ -84,20 +84,20 @@ class NodeClient:
                 return pid
         return None
 
-    async def inspect(self, where: HostPort) -> NodeInfo | None:
+    async def inspect(self, slave: HostPort) -> NodeInfo | None:
         """What the node at an address says of itself; None if nothing answers there."""
         answer, published, subscribed = await asyncio.gather(
-            self.probe(where),
-            self._topics(where, "getPublications"),
-            self._topics(where, "getSubscriptions"),
+            self.probe(slave),
+            self._topics(slave, "getPublications"),
+            self._topics(slave, "getSubscriptions"),
         )
         if answer.probe is not ProbeResult.ANSWERED:
-            log.debug("%s does not describe itself: %s", where, answer.reason)
+            log.debug("%s does not describe itself: %s", slave, answer.reason)
             return None
-        ports = await self._topic_ports(where, sorted(published or {}))
+        ports = await self._topic_ports(slave, sorted(published or {}))
         return NodeInfo(answer.pid, published, subscribed, ports)
 
-    async def name(self, where: HostPort, service: tuple[str, int] | None = None) -> str | None:
+    async def name(self, slave: HostPort, service: tuple[str, int] | None = None) -> str | None:
         """What the node at an address is called, as it says itself; None if it doesn't.
 
         rospy has ``getName`` for that. roscpp has nothing like it in its slave API, but gives its
@@ -109,85 +109,85 @@ class NodeClient:
         while it registers one (topic_manager.cpp, subscribe).
         """
         try:
-            said = await self._upstream.call_node(where, self._within, "getName")
-            if isinstance(said, str):
-                return said
+            name = await self._upstream.call_node(slave, self._within, "getName")
+            if isinstance(name, str):
+                return name
         except Unreachable as error:
             if error.probe is not ProbeResult.ANSWERED:
                 return None
         except MasterError as error:
-            log.debug("%s does not tell its name: %s", where, error)
-        return await self._name_by_tcpros(where, service)
+            log.debug("%s does not tell its name: %s", slave, error)
+        return await self._name_by_tcpros(slave, service)
 
-    async def provider(self, where: HostPort, service: str) -> str | None:
+    async def provider(self, server: HostPort, service: str) -> str | None:
         """The name of the node with a TCPROS server, if it has a service; None if it has not."""
-        return await self._greet(where, {"service": service})
+        return await self._server_name(server, {"service": service})
 
-    async def publisher(self, where: HostPort, topic: str) -> str | None:
+    async def publisher(self, server: HostPort, topic: str) -> str | None:
         """The name of the node with a TCPROS server, if it publishes a topic; None if it doesn't.
 
         None, too, of a library that does not answer somebody who takes any type.
         """
-        return await self._greet(where, {"topic": topic, "type": "*"})
+        return await self._server_name(server, {"topic": topic, "type": "*"})
 
-    async def _name_by_tcpros(self, where: HostPort, service: tuple[str, int] | None) -> str | None:
-        published = await self._topics(where, "getPublications") or {ROSOUT: ""}
+    async def _name_by_tcpros(self, slave: HostPort, service: tuple[str, int] | None) -> str | None:
+        published = await self._topics(slave, "getPublications") or {ROSOUT: ""}
         topics = sorted(published, key=lambda topic: topic != ROSOUT)[:TOPICS_ASKED]
         for topic in topics:
-            port = await self._topic_port_if_told(where, topic)
-            name = await self.publisher(HostPort(where.host, port), topic) if port else None
+            port = await self._topic_port_or_none(slave, topic)
+            name = await self.publisher(HostPort(slave.host, port), topic) if port else None
             if name:
                 return name
         if service is None:
             return None
-        return await self._greet(HostPort(where.host, service[1]), {"service": service[0]})
+        return await self._server_name(HostPort(slave.host, service[1]), {"service": service[0]})
 
-    async def _greet(self, where: HostPort, wanted: dict[str, str]) -> str | None:
+    async def _server_name(self, server: HostPort, fields: dict[str, str]) -> str | None:
         """The name in the header with which a TCPROS server answers; None if it gives none."""
-        header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **wanted})
+        header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **fields})
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(self._within):
-                conn = await sockets.dial(where)
+                conn = await sockets.dial(server)
                 with conn:
                     await loop.sock_sendall(conn, header)
                     size = header_length(await sockets.read_exactly(conn, 4))
                     return decode_header(await sockets.read_exactly(conn, size)).get("callerid")
         except (OSError, EOFError, HeaderError) as error:
-            log.debug("%s does not answer a TCPROS header: %s", where, error)
+            log.debug("%s does not answer a TCPROS header: %s", server, error)
             return None
 
-    async def _topics(self, where: HostPort, method: str) -> dict[str, str] | None:
+    async def _topics(self, slave: HostPort, method: str) -> dict[str, str] | None:
         try:
-            return read_types(await self._upstream.call_node(where, self._within, method))
+            return read_types(await self._upstream.call_node(slave, self._within, method))
         except (Unreachable, MasterError) as error:
-            log.debug("%s does not tell its topics: %s", where, error)
+            log.debug("%s does not tell its topics: %s", slave, error)
             return None
 
-    async def topic_port(self, where: HostPort, topic: str) -> int | None:
+    async def topic_port(self, slave: HostPort, topic: str) -> int | None:
         """The TCPROS port that a node names for a topic. Raises Unreachable, MasterError."""
         answer = await self._upstream.call_node(
-            where, self._within, "requestTopic", topic, [["TCPROS"]]
+            slave, self._within, "requestTopic", topic, [["TCPROS"]]
         )
         match answer:
             case [_, _, int(port)] if 0 < port < 65536:
                 return port
         return None
 
-    async def _topic_ports(self, where: HostPort, topics: list[str]) -> dict[str, int]:
+    async def _topic_ports(self, slave: HostPort, topics: list[str]) -> dict[str, int]:
         """The TCPROS ports of two topics, which show whether all of the node's are the same."""
         ports: dict[str, int] = {}
         for topic in topics[:TOPICS_ASKED]:
-            port = await self._topic_port_if_told(where, topic)
+            port = await self._topic_port_or_none(slave, topic)
             if port is not None:
                 ports[topic] = port
             if len(ports) == ENOUGH_PORTS:
                 break
         return ports
 
-    async def _topic_port_if_told(self, where: HostPort, topic: str) -> int | None:
+    async def _topic_port_or_none(self, slave: HostPort, topic: str) -> int | None:
         try:
-            return await self.topic_port(where, topic)
+            return await self.topic_port(slave, topic)
         except (Unreachable, MasterError) as error:
-            log.debug("%s gives no TCPROS port for %s: %s", where, topic, error)
+            log.debug("%s gives no TCPROS port for %s: %s", slave, topic, error)
             return None

@@ -19,13 +19,13 @@ nested in many namespaces, have a hundred; ROS 2 allows 255."""
 
 def too_long_to_register(call: Call) -> str | None:
     """What in a call that registers is too long; None if nothing is, and for any other call."""
-    found = method_spec(call.method)
-    if found.registers is None:
+    spec = method_spec(call.method)
+    if spec.registers is None:
         return None
-    names = {"caller_id": 0, "name": found.name, "type": found.type}
-    uris = {"caller_api": found.caller_api, "service_api": found.service_api}
-    return _too_long((what, call.string(at) or "", LONGEST_NAME) for what, at in names.items()) or (
-        _too_long((what, call.string(at) or "", LONGEST_URI) for what, at in uris.items())
+    names = {"caller_id": 0, "name": spec.name, "type": spec.type}
+    uris = {"caller_api": spec.caller_api, "service_api": spec.service_api}
+    return _too_long((label, call.string(i) or "", LONGEST_NAME) for label, i in names.items()) or (
+        _too_long((label, call.string(i) or "", LONGEST_URI) for label, i in uris.items())
     )
 
 
@@ -34,7 +34,7 @@ def too_long_to_ask(call: Call) -> str | None:
     names = {"caller_id": 0}
     if call.method in ("requestTopic", "publisherUpdate"):
         names["topic"] = 1
-    return _too_long((what, call.string(at) or "", LONGEST_NAME) for what, at in names.items())
+    return _too_long((label, call.string(i) or "", LONGEST_NAME) for label, i in names.items())
 
 
 def too_long_to_connect(fields: Mapping[str, str]) -> str | None:
@@ -43,9 +43,9 @@ def too_long_to_connect(fields: Mapping[str, str]) -> str | None:
     return _too_long((name, fields.get(name, ""), LONGEST_NAME) for name in names)
 
 
-def _too_long(given: Iterable[tuple[str, str, int]]) -> str | None:
-    """The first of some texts, each with what it is, that has more characters than it may."""
-    for what, text, most in given:
+def _too_long(texts: Iterable[tuple[str, str, int]]) -> str | None:
+    """The first of some texts, each with its label and bound, that is too long."""
+    for label, text, most in texts:
         if len(text) > most:
-            return f"{what} has {len(text)} characters, at most {most} are accepted"
+            return f"{label} has {len(text)} characters, at most {most} are accepted"
     return None

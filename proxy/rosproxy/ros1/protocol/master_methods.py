@@ -82,7 +82,7 @@ def resolve_name(name: str, caller_id: str) -> str:
         resolved = f"{caller_id}/{name[1:]}"
     else:
         resolved = f"{caller_id.rpartition('/')[0]}/{name}"
-    return "/" + "/".join(part for part in resolved.split("/") if part)
+    return "/" + "/".join(segment for segment in resolved.split("/") if segment)
 
 
 def prefix(name: str) -> str:

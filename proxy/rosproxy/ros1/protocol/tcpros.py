@@ -22,8 +22,8 @@ class HeaderError(ValueError):
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
     """A complete header with its leading total length."""
-    parts = [f"{name}={value}".encode() for name, value in fields.items()]
-    body = b"".join(_LENGTH.pack(len(part)) + part for part in parts)
+    encoded = [f"{name}={value}".encode() for name, value in fields.items()]
+    body = b"".join(_LENGTH.pack(len(field)) + field for field in encoded)
     return _LENGTH.pack(len(body)) + body
 
 

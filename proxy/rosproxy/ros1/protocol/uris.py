@@ -52,18 +52,18 @@ def placed(uri: str, address: str) -> str:
 
     roslisp says so where ROS_HOSTNAME is set to nothing, and rosmaster takes it.
     """
-    found = _NO_HOST.fullmatch(uri)
-    return f"{found[1]}{HostPort(address, int(found[2]))}{found[3]}" if found else uri
+    match = _NO_HOST.fullmatch(uri)
+    return f"{match[1]}{HostPort(address, int(match[2]))}{match[3]}" if match else uri
 
 
-def slave_uri(where: HostPort, path: str = "/") -> str:
+def slave_uri(host_port: HostPort, path: str = "/") -> str:
     """The slave URI of a host and port."""
-    return f"http://{where}{path}"
+    return f"http://{host_port}{path}"
 
 
-def service_uri(where: HostPort) -> str:
+def service_uri(host_port: HostPort) -> str:
     """The service URI of a host and port; it has no path (rospy's parser takes none)."""
-    return f"rosrpc://{where}"
+    return f"rosrpc://{host_port}"
 
 
 def path_of(uri: str) -> str:
@@ -76,12 +76,12 @@ def path_of(uri: str) -> str:
 
 def inside_path(inside: InsidePath) -> str:
     """What is remembered of where a node is, in the form of a path; see the module's text."""
-    carried = inside.path if len(inside.path) <= LONGEST_PATH else "/"
+    own_path = inside.path if len(inside.path) <= LONGEST_PATH else "/"
     segments = [_quoted(str(inside.node))]
-    if inside.address is not None or carried != "/":
+    if inside.address is not None or own_path != "/":
         segments.append(_quoted(inside.slave.host))
-    if carried != "/":
-        segments.append(quote(carried, safe=""))
+    if own_path != "/":
+        segments.append(quote(own_path, safe=""))
     return f"/{'/'.join(segments)}/"
 
 
@@ -94,16 +94,16 @@ def parse_inside_path(uri: str) -> InsidePath | None:
     if not _fits(uri):
         return None
     try:
-        parts = [unquote(part) for part in urlsplit(uri).path.strip("/").split("/")]
+        segments = [unquote(segment) for segment in urlsplit(uri).path.strip("/").split("/")]
     except ValueError:
         return None
-    node = parse_host_port(parts[0])
-    if node is None or len(parts) > 3 or (len(parts) > 1 and not is_address(parts[1])):
+    node = parse_host_port(segments[0])
+    if node is None or len(segments) > 3 or (len(segments) > 1 and not is_address(segments[1])):
         return None
-    path = parts[2] if len(parts) > 2 else "/"
+    path = segments[2] if len(segments) > 2 else "/"
     if not path.startswith("/"):
         return None
-    return InsidePath(node, parts[1] if len(parts) > 1 else None, path)
+    return InsidePath(node, segments[1] if len(segments) > 1 else None, path)
 
 
 def _fits(uri: str) -> bool:

@@ -79,8 +79,8 @@ class Endpoint:
 
     ``callers`` are the nodes' names with the number of their registrations, and ``characters`` is
     how long these are together; `Registry` keeps both.
-    It is plain state: who learns something of the node tells it by the methods (``note_…``), and
-    `Registry` keeps what it is found by.
+    It is plain state: whoever learns something of the node calls a method (``note_…``), and
+    `Registry` keeps the indexes by which it is found.
 
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
     listens on. ``topic_ports`` are the TCPROS ports that the node itself named, by topic: one for
@@ -107,7 +107,7 @@ class Endpoint:
     characters: int = 0
     topic_ports: dict[str, int] = field(default_factory=dict)
     service_ports: dict[int, None] = field(default_factory=dict)
-    """Those at which it has registered services, oldest first."""
+    """TCPROS ports at which it has registered services, oldest first."""
     former_callers: dict[str, None] = field(default_factory=dict)
     """Names that were registered here and are no longer, oldest first; `Registry` keeps them."""
     connections: int = 0
@@ -117,7 +117,7 @@ class Endpoint:
     source: str = ""
     health: Health = field(default_factory=Health)
     admissions: dict[tuple[HostPort, str], None] = field(default_factory=dict)
-    """What was found to mean it, by source, oldest first; `Registry` keeps that."""
+    """Hosts and ports that mean it, each with its source, oldest first; `Registry` keeps them."""
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0
@@ -176,10 +176,10 @@ class Endpoint:
         while len(self.former_callers) > MOST_FORMER_CALLERS:
             del self.former_callers[next(iter(self.former_callers))]
 
-    def note_moved(self, before: str, now: str) -> None:
-        """Note that the advertised URI has changed, and that the master has the former one yet."""
-        self.former_uris.add(before)
-        self.former_uris.discard(now)
+    def note_moved(self, former_uri: str, uri: str) -> None:
+        """Note that the advertised URI has changed; the master still has the former one."""
+        self.former_uris.add(former_uri)
+        self.former_uris.discard(uri)
         self.unsettled = True
 
     def note_settled(self) -> None:
@@ -260,7 +260,7 @@ class Endpoint:
 
     @property
     def expendable(self) -> bool:
-        """Whether its port is rather for a node that lives: its own does not answer.
+        """Whether its port may go to a node that lives: its own does not answer.
 
         One that never answered has one chance; what the master alone tells of must be borne out
         when it is asked for the first time.
@@ -309,17 +309,17 @@ class Endpoint:
 
     def names(self, kind: Kind) -> list[str]:
         """The topics, services or parameters registered as ``kind``."""
-        return sorted(held.name for held in self.registrations.values() if held.kind is kind)
+        return sorted(r.name for r in self.registrations.values() if r.kind is kind)
 
     def shown(self, kind: Kind) -> list[str]:
-        """Those of them that the master knows of."""
-        found = self.registrations.values()
-        return sorted(held.name for held in found if held.kind is kind and not held.hidden)
+        """The topics, services or parameters of a ``kind`` that the master knows of."""
+        registrations = self.registrations.values()
+        return sorted(r.name for r in registrations if r.kind is kind and not r.hidden)
 
     def callers_of(self, kind: Kind, name: str) -> list[str]:
         """The nodes here that have registered something; all that are here if none has."""
-        found = [caller for caller in self.callers if (kind, name, caller) in self.registrations]
-        return found or self.caller_ids
+        callers = [caller for caller in self.callers if (kind, name, caller) in self.registrations]
+        return callers or self.caller_ids
 
     def publishes(self, topic: str) -> bool:
         """Whether a topic is registered as published."""
@@ -355,19 +355,19 @@ class Endpoint:
     @property
     def full(self) -> str | None:
         """Why nothing more is registered here; None if something may be."""
-        for count, most, what in (
+        for count, most, label in (
             (len(self.registrations), MOST_REGISTRATIONS, "registrations"),
             (self.characters, MOST_CHARACTERS, "characters of registered names"),
         ):
             if count >= most:
-                return f"the node at {self.uri} has {count} {what}, at most {most} are accepted"
+                return f"the node at {self.uri} has {count} {label}, at most {most} are accepted"
         return None
 
     @property
     def unused(self) -> bool:
-        """Whether nobody needs the lease: nothing holds, nobody is connected or calls."""
-        held = self.registrations and not self.health.cleaned
-        return not (held or self.connected or self.pending)
+        """Whether nobody needs the lease: no registration stands, nobody is connected or calls."""
+        is_registered = self.registrations and not self.health.cleaned
+        return not (is_registered or self.connected or self.pending)
 
 
 EndpointRegistration = tuple[Endpoint, Registration]

@@ -30,9 +30,9 @@ class Graph(msgspec.Struct, frozen=True):
         """The slave URIs of each topic's publishers or subscribers."""
         topics: dict[str, list[str]] = {}
         for node, registrations in self.held.items():
-            for held in registrations:
-                if held.kind is kind and node in self.uris:
-                    topics.setdefault(held.name, []).append(self.uris[node])
+            for registration in registrations:
+                if registration.kind is kind and node in self.uris:
+                    topics.setdefault(registration.name, []).append(self.uris[node])
         return topics
 
 
@@ -51,20 +51,20 @@ class NodeInfo(msgspec.Struct, frozen=True):
     @property
     def by_kind(self) -> dict[Kind, Mapping[str, str]]:
         """Its topics by the kind of registration that they need, as far as it tells them."""
-        told = {Kind.PUBLISHER: self.published, Kind.SUBSCRIBER: self.subscribed}
-        return {kind: topics for kind, topics in told.items() if topics is not None}
+        topics_by_kind = {Kind.PUBLISHER: self.published, Kind.SUBSCRIBER: self.subscribed}
+        return {kind: topics for kind, topics in topics_by_kind.items() if topics is not None}
 
     def has(self, topic: str) -> bool | None:
         """Whether it publishes a topic or subscribes to it; None if it does not tell."""
-        told = self.by_kind.values()
-        if any(topic in topics for topics in told):
+        tables = self.by_kind.values()
+        if any(topic in topics for topics in tables):
             return True
-        return False if len(told) == len(TOPIC_KINDS) else None
+        return False if len(tables) == len(TOPIC_KINDS) else None
 
-    def holds(self, held: Registration) -> bool | None:
+    def holds(self, registration: Registration) -> bool | None:
         """Whether it has what is registered; None if it does not tell, as of services."""
-        topics = self.by_kind.get(held.kind)
-        return None if topics is None else held.name in topics
+        topics = self.by_kind.get(registration.kind)
+        return None if topics is None else registration.name in topics
 
 
 def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
@@ -73,21 +73,21 @@ def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
     ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
     ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not.
     """
-    tables, known = msgspec.convert(state, tuple[_Table, _Table, _Table]), read_types(types)
-    found: dict[str, list[Registration]] = {}
-    for kind, entries in zip(_STATE_KINDS, tables, strict=True):
-        for name, nodes in entries:
+    tables, type_by_topic = msgspec.convert(state, tuple[_Table, _Table, _Table]), read_types(types)
+    by_node: dict[str, list[Registration]] = {}
+    for kind, rows in zip(_STATE_KINDS, tables, strict=True):
+        for name, nodes in rows:
             for node in nodes:
-                held = Registration(kind, name, node, known.get(name, "*"))
-                found.setdefault(node, []).append(held)
-    return found
+                registration = Registration(kind, name, node, type_by_topic.get(name, "*"))
+                by_node.setdefault(node, []).append(registration)
+    return by_node
 
 
 def read_types(rows: Any) -> dict[str, str]:
     """Topics with their types, from ``[[topic, type], …]``; other rows are left out."""
-    held: dict[str, str] = {}
+    types: dict[str, str] = {}
     for row in rows if isinstance(rows, list) else ():
         match row:
             case [str(name), str(type_)]:
-                held[name] = type_
-    return held
+                types[name] = type_
+    return types

@@ -71,8 +71,8 @@ class Health:
     @property
     def steady(self) -> bool:
         """Whether it has answered whenever it was asked of late, always as the same process."""
-        well = self.answered is not None and not (self.failures or self.cleaned or self.over)
-        return well and self.checked is not None and self.pid not in UNKNOWN_PID
+        is_well = self.answered is not None and not (self.failures or self.cleaned or self.over)
+        return is_well and self.checked is not None and self.pid not in UNKNOWN_PID
 
     @property
     def hangs_up(self) -> bool:

@@ -15,8 +15,8 @@ from rosproxy.ros1.registry.registry import Registry
 
 def publishers(registry: Registry, topic: str) -> list[Endpoint]:
     """The nodes whose publishing of a topic is hidden, without those that are given up."""
-    found = registry.hidden.get((Kind.PUBLISHER, topic), {}).values()
-    return _living(found)
+    endpoints = registry.hidden.get((Kind.PUBLISHER, topic), {}).values()
+    return _living(endpoints)
 
 
 def publishers_inside(registry: Registry, topic: str) -> list[Endpoint]:
@@ -32,16 +32,16 @@ def is_hidden_subscriber(registry: Registry, endpoint: Endpoint, topic: str) -> 
 def subscribers_inside(registry: Registry, topic: str) -> list[EndpointRegistration]:
     """All subscriptions of nodes inside to a topic."""
     return [
-        (endpoint, held)
-        for endpoint, held in registry.registrations()
-        if held.kind is Kind.SUBSCRIBER and held.name == topic
+        (endpoint, registration)
+        for endpoint, registration in registry.registrations()
+        if registration.kind is Kind.SUBSCRIBER and registration.name == topic
     ]
 
 
 def service(registry: Registry, name: str) -> Endpoint | None:
     """The node that has a hidden service."""
-    found = _living(registry.hidden.get((Kind.SERVICE, name), {}).values())
-    return found[0] if found else None
+    providers = _living(registry.hidden.get((Kind.SERVICE, name), {}).values())
+    return providers[0] if providers else None
 
 
 def node(registry: Registry, caller_id: str) -> Endpoint | None:
@@ -49,10 +49,10 @@ def node(registry: Registry, caller_id: str) -> Endpoint | None:
     endpoint = registry.by_caller.get(caller_id)
     if endpoint is None or endpoint.health.cleaned:
         return None
-    held = [one for one in endpoint.registrations.values() if one.caller_id == caller_id]
-    return endpoint if all(one.hidden for one in held) else None
+    registrations = [r for r in endpoint.registrations.values() if r.caller_id == caller_id]
+    return endpoint if all(r.hidden for r in registrations) else None
 
 
 def _living(endpoints: Iterable[Endpoint]) -> list[Endpoint]:
-    found = {id(endpoint): endpoint for endpoint in endpoints if not endpoint.health.cleaned}
-    return sorted(found.values(), key=lambda endpoint: endpoint.port)
+    by_id = {id(endpoint): endpoint for endpoint in endpoints if not endpoint.health.cleaned}
+    return sorted(by_id.values(), key=lambda endpoint: endpoint.port)

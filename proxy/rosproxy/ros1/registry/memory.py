@@ -52,16 +52,16 @@ def to_remember(endpoints: Iterable[Endpoint], ports: PortMap) -> str:
 
 def remembered(value: object, ports: PortMap) -> Mapping[int, Remembered]:
     """What a value tells of the ports of the range, by the port that listens; never an error."""
-    found = {ports.listening(port): lease for port, lease in _read(value)}
-    return {port: lease for port, lease in found.items() if port is not None}
+    leases = {ports.listening(port): lease for port, lease in _read(value)}
+    return {port: lease for port, lease in leases.items() if port is not None}
 
 
-def lease_at(parameters: object, where: HostPort) -> Remembered | None:
-    """What any proxy has at an advertised address, given all that is in the NAMESPACE."""
-    name = _name_of(where.host)
-    held = parameters.items() if isinstance(parameters, dict) else ()
-    values = [value for key, value in held if str(key).startswith(name)]
-    return next((one for value in values for port, one in _read(value) if port == where.port), None)
+def lease_at(parameters: object, advertised: HostPort) -> Remembered | None:
+    """What any proxy has at an advertised host and port, given the parameters in NAMESPACE."""
+    name = _name_of(advertised.host)
+    items = parameters.items() if isinstance(parameters, dict) else ()
+    values = [v for key, v in items if str(key).startswith(name)]
+    return next((lease for v in values for p, lease in _read(v) if p == advertised.port), None)
 
 
 def _name_of(host: str) -> str:
@@ -71,11 +71,11 @@ def _name_of(host: str) -> str:
 def _read(value: object) -> Iterator[tuple[int, Remembered]]:
     """The advertised ports in a value, with what it tells of each."""
     for line in value.splitlines() if isinstance(value, str) else ():
-        told = _LINE.fullmatch(line)
-        node = parse_inside_path(f"http://h:1{told[2]}") if told else None
-        if told and node:
-            services = [int(text) for text in told[3].split()][:MOST_SERVICE_PORTS]
-            yield int(told[1]), Remembered(node, tuple(p for p in services if 0 < p < 65536))
+        match = _LINE.fullmatch(line)
+        node = parse_inside_path(f"http://h:1{match[2]}") if match else None
+        if match and node:
+            services = [int(text) for text in match[3].split()][:MOST_SERVICE_PORTS]
+            yield int(match[1]), Remembered(node, tuple(p for p in services if 0 < p < 65536))
 
 
 def _line(endpoint: Endpoint, ports: PortMap) -> str:

@@ -52,7 +52,7 @@ class Registry:
         self._last_port: dict[HostPort, int] = {}
         self._former: dict[int, Endpoint] = {}
         self._unproven: dict[str, dict[Endpoint, None]] = {}
-        """Those of each source that had not answered when that was last asked."""
+        """The endpoints of each source that had not answered when that was last asked."""
 
     def __iter__(self) -> Iterator[Endpoint]:
         """All endpoints; safe against changes while iterating."""
@@ -116,25 +116,25 @@ class Registry:
             del self._admitted[admission]
         self._former[endpoint.port] = endpoint
         self.pool.give_back(endpoint.port)
-        known = self._unproven.get(endpoint.source, {})
-        known.pop(endpoint, None)
-        if not known:
+        unproven = self._unproven.get(endpoint.source, {})
+        unproven.pop(endpoint, None)
+        if not unproven:
             self._unproven.pop(endpoint.source, None)
 
-    def move(self, places: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
+    def move(self, locations: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
         """Note that nodes are at other addresses now; ports and registrations stay.
 
         What came from the old address means the node at the new one from now on, and what it
         calls itself too. Those whose new address and port another endpoint holds are left where
         they are; the others are returned.
         """
-        moved = self._movable(places)
+        moved = self._movable(locations)
         self.lease_changes += 1
         for endpoint in moved:
             del self.by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
         for endpoint in moved:
-            endpoint.location = places[endpoint]
+            endpoint.location = locations[endpoint]
             self.by_slave[endpoint.slave] = endpoint
             self._remember(endpoint)
         for endpoint, node in admissions:
@@ -155,30 +155,30 @@ class Registry:
         Those that never answered go first, of the source that has most of them; then those that
         refuse, which have ended; then those that are silent, for the longest time.
         """
-        found = [e for e in self if e.expendable]
-        crowds = Counter(e.source for e in found if not e.proven)
+        expendable = [e for e in self if e.expendable]
+        crowds = Counter(e.source for e in expendable if not e.proven)
 
         def order(endpoint: Endpoint) -> tuple[bool, int, bool, float]:
             health, proven = endpoint.health, endpoint.proven
             crowd = 0 if proven else crowds[endpoint.source]
             return proven, -crowd, not health.refused, health.failing_since or 0.0
 
-        return min(found, key=order, default=None)
+        return min(expendable, key=order, default=None)
 
     def unproven(self, source: str) -> list[Endpoint]:
         """The endpoints that a source has registered whose nodes have never answered."""
-        known = self._unproven.get(source, {})
-        for endpoint in list(known):
+        unproven = self._unproven.get(source, {})
+        for endpoint in list(unproven):
             if endpoint.proven or self.by_port.get(endpoint.port) is not endpoint:
-                del known[endpoint]
-        return list(known)
+                del unproven[endpoint]
+        return list(unproven)
 
     @property
     def most_unproven(self) -> int:
-        """How many of them one source may have."""
+        """How many such endpoints one source may have."""
         return max(1, len(self.pool.range) // UNPROVEN_SHARE)
 
-    def register(self, endpoint: Endpoint, held: Registration) -> None:
+    def register(self, endpoint: Endpoint, registration: Registration) -> None:
         """Note what the master has accepted.
 
         As the master does, a service has one provider, and a name that registers from another
@@ -187,26 +187,28 @@ class Registry:
         from a node may be anything.
         """
         self.changes += 1
-        former = endpoint.registrations.get(held.key)
-        if held.characters > LONGEST_REGISTRATION or (endpoint.full and former is None):
+        former = endpoint.registrations.get(registration.key)
+        if registration.characters > LONGEST_REGISTRATION or (endpoint.full and former is None):
             return
-        other = self.by_caller.get(held.caller_id)
-        if other and other is not endpoint:
-            self.drop_caller(other, held.caller_id)
-        if held.kind is Kind.SERVICE:
-            before = self.services.get(held.name)
-            if before and before[1].key != held.key:
-                self._drop(before[0], before[1].key)
-            self.services[held.name] = (endpoint, held)
-            where = parse_service_uri(held.service_api or "")
-            if where is not None and endpoint.note_service_port(where.port):
+        owner = self.by_caller.get(registration.caller_id)
+        if owner and owner is not endpoint:
+            self.drop_caller(owner, registration.caller_id)
+        if registration.kind is Kind.SERVICE:
+            provider = self.services.get(registration.name)
+            if provider and provider[1].key != registration.key:
+                self._drop(provider[0], provider[1].key)
+            self.services[registration.name] = (endpoint, registration)
+            service = parse_service_uri(registration.service_api or "")
+            if service is not None and endpoint.note_service_port(service.port):
                 self.lease_changes += 1
-        if held.key not in endpoint.registrations:
-            endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
-        endpoint.characters += held.characters - (former.characters if former else 0)
-        endpoint.registrations[held.key] = held
-        self._index_hidden(endpoint, held)
-        self.by_caller[held.caller_id] = endpoint
+        if registration.key not in endpoint.registrations:
+            endpoint.callers[registration.caller_id] = (
+                endpoint.callers.get(registration.caller_id, 0) + 1
+            )
+        endpoint.characters += registration.characters - (former.characters if former else 0)
+        endpoint.registrations[registration.key] = registration
+        self._index_hidden(endpoint, registration)
+        self.by_caller[registration.caller_id] = endpoint
         endpoint.note_used()
 
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
@@ -226,36 +228,36 @@ class Registry:
         Those removed come last, until somebody else has their port: a node that was handed their
         URI may still send it back.
         """
-        same = self._by_node.get(node, {}).values()
-        return sorted(same, key=lambda endpoint: endpoint.port in self._former)
+        endpoints = self._by_node.get(node, {}).values()
+        return sorted(endpoints, key=lambda endpoint: endpoint.port in self._former)
 
     def service_port(self, endpoint: Endpoint, name: str) -> int | None:
         """The TCPROS port that an endpoint's node gave for a service; None if it is not known."""
-        known = self.services.get(name)
-        if known is None or known[0] is not endpoint:
+        provider = self.services.get(name)
+        if provider is None or provider[0] is not endpoint:
             return None
-        where = parse_service_uri(known[1].service_api or "")
-        return where.port if where else None
+        service = parse_service_uri(provider[1].service_api or "")
+        return service.port if service else None
 
     def note_service_port(self, endpoint: Endpoint, name: str, port: int) -> None:
         """Note the TCPROS port at which an endpoint's node has answered for a service."""
-        known = self.services.get(name)
-        if known is not None and known[0] is endpoint:
-            api = service_uri(HostPort(endpoint.node.host, port))
-            self.register(endpoint, replace(known[1], service_api=api))
+        provider = self.services.get(name)
+        if provider is not None and provider[0] is endpoint:
+            uri = service_uri(HostPort(endpoint.node.host, port))
+            self.register(endpoint, replace(provider[1], service_api=uri))
 
     def registrations(self) -> Iterable[tuple[Endpoint, Registration]]:
         """Everything that is registered, with its endpoint."""
-        return [(e, held) for e in self for held in e.registrations.values()]
+        return [(e, r) for e in self for r in e.registrations.values()]
 
-    def _movable(self, places: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
+    def _movable(self, locations: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
         """Those whose new addresses are free, or will be; of two for the same one the first."""
-        moved = list(places)
+        moved = list(locations)
         while True:
             taken = {slave for slave, e in self.by_slave.items() if e not in moved}
             kept = []
             for endpoint in moved:
-                slave = HostPort(places[endpoint].address, endpoint.node.port)
+                slave = HostPort(locations[endpoint].address, endpoint.node.port)
                 if slave not in taken:
                     taken.add(slave)
                     kept.append(endpoint)
@@ -264,7 +266,7 @@ class Registry:
             moved = kept
 
     def _take_admissions(self, endpoint: Endpoint) -> list[HostPort]:
-        """What meant an endpoint if its own address said so; it no longer does."""
+        """End the admissions of an endpoint's own address; their hosts and ports, and its own."""
         address = endpoint.location.address
         nodes = [node for node, source in endpoint.admissions if source == address]
         for node in nodes:
@@ -284,8 +286,8 @@ class Registry:
         return endpoint
 
     def _admit(self, endpoint: Endpoint, node: HostPort, source: str) -> None:
-        before = self._admitted.get((node, source), endpoint)
-        before.admissions.pop((node, source), None)
+        previous = self._admitted.get((node, source), endpoint)
+        previous.admissions.pop((node, source), None)
         self._admitted[node, source] = endpoint
         endpoint.admissions[node, source] = None
         if len(endpoint.admissions) > MOST_ADMISSIONS:
@@ -303,28 +305,28 @@ class Registry:
         self._last_port[endpoint.slave] = endpoint.port
 
     def _forget_node(self, endpoint: Endpoint) -> None:
-        same = self._by_node[endpoint.node]
-        del same[endpoint.port]
-        if not same:
+        endpoints = self._by_node[endpoint.node]
+        del endpoints[endpoint.port]
+        if not endpoints:
             del self._by_node[endpoint.node]
 
-    def _index_hidden(self, endpoint: Endpoint, held: Registration) -> None:
+    def _index_hidden(self, endpoint: Endpoint, registration: Registration) -> None:
         """Note by kind and name that a registration is hidden, or no longer."""
-        found = self.hidden.setdefault((held.kind, held.name), {})
-        if held.hidden:
-            found[held.caller_id] = endpoint
-        elif found.get(held.caller_id) is endpoint:
-            del found[held.caller_id]
-        if not found:
-            del self.hidden[held.kind, held.name]
+        endpoints = self.hidden.setdefault((registration.kind, registration.name), {})
+        if registration.hidden:
+            endpoints[registration.caller_id] = endpoint
+        elif endpoints.get(registration.caller_id) is endpoint:
+            del endpoints[registration.caller_id]
+        if not endpoints:
+            del self.hidden[registration.kind, registration.name]
 
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
-        held = endpoint.registrations.pop(key, None)
-        if held is None:
+        registration = endpoint.registrations.pop(key, None)
+        if registration is None:
             return
         self.changes += 1
-        endpoint.characters -= held.characters
-        self._index_hidden(endpoint, replace(held, hidden=False))
+        endpoint.characters -= registration.characters
+        self._index_hidden(endpoint, replace(registration, hidden=False))
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
             self.services.pop(name, None)

@@ -32,9 +32,9 @@ def client_kind(
     return ClientKind.ADMITTED if selected is None else ClientKind.UNSELECTED
 
 
-def refusal(address: str, found: ClientKind, networks: Sequence[Network]) -> str:
+def refusal(address: str, kind: ClientKind, networks: Sequence[Network]) -> str:
     """What somebody is told, in one line, who may not use the proxy as its master."""
-    if found is ClientKind.UNSELECTED:
+    if kind is ClientKind.UNSELECTED:
         return (
             f"rosproxy: {address} is not selected to use this proxy as its master: label its "
             "container rosproxy.enable=true (Docker) or its pod rosproxy.io/inject=true "

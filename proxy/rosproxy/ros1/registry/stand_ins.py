@@ -5,7 +5,7 @@ one node outside, or to the server of one service. There are two cases of it:
 
   * ``--direction both``: inside has no way outwards but the proxy. Every URI of outside gets a
     stand-in, at a port of the proxy's choice, and inside is told that port instead,
-    ``http://PROXY:PORT/``: by it what comes back from inside is undone.
+    ``http://PROXY:PORT/``: what comes back from inside is turned back by it.
   * The master's host name leads to the proxy (a network alias of Docker, so that ``ROS_MASTER_URI``
     need not change). The nodes on the master's host give that very name in their URIs, which lead
     to the proxy, too. So the same port numbers stand in for theirs, and the URIs stay as they are.
@@ -120,7 +120,7 @@ class StandIn:
             del self.topic_ports[next(iter(self.topic_ports))]
 
     @property
-    def told(self) -> str:
+    def inside_uri(self) -> str:
         """What inside is told instead of the URI."""
         if self.kept:
             return self.uri
@@ -140,39 +140,39 @@ class StandIns:
         self.both = settings.direction == "both"
         self.aliased = aliased_host(settings.master_uri) or ""
         self.by_local: dict[HostPort, StandIn] = {}
-        """The one that was of no use for longest first."""
+        """By where they listen, the one that was unused for longest first."""
         self._by_uri: dict[tuple[str, str], StandIn] = {}
         self._former: dict[HostPort, str] = {}
         """URIs by where something stood in for them, longest ago first."""
         self.by_port: dict[int, StandIn] = {}
-        """Those with a fast port, by that."""
+        """The stand-ins with a fast port, by that port."""
 
     def target(self, uri: str) -> HostPort | None:
         """What a stand-in for a URI of the master's has to lead to; None if it needs none.
 
-        The caller knows that it is no URI of this proxy's own, and none of inside.
+        The caller makes sure that it is no URI of this proxy's own, and none of inside.
         """
-        where = parse_slave_uri(uri) or parse_service_uri(uri)
-        if where is None or self.both:
-            return where
-        return where if self.aliased and where.host.lower() == self.aliased else None
+        host_port = parse_slave_uri(uri) or parse_service_uri(uri)
+        if host_port is None or self.both:
+            return host_port
+        return host_port if self.aliased and host_port.host.lower() == self.aliased else None
 
-    def candidates(self, uri: str, where: HostPort, address: str) -> Iterator[StandIn]:
-        """Those to try for a URI at an address, one after the other; always the same."""
+    def candidates(self, uri: str, target: HostPort, address: str) -> Iterator[StandIn]:
+        """The stand-ins to try for a URI at an address, one after the other; always the same."""
         if not self.both:
-            yield StandIn(HostPort(address, where.port), uri, where, kept=True)
+            yield StandIn(HostPort(address, target.port), uri, target, kept=True)
             return
         seed = _number(uri)
         for number in range(TRIES):
             port = PORTS[(seed + number * number) % _HALF]
-            yield StandIn(HostPort(address, port), uri, where, kept=False)
+            yield StandIn(HostPort(address, port), uri, target, kept=False)
 
-    def address(self, towards: str) -> str:
+    def address(self, proxy: str) -> str:
         """Where stand-ins listen for a node inside that sees the proxy at an address.
 
         At that address alone; but at all where the URIs are kept, since a name may lead to any.
         """
-        return towards if self.both else self._settings.bind
+        return proxy if self.both else self._settings.bind
 
     def at(self, local: HostPort) -> StandIn | None:
         """The stand-in at which a connection arrived."""
@@ -183,9 +183,9 @@ class StandIns:
         return self._by_uri.get((address, uri))
 
     def choose_fast_candidate(self, stand_in: StandIn) -> HostPort | None:
-        """Go on to the first of its candidates that no other stand-in has; None if it needs none.
+        """Go on to the first of its candidates that no other stand-in has; None if all are taken.
 
-        That is one which may have no fast port, or has it. None as well if all are taken.
+        None as well if it needs none, since it has a fast port or may have none.
         """
         if stand_in.fast_port is not None or stand_in.fast_candidate is None:
             return None
@@ -200,13 +200,13 @@ class StandIns:
         return stands_in or obstacle(port, self._settings) is not None
 
     def add(self, stand_in: StandIn) -> None:
-        """Take in one that listens now."""
+        """Take in a stand-in that listens now."""
         self.by_local[stand_in.local] = stand_in
         self._by_uri[stand_in.local.host, stand_in.uri] = stand_in
         self._former.pop(stand_in.local, None)
 
     def remove(self, stand_in: StandIn) -> None:
-        """Forget one that listens no more."""
+        """Forget a stand-in that listens no more."""
         del self.by_local[stand_in.local]
         del self._by_uri[stand_in.local.host, stand_in.uri]
         self._former[stand_in.local] = stand_in.uri
@@ -225,34 +225,34 @@ class StandIns:
             del self.by_port[stand_in.port]
 
     def note_used(self, stand_in: StandIn) -> None:
-        """Note that it is of use."""
+        """Note that a stand-in is used."""
         if self.by_local.get(stand_in.local) is stand_in:
             self.by_local[stand_in.local] = self.by_local.pop(stand_in.local)
 
-    def advice(self, where: HostPort, why: str, address: str) -> str:
+    def advice(self, target: HostPort, reason: str, address: str) -> str:
         """What is wrong where no port can stand in, and the cure; ``address`` is the master's."""
         if self.both:
-            return f"inside nodes can't reach it: no port stands in for {where}; the last {why}"
+            return f"inside nodes can't reach it: no port stands in for {target}; the last {reason}"
         return (
-            f"inside nodes can't reach it: port {where.port} {why}. Start that node with "
+            f"inside nodes can't reach it: port {target.port} {reason}. Start that node with "
             f"ROS_IP={address}, so that it gives its address instead of its host name"
         )
 
     def import_uri(self, uri: str, address: str) -> str:
         """What inside nodes are told instead of a URI of outside, given the proxy's address."""
-        found = self.find(self.address(address), uri)
-        return found.told if found else uri
+        stand_in = self.find(self.address(address), uri)
+        return stand_in.inside_uri if stand_in else uri
 
     def export_uri(self, uri: str) -> str | None:
         """The URI of outside that inside nodes were once told this one for; None if it is none."""
         if not self.both or len(uri) > LONGEST_URI:
             return None
         service = parse_service_uri(uri)
-        where = service or parse_slave_uri(uri)
-        if where is None:
+        local = service or parse_slave_uri(uri)
+        if local is None:
             return None
-        stand_in = self.at(where)
-        original = stand_in.uri if stand_in else self._former.get(where)
+        stand_in = self.at(local)
+        original = stand_in.uri if stand_in else self._former.get(local)
         if original is None or bool(parse_service_uri(original)) is not bool(service):
             return None
         return original
@@ -260,22 +260,22 @@ class StandIns:
 
 def aliased_host(master_uri: str) -> str | None:
     """The master's host if it is a name that can lead to the proxy, in lower case."""
-    where = parse_slave_uri(master_uri)
-    if where is None or is_address(where.host) or is_loopback(where.host):
+    master = parse_slave_uri(master_uri)
+    if master is None or is_address(master.host) or is_loopback(master.host):
         return None
-    return where.host.lower()
+    return master.host.lower()
 
 
 def obstacle(port: int, settings: Settings) -> str | None:
     """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
     if port in settings.ports.listen:
         return f"lies in --port-range {settings.ports.listen}"
-    own = {
+    option_by_port = {
         settings.master_port: "--master-port",
         settings.publish_master: "--publish-master",
         settings.admin.port: "--admin-bind",
     }
-    return f"is that of {own[port]}" if port in own else None
+    return f"is that of {option_by_port[port]}" if port in option_by_port else None
 
 
 def _number(text: str) -> int:

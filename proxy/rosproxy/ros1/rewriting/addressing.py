@@ -81,12 +81,12 @@ class Addressing:
         uri = placed(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
-        where = parse_slave_uri(uri)
-        endpoint = self._own(where, caller) if where else None
+        slave = parse_slave_uri(uri)
+        endpoint = self._meant_by(slave, caller) if slave else None
         if endpoint:
             return self.advertised_uri(endpoint)
-        if where and self._is_relayed(where, caller):
-            return uri.replace(str(where), str(self.outside(where.port)), 1)
+        if slave and self._is_relayed(slave, caller):
+            return uri.replace(str(slave), str(self.outside(slave.port)), 1)
         return uri
 
     def export_service(self, uri: str, service: str, caller: Caller) -> str:
@@ -94,14 +94,14 @@ class Addressing:
         uri = placed(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
-        where = parse_service_uri(uri)
-        if where is None:
+        host_port = parse_service_uri(uri)
+        if host_port is None:
             return uri
-        if self._is_relayed(where, caller):
-            return service_uri(self.outside(where.port))
-        known = self.registry.services.get(service)
-        if known and (where.host == known[0].node.host or uri == known[1].service_api):
-            return self.advertised_service(known[0])
+        if self._is_relayed(host_port, caller):
+            return service_uri(self.outside(host_port.port))
+        provider = self.registry.services.get(service)
+        if provider and (host_port.host == provider[0].node.host or uri == provider[1].service_api):
+            return self.advertised_service(provider[0])
         return uri
 
     def import_slave(self, uri: str, caller: Caller) -> str:
@@ -114,28 +114,28 @@ class Addressing:
         endpoint = self._endpoint_at(parse_service_uri(uri))
         if endpoint is None:
             return self._import_foreign(uri, caller)
-        literal = self._service_literal(endpoint, service)
-        if literal and self._direct(endpoint, caller):
-            return literal
+        own_uri = self._own_service_uri(endpoint, service)
+        if own_uri and self._is_direct(endpoint, caller):
+            return own_uri
         return service_uri(HostPort(caller.proxy, endpoint.port))
 
     def foreign(self, uri: str) -> HostPort | None:
-        """What a stand-in for a URI that the master has needs to lead to; None if it needs none."""
-        where = self.stand_ins.target(uri)
-        if where is None or self.advertises(where) or is_inside(where.host, self.networks):
+        """Where a stand-in for a URI at the master is to lead; None if it needs no stand-in."""
+        target = self.stand_ins.target(uri)
+        if target is None or self.advertises(target) or is_inside(target.host, self.networks):
             return None
-        return where
+        return target
 
     def handed_out(self, uri: str, caller: Caller) -> bool:
         """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
-        where = parse_slave_uri(uri)
-        if where is None:
+        slave = parse_slave_uri(uri)
+        if slave is None:
             return False
-        return self._is_relayed(where, caller) or self.stands_for(uri) is not None
+        return self._is_relayed(slave, caller) or self.stands_for(uri) is not None
 
-    def advertises(self, where: HostPort) -> bool:
+    def advertises(self, host_port: HostPort) -> bool:
         """Whether outside finds one of this proxy's own ports at a host and port."""
-        return self._listening(where) is not None
+        return self._listening(host_port) is not None
 
     def lease_of(self, uri: str) -> int | None:
         """The listening port of an advertised slave URI of this proxy."""
@@ -145,11 +145,11 @@ class Addressing:
         return self.stand_ins.import_uri(uri, caller.proxy) if self.foreign(uri) else uri
 
     def _import(self, endpoint: Endpoint, caller: Caller) -> str:
-        if self._direct(endpoint, caller) and self._own(endpoint.node, caller) is endpoint:
+        if self._is_direct(endpoint, caller) and self._meant_by(endpoint.node, caller) is endpoint:
             return endpoint.uri
         return slave_uri(HostPort(caller.proxy, endpoint.port))
 
-    def _direct(self, endpoint: Endpoint, caller: Caller) -> bool:
+    def _is_direct(self, endpoint: Endpoint, caller: Caller) -> bool:
         if endpoint is caller.endpoint:
             return True
         if caller.address == endpoint.location.address:
@@ -169,29 +169,29 @@ class Addressing:
             return endpoint
         return None
 
-    def _endpoint_at(self, where: HostPort | None) -> Endpoint | None:
-        port = self._listening(where)
+    def _endpoint_at(self, host_port: HostPort | None) -> Endpoint | None:
+        port = self._listening(host_port)
         return self.registry.by_port.get(port) if port else None
 
-    def _listening(self, where: HostPort | None) -> int | None:
-        if where is None or where.host != self.host:
+    def _listening(self, host_port: HostPort | None) -> int | None:
+        if host_port is None or host_port.host != self.host:
             return None
-        return self.ports.listening(where.port)
+        return self.ports.listening(host_port.port)
 
-    def _is_relayed(self, where: HostPort, caller: Caller) -> bool:
-        return where.host == caller.proxy and where.port in self.ports.listen
+    def _is_relayed(self, host_port: HostPort, caller: Caller) -> bool:
+        return host_port.host == caller.proxy and host_port.port in self.ports.listen
 
-    def _own(self, node: HostPort, caller: Caller) -> Endpoint | None:
-        """Whom an caller means by a host and port; several nodes may call themselves the same."""
+    def _meant_by(self, node: HostPort, caller: Caller) -> Endpoint | None:
+        """Whom a caller means by a host and port; several nodes may call themselves the same."""
         admitted = self.registry.admitted(node, caller.address)
 
         def distance(endpoint: Endpoint) -> tuple[bool, bool, bool]:
-            itself = endpoint is caller.endpoint
-            return not itself, endpoint is not admitted, endpoint.location.address != caller.address
+            own = endpoint is caller.endpoint
+            return not own, endpoint is not admitted, endpoint.location.address != caller.address
 
         return min(self.registry.by_node(node), key=distance, default=None)
 
-    def _service_literal(self, endpoint: Endpoint, service: str) -> str | None:
-        """A service as its provider gave it; None if that is not known (after a recovery)."""
-        known = self.registry.services.get(service)
-        return known[1].service_api if known and known[0] is endpoint else None
+    def _own_service_uri(self, endpoint: Endpoint, service: str) -> str | None:
+        """A service's URI as its provider gave it; None if that is not known (after a recovery)."""
+        provider = self.registry.services.get(service)
+        return provider[1].service_api if provider and provider[0] is endpoint else None

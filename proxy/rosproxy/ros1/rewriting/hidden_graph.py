@@ -16,24 +16,24 @@ METHODS = frozenset({"getPublishedTopics", "getTopicTypes", "getSystemState"})
 _TABLES = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
-def completed(call: Call, said: Any, registry: Registry) -> Any:
+def completed(call: Call, listing: Any, registry: Registry) -> Any:
     """What the master has said of the graph, with what is hidden; as it is if it is malformed."""
-    if not isinstance(said, list):
-        return said
+    if not isinstance(listing, list):
+        return listing
     if call.method == "getSystemState":
-        if len(said) != len(_TABLES):
-            return said
-        pairs = zip(_TABLES, said, strict=True)
+        if len(listing) != len(_TABLES):
+            return listing
+        pairs = zip(_TABLES, listing, strict=True)
         return [_with_nodes(table, kind, registry) for kind, table in pairs]
     kinds, prefix = [Kind.PUBLISHER, Kind.SUBSCRIBER], ""
     if call.method == "getPublishedTopics":  # of a namespace, if it names one
         kinds, namespace = kinds[:1], call.string(1) or ""
         prefix = f"{namespace.rstrip('/')}/" if namespace else ""
-    known, types = read_types(said), _types(kinds, registry)
-    return said + [
+    listed, types = read_types(listing), _types(kinds, registry)
+    return listing + [
         [topic, type_]
         for topic, type_ in sorted(types.items())
-        if topic not in known and topic.startswith(prefix)
+        if topic not in listed and topic.startswith(prefix)
     ]
 
 
@@ -58,10 +58,10 @@ def _is_row(row: Any) -> bool:
 
 def _types(kinds: list[Kind], registry: Registry) -> dict[str, str]:
     """The types of hidden topics, as far as a node has given one."""
-    found: dict[str, str] = {}
+    types: dict[str, str] = {}
     for (kind, name), holders in registry.hidden.items():
         for node, endpoint in holders.items() if kind in kinds else ():
             type_ = endpoint.registrations[kind, name, node].type
-            if found.get(name, "*") == "*":
-                found[name] = type_
-    return found
+            if types.get(name, "*") == "*":
+                types[name] = type_
+    return types

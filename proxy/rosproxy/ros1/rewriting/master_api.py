@@ -71,7 +71,7 @@ def import_reply(
         edits += _import_result(result, caller, addressing, changes)
     if request.multicall and reply.value and reply.value.items:
         outcomes = enumerate(reply.exported.outcomes)
-        local = [(i, one.triple()) for i, one in outcomes if isinstance(one, LocalReply)]
+        local = [(i, o.triple()) for i, o in outcomes if isinstance(o, LocalReply)]
         results = [(i, xmlrpc.dump_value([triple])) for i, triple in local]
         edits += insert_items(reply.value, results)
     return xmlrpc.apply(reply.body, edits)
@@ -96,16 +96,16 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
 
 def holder(call: Call, caller: Caller, addressing: Addressing) -> Endpoint | None:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
-    found, known = method_spec(call.method), addressing.registry.by_caller.get(caller_id_of(call))
-    if known is None:
+    spec, endpoint = method_spec(call.method), addressing.registry.by_caller.get(caller_id_of(call))
+    if endpoint is None:
         return None
-    if found.caller_api is None:
+    if spec.caller_api is None:
         uri = addressing.export_service(
-            call.string(found.service_api) or "", second_name(call), caller
+            call.string(spec.service_api) or "", second_name(call), caller
         )
-        return known if uri == addressing.advertised_service(known) else None
-    uri = addressing.export_slave(call.string(found.caller_api) or "", caller)
-    return known if uri == addressing.advertised_uri(known) else None
+        return endpoint if uri == addressing.advertised_service(endpoint) else None
+    uri = addressing.export_slave(call.string(spec.caller_api) or "", caller)
+    return endpoint if uri == addressing.advertised_uri(endpoint) else None
 
 
 def _export_call(
@@ -132,15 +132,15 @@ def _import_result(
     triple = result.triple
     if triple is None or not result.accepted:
         return []
-    held = triple.items[2]
+    value = triple.items[2]
     if method_spec(result.call.method).reply is Reply.SLAVE_URIS:
-        return _import_uris(result.call, held, caller, addressing, changes)
+        return _import_uris(result.call, value, caller, addressing, changes)
     if result.call.method == "getParamNames":
-        return [xmlrpc.remove(item) for item in held.items if item.text in changes.params]
+        return [xmlrpc.remove(item) for item in value.items if item.text in changes.params]
     if changes.graph and result.call.method in hidden_graph.METHODS:
-        said = xmlrpc.python_value(held)
-        more = hidden_graph.completed(result.call, said, addressing.registry)
-        return [Edit(*held.outer, xmlrpc.dump_value(more))]
+        listing = xmlrpc.python_value(value)
+        completed = hidden_graph.completed(result.call, listing, addressing.registry)
+        return [Edit(*value.outer, xmlrpc.dump_value(completed))]
     return _import_uri(result.call, triple, caller, addressing)
 
 
@@ -157,31 +157,31 @@ def _import_uri(call: Call, triple: Value, caller: Caller, addressing: Addressin
 
 
 def _import_uris(
-    call: Call, held: Value, caller: Caller, addressing: Addressing, changes: ReplyChanges
+    call: Call, array: Value, caller: Caller, addressing: Addressing, changes: ReplyChanges
 ) -> list[Edit]:
     """The publishers that a subscriber is told of, or the subscribers that a publisher is."""
-    more: Sequence[str] = ()
+    extra: Sequence[str] = ()
     if method_spec(call.method).registers is Kind.SUBSCRIBER:
-        more = changes.publishers.get(second_name(call), ())
-    if more:
-        uris = [*(item.text for item in held.items), *more]
+        extra = changes.publishers.get(second_name(call), ())
+    if extra:
+        uris = [*(item.text for item in array.items), *extra]
         imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
-        return [Edit(*held.outer, xmlrpc.dump_value([*imported]))]
+        return [Edit(*array.outer, xmlrpc.dump_value([*imported]))]
     return [
         xmlrpc.replace(item, addressing.import_slave(item.text, caller))
-        for item in held.items
+        for item in array.items
         if item.kind == "string"
     ]
 
 
 def registration(call: Call, now: float, source: str) -> Registration | None:
     """What a call from an address registers or unregisters; None for any other call."""
-    found, caller_id = method_spec(call.method), caller_id_of(call)
-    kind, name = found.registers or found.unregisters, call.string(found.name)
+    spec, caller_id = method_spec(call.method), caller_id_of(call)
+    kind, name = spec.registers or spec.unregisters, call.string(spec.name)
     if kind is None or not name:
         return None
-    name, type_ = resolve_name(name, caller_id), call.string(found.type) or "*"
-    service_api = call.string(found.service_api)
+    name, type_ = resolve_name(name, caller_id), call.string(spec.type) or "*"
+    service_api = call.string(spec.service_api)
     if service_api is not None:
         service_api = placed(service_api, source)
     return Registration(kind, name, caller_id, type_, service_api, now)

@@ -50,7 +50,7 @@ class Answered(msgspec.Struct, frozen=True):
 
 
 class ReplyChanges(msgspec.Struct, frozen=True):
-    """What a reply has to say otherwise than the master does.
+    """What has to be changed in the master's reply to a request.
 
     ``publishers`` are those by topic that the master does not know of, as it would have them;
     ``params`` the names that getParamNames leaves out; ``graph`` says whether replies that tell
@@ -127,13 +127,13 @@ class Exported(msgspec.Struct, frozen=True):
 
     def local_reply(self) -> bytes:
         """The whole reply to a request of which the master gets nothing."""
-        triples = [one.triple() for one in self.outcomes if isinstance(one, LocalReply)]
+        triples = [o.triple() for o in self.outcomes if isinstance(o, LocalReply)]
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
     def facts(self) -> "list[RegistryChange]":
         """What the registry has to learn from the calls that the proxy answers."""
-        local = (one for one in self.outcomes if isinstance(one, Answered))
-        return [one.fact for one in local if one.fact]
+        local = (o for o in self.outcomes if isinstance(o, Answered))
+        return [o.fact for o in local if o.fact]
 
 
 class Result(msgspec.Struct, frozen=True):
@@ -191,20 +191,20 @@ class MasterReply(msgspec.Struct, frozen=True):
         The master also accepts what changes nothing: a node that makes room for another of its
         name unregisters with its own URI, and the other's registrations stay.
         """
-        found = []
+        changes = []
         for result in self.results:
-            held = registration(result.call, now, self.exported.request.caller.address)
-            if held and result.accepted and result.endpoint:
-                made = method_spec(result.call.method).registers is not None
-                found.append(RegistryChange(held, result.endpoint if made else None))
-        return found
+            affected = registration(result.call, now, self.exported.request.caller.address)
+            if affected and result.accepted and result.endpoint:
+                registers = method_spec(result.call.method).registers is not None
+                changes.append(RegistryChange(affected, result.endpoint if registers else None))
+        return changes
 
     def uris(self) -> Iterator[str]:
         """The URIs that it hands to an inside node, as the master holds them."""
         for result in self.results:
-            held = result.value
-            if held and result.accepted and method_spec(result.call.method).reply in _URIS:
-                texts = (item.string() for item in (held.items or [held]))
+            value = result.value
+            if value and result.accepted and method_spec(result.call.method).reply in _URIS:
+                texts = (item.string() for item in (value.items or [value]))
                 yield from (text for text in texts if text)
 
 
@@ -241,12 +241,12 @@ def registering_uri(call: Call | None) -> str | None:
 
 def registration(call: Call, now: float, source: str) -> Registration | None:
     """What a call from an address registers or unregisters; None for any other call."""
-    found, caller_id = method_spec(call.method), caller_id_of(call)
-    kind, name = found.registers or found.unregisters, call.string(found.name)
+    spec, caller_id = method_spec(call.method), caller_id_of(call)
+    kind, name = spec.registers or spec.unregisters, call.string(spec.name)
     if kind is None or not name:
         return None
-    name, type_ = resolve_name(name, caller_id), call.string(found.type) or "*"
-    service_api = call.string(found.service_api)
+    name, type_ = resolve_name(name, caller_id), call.string(spec.type) or "*"
+    service_api = call.string(spec.service_api)
     if service_api is not None:
         service_api = placed(service_api, source)
     return Registration(kind, name, caller_id, type_, service_api, now)

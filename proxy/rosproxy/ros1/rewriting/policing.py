@@ -49,38 +49,40 @@ def param_use(method: str, caller_id: str, name: str | None) -> ParamUse | None:
     if name is None:
         return ParamUse(kind, (_EVERYTHING,), True)
     if method == "searchParam":
-        return ParamUse(kind, _searched(caller_id, name), False)
+        return ParamUse(kind, _searched_names(caller_id, name), False)
     return ParamUse(kind, (resolve_name(name, caller_id),), method in _WHOLE)
 
 
 def param_use_of(call: Call) -> ParamUse | None:
-    """The same of a call that was read."""
+    """What a call that was read does with parameters; None if nothing."""
     place = _READS.get(call.method) or _WRITES.get(call.method)
     return param_use(call.method, call.string(0) or "", call.string(place))
 
 
 def hidden_registration(
-    held: Registration, endpoint: Endpoint, caller: Caller, addressing: Addressing
+    registration: Registration, endpoint: Endpoint, caller: Caller, addressing: Addressing
 ) -> Answered:
     """The answer to a registration that the master is not told of."""
     caller, registry = replace(caller, endpoint=endpoint), addressing.registry
-    fact = RegistryChange(held, endpoint)
-    if held.kind is Kind.SERVICE:
-        text = f"Registered [{held.caller_id}] as provider of [{held.name}]"
+    fact = RegistryChange(registration, endpoint)
+    if registration.kind is Kind.SERVICE:
+        text = f"Registered [{registration.caller_id}] as provider of [{registration.name}]"
         return Answered(1, text, 1, fact)
-    if held.kind is Kind.PUBLISHER:
-        found: Iterable[Endpoint] = (e for e, _ in hidden.subscribers_inside(registry, held.name))
-        text = f"Registered [{held.caller_id}] as publisher of [{held.name}]"
+    if registration.kind is Kind.PUBLISHER:
+        endpoints: Iterable[Endpoint] = (
+            e for e, _ in hidden.subscribers_inside(registry, registration.name)
+        )
+        text = f"Registered [{registration.caller_id}] as publisher of [{registration.name}]"
     else:
-        found = hidden.publishers_inside(registry, held.name)
-        text = f"Subscribed to [{held.name}]"
-    return Answered(1, text, _imported(dict.fromkeys(found), caller, addressing), fact)
+        endpoints = hidden.publishers_inside(registry, registration.name)
+        text = f"Subscribed to [{registration.name}]"
+    return Answered(1, text, _imported(dict.fromkeys(endpoints), caller, addressing), fact)
 
 
-def hidden_end(held: Registration) -> Answered:
+def hidden_end(registration: Registration) -> Answered:
     """The answer to a call that ends a registration of which the master knows nothing."""
-    text = f"Unregistered [{held.caller_id}] as provider of [{held.name}]"
-    return Answered(1, text, 1, RegistryChange(held, None))
+    text = f"Unregistered [{registration.caller_id}] as provider of [{registration.name}]"
+    return Answered(1, text, 1, RegistryChange(registration, None))
 
 
 def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> Answered | None:
@@ -89,8 +91,8 @@ def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> Answer
     if endpoint is None:
         return None
     uri = addressing.advertised_service(endpoint)
-    found = addressing.import_service(uri, second_name(call), caller)
-    return Answered(1, f"rosrpc URI: [{found}]", found)
+    imported = addressing.import_service(uri, second_name(call), caller)
+    return Answered(1, f"rosrpc URI: [{imported}]", imported)
 
 
 def hidden_node(call: Call, caller: Caller, addressing: Addressing) -> Answered | None:
@@ -129,24 +131,24 @@ def publishers_for(
     if endpoint is None:
         return [*at_master]
     if hidden.is_hidden_subscriber(registry, endpoint, topic):
-        at_master, more = [], hidden.publishers_inside(registry, topic)
+        at_master, extra = [], hidden.publishers_inside(registry, topic)
     else:
-        more = hidden.publishers(registry, topic)
-    return [*dict.fromkeys([*at_master, *map(addressing.advertised_uri, more)])]
+        extra = hidden.publishers(registry, topic)
+    return [*dict.fromkeys([*at_master, *map(addressing.advertised_uri, extra)])]
 
 
 def topic_names(topic: str, caller_id: str) -> tuple[str, ...]:
-    """The names that a node may take a topic for which somebody outside names."""
+    """The names to which a node may resolve a topic as somebody outside has written it."""
     return tuple(dict.fromkeys((topic, resolve_name(topic, ""), resolve_name(topic, caller_id))))
 
 
-def _searched(caller_id: str, name: str) -> tuple[str, ...]:
+def _searched_names(caller_id: str, name: str) -> tuple[str, ...]:
     """The names that searchParam looks at: in all namespaces of the caller, from its own up."""
     if name.startswith(("/", "~")):
         return (resolve_name(name, caller_id),)
-    parts = [part for part in caller_id.split("/") if part]
-    spaces = ("/".join(["", *parts[:count]]) for count in range(len(parts), -1, -1))
-    return tuple(resolve_name(f"{space}/{name}", "") for space in spaces)
+    segments = [segment for segment in caller_id.split("/") if segment]
+    namespaces = ("/".join(["", *segments[:count]]) for count in range(len(segments), -1, -1))
+    return tuple(resolve_name(f"{namespace}/{name}", "") for namespace in namespaces)
 
 
 def _imported(endpoints: Iterable[Endpoint], caller: Caller, addressing: Addressing) -> list[str]:

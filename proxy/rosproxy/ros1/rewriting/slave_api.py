@@ -31,12 +31,12 @@ _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 class CallView(msgspec.Struct, frozen=True):
     """How the two ends of a call see the nodes that they name.
 
-    ``asked`` is what a slave URI in the call becomes, ``answered`` one in the reply, ``master_uri``
-    the URI that the caller has for the master.
+    ``rewrite_in_call`` makes of a slave URI in the call what the node sees, ``rewrite_in_reply`` of
+    one in the reply what the caller sees; ``master_uri`` is the caller's URI for the master.
     """
 
-    asked: Callable[[str], str]
-    answered: Callable[[str], str]
+    rewrite_in_call: Callable[[str], str]
+    rewrite_in_reply: Callable[[str], str]
     master_uri: str
 
 
@@ -70,11 +70,11 @@ def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
 
     Their order is kept; a publisher that is named twice is left out the second time.
     """
-    edits, seen = [], set()
+    edits, listed = [], set()
     for item in _publishers(call):
-        uri = view.asked(item.text)
-        edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
-        seen.add(uri)
+        uri = view.rewrite_in_call(item.text)
+        edits.append(xmlrpc.remove(item) if uri in listed else xmlrpc.replace(item, uri))
+        listed.add(uri)
     return xmlrpc.apply(body, edits)
 
 
@@ -94,7 +94,7 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
         # Datagrams come from there, by a relay or by NAT; some libraries drop any other's.
         edits = [xmlrpc.replace(triple.items[2].items[1], reached.host)]
     elif call.method == "getBusInfo":
-        edits = [xmlrpc.replace(peer, view.answered(peer.text)) for peer in _peers(triple)]
+        edits = [xmlrpc.replace(peer, view.rewrite_in_reply(peer.text)) for peer in _peers(triple)]
     elif call.method in _URI_REPLIES:
         edits = _rewrite_uri(call.method, triple, view)
     return xmlrpc.apply(reply, edits)
@@ -106,10 +106,10 @@ def sent_directly(call: Call, reply: bytes, host: str, address: str) -> bytes:
     So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
     """
     triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "requestTopic" else None
-    said = tcpros_address(triple) if triple else None
-    if triple is None or said is None or said.host.lower() != host:
+    server = tcpros_address(triple) if triple else None
+    if triple is None or server is None or server.host.lower() != host:
         return reply
-    return xmlrpc.apply(reply, send_to(triple, HostPort(address, said.port)))
+    return xmlrpc.apply(reply, send_to(triple, HostPort(address, server.port)))
 
 
 def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
@@ -156,8 +156,8 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
 def topic_port(call: Call, reply: bytes) -> int | None:
     """The port that a reply to ``requestTopic`` names for a topic, if it is one for TCPROS."""
     triple = ros_triple(xmlrpc.parse_reply(reply))
-    said = tcpros_address(triple) if triple else None
-    return said.port if said and call.string(1) else None
+    server = tcpros_address(triple) if triple else None
+    return server.port if server and call.string(1) else None
 
 
 def ros_triple(value: Value | None) -> Value | None:
@@ -174,17 +174,17 @@ def tcpros_address(triple: Value) -> HostPort | None:
     return HostPort(host.text, number) if number and 0 < number < 65536 else None
 
 
-def send_to(triple: Value, where: HostPort) -> list[Edit]:
-    """Edits by which such a reply sends the subscriber elsewhere."""
+def send_to(triple: Value, target: HostPort) -> list[Edit]:
+    """Edits by which a reply to ``requestTopic`` sends the subscriber elsewhere."""
     _, host, port = triple.items[2].items
-    edits = [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
-    return edits + _in_message(triple, f"{host.text}:{port.text}", str(where))
+    edits = [xmlrpc.replace(host, target.host), xmlrpc.replace(port, str(target.port))]
+    return edits + _in_message(triple, f"{host.text}:{port.text}", str(target))
 
 
-def replace_held(triple: Value, after: str) -> list[Edit]:
+def replace_held(triple: Value, text: str) -> list[Edit]:
     """Edits by which a reply gives another text, also where its status message quotes it."""
-    held = triple.items[2]
-    return [xmlrpc.replace(held, after), *_in_message(triple, held.text, after)]
+    value = triple.items[2]
+    return [xmlrpc.replace(value, text), *_in_message(triple, value.text, text)]
 
 
 def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
@@ -216,8 +216,8 @@ def _peers(triple: Value) -> list[Value]:
 
 
 def _rewrite_uri(method: str, triple: Value, view: CallView) -> list[Edit]:
-    held = triple.items[2].string()
-    if not held:
+    text = triple.items[2].string()
+    if not text:
         return []
-    uri = view.master_uri if method == "getMasterUri" else view.answered(held)
+    uri = view.master_uri if method == "getMasterUri" else view.rewrite_in_reply(text)
     return replace_held(triple, uri)

@@ -33,18 +33,18 @@ def read_offers(call: Call) -> list[UdprosOffer]:
     if call.method != "requestTopic" or len(call.params) < 3:
         return []
     return [
-        UdprosOffer(offer, _topic(offer.items), _where(offer.items))
+        UdprosOffer(offer, _topic(offer.items), _receiver(offer.items))
         for offer in call.params[2].items
         if offer.items and offer.items[0].string() == PROTOCOL
     ]
 
 
-def lead_to(offer: UdprosOffer, where: HostPort | None) -> list[Edit]:
+def lead_to(offer: UdprosOffer, target: HostPort | None) -> list[Edit]:
     """The edits by which an offer leads elsewhere; None takes it out of the call."""
-    if where is None or offer.where is None:
+    if target is None or offer.where is None:
         return [xmlrpc.remove(offer.value)]
     _, _, host, port, *_ = offer.value.items
-    return [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
+    return [xmlrpc.replace(host, target.host), xmlrpc.replace(port, str(target.port))]
 
 
 def _topic(items: list[Value]) -> str:
@@ -54,7 +54,7 @@ def _topic(items: list[Value]) -> str:
         return ""
 
 
-def _where(items: list[Value]) -> HostPort | None:
+def _receiver(items: list[Value]) -> HostPort | None:
     if len(items) < 4:
         return None
     host, port = items[2].string(), items[3].integer()

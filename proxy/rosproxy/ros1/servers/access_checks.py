@@ -93,7 +93,7 @@ class AccessChecks:
         if use is None:
             return None
         verdict = self._judge_use(use, caller_id or "", source)
-        return _refused(self._policy.tell(verdict, use.kind, f"of {caller_id}", source))
+        return _refusal(self._policy.tell(verdict, use.kind, f"of {caller_id}", source))
 
     def judge_registration(
         self, call: Call, admission: CallOutcome, caller: Caller, now: float
@@ -101,23 +101,23 @@ class AccessChecks:
         """What becomes of a call that registers or unregisters, once it is admitted."""
         if self.idle or isinstance(admission, LocalReply):
             return admission
-        held, found = registration(call, now, caller.address), method_spec(call.method)
-        if held is None or held.kind is Kind.PARAM:  # parameters were judged before
+        affected, spec = registration(call, now, caller.address), method_spec(call.method)
+        if affected is None or affected.kind is Kind.PARAM:  # parameters were judged before
             return admission
-        if found.unregisters:
-            return self._judge_end(held, call, caller) or admission
+        if spec.unregisters:
+            return self._judge_end(affected, call, caller) or admission
         address = admission.address if isinstance(admission, Endpoint) else caller.address
-        kind, callers = policing.KINDS[held.kind], [held.caller_id]
-        verdict = self._policy.ask(kind, held.name, callers, address)
+        kind, callers = policing.KINDS[affected.kind], [affected.caller_id]
+        verdict = self._policy.ask(kind, affected.name, callers, address)
         if verdict.allowed:
             return admission
         if not isinstance(admission, Endpoint):
-            return _refused(verdict)  # a URI of somebody else, whom the proxy could not hide
-        concealed = replace(held, hidden=True)
+            return _refusal(verdict)  # a URI of somebody else, whom the proxy could not hide
+        concealed = replace(affected, hidden=True)
         return policing.hidden_registration(concealed, admission, caller, self._addressing)
 
     def unseen(self, reply: MasterReply) -> ReplyChanges:
-        """What a reply has to say otherwise than the master does."""
+        """What the policy changes in the master's reply."""
         if self.idle:
             return NO_REPLY_CHANGES
         publishers, caller = dict[str, list[str]](), reply.exported.request.caller
@@ -143,12 +143,12 @@ class AccessChecks:
         self, kind: RuleKind, name: str, endpoint: Endpoint, source: str, caller_id: str = ""
     ) -> str | None:
         """Why somebody outside may not have a topic or service of a node; None if he may."""
-        wanted = Kind.SERVICE if kind is RuleKind.SERVE else Kind.PUBLISHER
-        callers = endpoint.callers_of(wanted, name)
-        for one in policing.topic_names(name, caller_id):
-            verdict = self._policy.judge(kind, one, callers, endpoint.address)
+        wanted_kind = Kind.SERVICE if kind is RuleKind.SERVE else Kind.PUBLISHER
+        callers = endpoint.callers_of(wanted_kind, name)
+        for resolved in policing.topic_names(name, caller_id):
+            verdict = self._policy.judge(kind, resolved, callers, endpoint.address)
             if verdict.rule is not None and not self._is_inside(source):
-                self._policy.tell(verdict, kind, f"{one} of {endpoint.label}", source)
+                self._policy.tell(verdict, kind, f"{resolved} of {endpoint.label}", source)
                 if not verdict.allowed:
                     return verdict.reason
         return None
@@ -162,12 +162,12 @@ class AccessChecks:
         requestTopic): it is refused where anything of the node may be denied.
         """
         topic, caller_id = call.string(1) or "", call.string(0) or ""
-        why = self.outside_may_not(RuleKind.PUBLISH, topic, endpoint, source, caller_id)
-        if why is None and not policing.offers_tcpros_alone(call):
+        reason = self.outside_may_not(RuleKind.PUBLISH, topic, endpoint, source, caller_id)
+        if reason is None and not policing.offers_tcpros_alone(call):
             if self.may_bypass(endpoint) or self._is_inside(source):
                 return None
-            why = "only TCPROS is passed where a policy may deny a topic of the node"
-        return None if why is None else policing.no_publisher(topic, why)
+            reason = "only TCPROS is passed where a policy may deny a topic of the node"
+        return None if reason is None else policing.no_publisher(topic, reason)
 
     # What a node inside asks of outside
 
@@ -177,10 +177,10 @@ class AccessChecks:
         Whoever connects gives any name: unless a node of that name is known at its address, what
         one of the nodes there may not have is denied.
         """
-        there = [one for e in self._registry if e.address == source for one in e.caller_ids]
-        callers = [caller_id] if caller_id in there else [caller_id, *there]
-        for one in policing.topic_names(name, caller_id):
-            verdict = self._policy.ask(kind, one, callers, source)
+        names_at_source = [n for e in self._registry if e.address == source for n in e.caller_ids]
+        callers = [caller_id] if caller_id in names_at_source else [caller_id, *names_at_source]
+        for resolved in policing.topic_names(name, caller_id):
+            verdict = self._policy.ask(kind, resolved, callers, source)
             if not verdict.allowed:
                 return verdict.reason
         return None
@@ -205,8 +205,8 @@ class AccessChecks:
         if call.method != "requestTopic":
             return None
         topic, caller_id = call.string(1) or "", call.string(0) or ""
-        why = self.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
-        return None if why is None else policing.no_publisher(topic, why)
+        reason = self.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
+        return None if reason is None else policing.no_publisher(topic, reason)
 
     # What outside calls at a node inside
 
@@ -221,11 +221,11 @@ class AccessChecks:
         verdict = self._policy.judge(kind, method, [caller_id], endpoint.address)
         if verdict.rule is None or self._is_inside(source):
             return None
-        masters = method in MASTER_ONLY and caller_id == MASTER
-        if masters and source in await self._upstream.master_addresses():
+        is_from_master = method in MASTER_ONLY and caller_id == MASTER
+        if is_from_master and source in await self._upstream.master_addresses():
             return None
-        what = f"{method} at {endpoint.label}"
-        return None if self._policy.tell(verdict, kind, what, source).allowed else verdict.reason
+        subject = f"{method} at {endpoint.label}"
+        return None if self._policy.tell(verdict, kind, subject, source).allowed else verdict.reason
 
     def may_bypass(self, endpoint: Endpoint) -> bool:
         """Whether a node's topics may go where no header is read: forwarded by the kernel."""
@@ -249,51 +249,51 @@ class AccessChecks:
         verdict = self._judge_use(use, caller_id, caller.address)
         if not verdict.allowed and use.below and call.method != "subscribeParam":
             verdict = await self._judge_names(use, call, caller.address, params)
-        what = f"{use.names[0]} of {caller_id}"
-        return _refused(self._policy.tell(verdict, use.kind, what, caller.address))
+        subject = f"{use.names[0]} of {caller_id}"
+        return _refusal(self._policy.tell(verdict, use.kind, subject, caller.address))
 
     def _judge_lookup(self, call: Call, caller: Caller, caller_id: str) -> LocalReply | None:
         name = second_name(call)
-        known = self._registry.services.get(name)
-        if known and not known[0].health.cleaned:
+        provider = self._registry.services.get(name)
+        if provider and not provider[0].health.cleaned:
             return policing.hidden_service(call, caller, self._addressing)
         verdict = self._policy.ask(RuleKind.CALL, name, [caller_id], caller.address)
         return None if verdict.allowed else policing.no_provider(verdict.reason)
 
     def _judge_use(self, use: ParamUse, caller_id: str, source: str) -> Verdict:
-        """What is said to all names that a call may mean, and may have below them."""
-        found = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
+        """The strictest verdict on all names that a call may mean, and on those below them."""
+        verdicts = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
         if use.below:
-            found += [
+            verdicts += [
                 self._policy.judge_below(use.kind, prefix(name), caller_id, source)
                 for name in use.names
             ]
-        return strictest(found)
+        return strictest(verdicts)
 
     async def _judge_names(
         self, use: ParamUse, call: Call, source: str, params: "_KnownParams"
     ) -> Verdict:
-        """The same where it is denied for what may be below a name: by what there is.
+        """The verdict on a call denied for what may be below its names: by the names that exist.
 
         Whoever sets a whole namespace stays denied. Raises Unreachable.
         """
         caller_id = call.string(0) or ""
-        own = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
-        sets_more = call.method == "setParam" and (
+        exact = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
+        sets_namespace = call.method == "setParam" and (
             len(call.params) < 3 or call.params[2].kind == "struct"
         )
-        if sets_more or not all(one.allowed for one in own):
+        if sets_namespace or not all(v.allowed for v in exact):
             return self._judge_use(use, caller_id, source)
         starts = tuple(map(prefix, use.names))
         below = [name for name in await params.names() if name.startswith(starts)]
-        found = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
-        return strictest([*own, *found])
+        verdicts = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
+        return strictest([*exact, *verdicts])
 
-    def _judge_end(self, held: Registration, call: Call, caller: Caller) -> Answered | None:
+    def _judge_end(self, ended: Registration, call: Call, caller: Caller) -> Answered | None:
         """The answer to a call that ends what the master does not know of."""
         endpoint = holder(call, caller, self._addressing)
-        known = endpoint.registrations.get(held.key) if endpoint else None
-        return policing.hidden_end(known) if known and known.hidden else None
+        current = endpoint.registrations.get(ended.key) if endpoint else None
+        return policing.hidden_end(current) if current and current.hidden else None
 
 
 class _KnownParams:
@@ -307,13 +307,13 @@ class _KnownParams:
         """The names. Raises Unreachable."""
         if self._names is None:
             try:
-                found = await self._upstream.call_master("getParamNames")
+                listing = await self._upstream.call_master("getParamNames")
             except MasterError as error:
                 raise Unreachable(str(error)) from None
-            names = found if isinstance(found, list) else []
+            names = listing if isinstance(listing, list) else []
             self._names = [name for name in names if isinstance(name, str)]
         return self._names
 
 
-def _refused(verdict: Verdict) -> LocalReply | None:
+def _refusal(verdict: Verdict) -> LocalReply | None:
     return None if verdict.allowed else Refusal(f"rosproxy: {verdict.reason}")

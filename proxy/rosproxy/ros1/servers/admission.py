@@ -1,4 +1,4 @@
-"""CallOutcome: a node that registers through the proxy gets an endpoint and a port.
+"""Admission: a node that registers through the proxy gets an endpoint and a port.
 
 A node says where it is by its slave URI, and that may name a host which only its own container
 knows. So the address that the registration came from counts where it must: see `NodeAdmission`'s
@@ -10,11 +10,11 @@ address that registers them; and where the range is used up, a node that answers
 one that doesn't, whose registrations are taken back (`_make_room`). So neither dead URIs nor stale
 claims of former proxies keep a port from it.
 
-Who makes up names is told of in the log by its address, which comes first in each message: so the
-log's bound for one subject holds (`rosproxy.telemetry.logs`).
+Log messages begin with the address that registers, so that whoever makes up names is one subject,
+for which the log has a bound (`rosproxy.telemetry.logs`).
 
-A node that is admitted is looked at once, so that one which can't be reached is told of at once; a
-node that is known is taken for alive, whatever was believed of it.
+A new node is probed at once, so that one which can't be reached is reported at once; a node that
+registers again is taken for alive, whatever was believed of it.
 """
 
 import asyncio
@@ -123,12 +123,12 @@ class NodeAdmission:
         location = await self._locate(node, call, caller)
         if location is None:
             return None
-        taken_in = await self.take_in(uri, node, location, caller)
-        if isinstance(taken_in, Endpoint):
-            await self._leases.cleared(taken_in)
-            first_probe = self._probe_first(taken_in, caller.caller_id)
+        admitted = await self.take_in(uri, node, location, caller)
+        if isinstance(admitted, Endpoint):
+            await self._leases.cleared(admitted)
+            first_probe = self._probe_first(admitted, caller.caller_id)
             self._context.tasks.spawn(first_probe, f"first probe of {uri}")
-        return taken_in
+        return admitted
 
     async def take_in(
         self,
@@ -225,8 +225,8 @@ class NodeAdmission:
             answer = await self._context.nodes.probe(slave)
             if answer.probe is ProbeResult.ANSWERED:
                 return True
-            over = self._context.now() >= end
-            if answer.probe is ProbeResult.REFUSED or over or not self._is_crowded(source):
+            is_over = self._context.now() >= end
+            if answer.probe is ProbeResult.REFUSED or is_over or not self._is_crowded(source):
                 return False
             await asyncio.sleep(PATIENCE_STEP)
 
@@ -246,8 +246,8 @@ class NodeAdmission:
             self._context.problems.solved_at(endpoint.port)
         if endpoint.trusted:
             self._leases.open(endpoint)
-        known = endpoint.caller_ids
-        if endpoint.health.down or (known and caller.caller_id not in known):
+        names = endpoint.caller_ids
+        if endpoint.health.down or (names and caller.caller_id not in names):
             endpoint.health.suspect()
 
     async def _locate(self, node: HostPort, call: Call, caller: Caller) -> NodeLocation | None:
@@ -260,26 +260,26 @@ class NodeAdmission:
         """
         source, caller_id = caller.address, call.string(0) or ""
         addresses = await resolve(self._context.upstream.reach(node).host, source)
-        elsewhere = [address for address in addresses if not is_loopback(address)]
-        if source in addresses or not elsewhere:
+        candidates = [address for address in addresses if not is_loopback(address)]
+        if source in addresses or not candidates:
             return NodeLocation(source, named=source in addresses)
         if await self._answers(HostPort(source, node.port)):
             return NodeLocation(source, named=False)
         service = _service(call, caller)
-        for address in elsewhere[:MOST_ADDRESSES]:
-            where, client_kind = HostPort(address, node.port), self._context.client_kind(address)
+        for address in candidates[:MOST_ADDRESSES]:
+            slave, client_kind = HostPort(address, node.port), self._context.client_kind(address)
             if client_kind is ClientKind.OUTSIDE:
-                bears_out = await self._answers(where)  # a gateway gives it another name
+                bears_out = await self._answers(slave)  # a gateway gives it another name
             else:
-                bears_out = await self._context.nodes.name(where, service) == caller_id
+                bears_out = await self._context.nodes.name(slave, service) == caller_id
             if bears_out and client_kind is ClientKind.ADMITTED:
                 return NodeLocation(address, named=True, confirmed=False)
             if bears_out:
-                log.info("%s at %s is outside; its URI passes as it is", caller_id, where)
+                log.info("%s at %s is outside; its URI passes as it is", caller_id, slave)
                 return None
         text = (
             f"gives its address as {node}, but registers from {source}: no node answers there at "
-            f"port {node.port}, and none of this name at {', '.join(elsewhere[:MOST_ADDRESSES])}. "
+            f"port {node.port}, and none of this name at {', '.join(candidates[:MOST_ADDRESSES])}. "
             "Set ROS_IP where it runs"
         )
         self._context.problems.add(caller_id, text)
@@ -302,9 +302,9 @@ class NodeAdmission:
 
 def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
     """The service that a call registers, and its port; None if it registers another thing."""
-    found = method_spec(call.method)
-    where = parse_service_uri(placed(call.string(found.service_api) or "", caller.address))
-    return (call.string(found.name) or "", where.port) if where else None
+    spec = method_spec(call.method)
+    service = parse_service_uri(placed(call.string(spec.service_api) or "", caller.address))
+    return (call.string(spec.name) or "", service.port) if service else None
 
 
 def _crowd_text(source: str, slave: HostPort, most: int) -> str:

@@ -81,17 +81,17 @@ class Callers:
         """Why a caller is refused, in one line; None if it is let in."""
         if not self._begun.is_set() and not is_own(source):
             await self.begin()
-        if self._standing(source) is ClientKind.ADMITTED:
+        if self._client_kind(source) is ClientKind.ADMITTED:
             return None
         await self._wait_for_news(source)
-        found = self._standing(source)
-        if found is ClientKind.ADMITTED:
+        kind = self._client_kind(source)
+        if kind is ClientKind.ADMITTED:
             return None
-        text = selection.refusal(source, found, self._context.addressing.networks)
-        self._report(text, found)
+        text = selection.refusal(source, kind, self._context.addressing.networks)
+        self._report(text, kind)
         return text
 
-    def _standing(self, source: str) -> ClientKind:
+    def _client_kind(self, source: str) -> ClientKind:
         self._context.refresh_networks()
         if self._context.client_kind(source) is ClientKind.ADMITTED or is_own(source):
             return ClientKind.ADMITTED
@@ -101,16 +101,16 @@ class Callers:
     async def _wait_for_news(self, source: str) -> None:
         """Wait until an operator has selected a source, up to NEWS_TIMEOUT.
 
-        None can tell where the admin endpoint is on loopback, and none has told so far.
+        No operator is heard where the admin endpoint is on loopback, if none was heard so far.
         """
-        alone = self._context.selected is None and is_loopback(self._context.settings.admin.host)
+        no_news = self._context.selected is None and is_loopback(self._context.settings.admin.host)
         waiting = self._waiting
-        if alone or waiting.total() >= MOST_WAITING or waiting[source] >= MOST_WAITING_EACH:
+        if no_news or waiting.total() >= MOST_WAITING or waiting[source] >= MOST_WAITING_EACH:
             return
         waiting[source] += 1
         try:
             async with asyncio.timeout(NEWS_TIMEOUT):
-                while self._standing(source) is not ClientKind.ADMITTED:
+                while self._client_kind(source) is not ClientKind.ADMITTED:
                     await self._news.wait()
         except TimeoutError:
             log.debug("%s was not selected in time", source)
@@ -119,9 +119,9 @@ class Callers:
             if not waiting[source]:
                 del waiting[source]
 
-    def _report(self, text: str, found: ClientKind) -> None:
+    def _report(self, text: str, kind: ClientKind) -> None:
         context, now = self._context, self._context.now()
-        context.metrics.strangers.labels(found.value).inc()
+        context.metrics.strangers.labels(kind.value).inc()
         context.problems.solved(SUBJECT)  # the last one is enough: there may be any number
         context.problems.add(SUBJECT, text)
         if self._logged is None or now - self._logged >= LOG_INTERVAL:

@@ -34,7 +34,7 @@ class LongCall:
         for piece in cut(self._head):
             self._watch.see(piece)
             await asyncio.sleep(0)
-        held = self._head
+        previous = self._head
         while not self._rest.at_eof():
             try:
                 async with asyncio.timeout(PIECE_TIMEOUT):
@@ -42,10 +42,10 @@ class LongCall:
             except (OSError, web.RequestPayloadError) as error:  # a time-out is one of the former
                 raise Unreachable(f"the caller did not send all of it: {error}") from error
             self._watch.see(piece)
-            yield held
-            held = piece
+            yield previous
+            previous = piece
         self._watch.end()
-        yield held
+        yield previous
 
 
 class LongCalls(Protocol):

@@ -102,13 +102,13 @@ class TcprosServer:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
             header = await read_header(self._context, peer, conn)
-            kind, name, caller_id = _asked_for(decode_header(header[4:]))
+            kind, name, caller_id = _requested(decode_header(header[4:]))
         except HeaderError as error:
             await self._refuse(conn, str(error), "bad header")
             return
         version = self._context.policy.version
-        if why := target.why_not(kind, name, peer, caller_id):
-            await self._refuse(conn, why, "denied")
+        if denial := target.why_not(kind, name, peer, caller_id):
+            await self._refuse(conn, denial, "denied")
             return
         try:
             node = await target.connect(kind, name)
@@ -144,9 +144,9 @@ class TcprosServer:
             if relay.port == port:
                 relay.end()
 
-    async def _refuse(self, conn: socket.socket, why: str, reason: str) -> None:
+    async def _refuse(self, conn: socket.socket, text: str, reason: str) -> None:
         """Say why in a header, as ROS's servers do, and close."""
-        reply = encode_header({"error": f"rosproxy: {why}"})
+        reply = encode_header({"error": f"rosproxy: {text}"})
         await asyncio.get_running_loop().sock_sendall(conn, reply)
         conn.close()
         self._context.metrics.relay_errors.labels(reason).inc()
@@ -173,7 +173,7 @@ class InsideNodes:
 
     def __init__(self, context: Context, access: AccessChecks) -> None:
         self._context, self._access = context, access
-        self._asking: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
+        self._port_tasks: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
 
     def target(self, endpoint: Endpoint) -> "InsideNode":
         """What connections to an endpoint's ports lead to."""
@@ -182,13 +182,13 @@ class InsideNodes:
     async def _learn_port(self, endpoint: Endpoint, kind: str, name: str) -> int | None:
         """The TCPROS port of a topic or service now; the node is asked once for all who wait."""
         key = endpoint, kind, name
-        asking = self._asking.get(key)
-        if asking is None:
+        task = self._port_tasks.get(key)
+        if task is None:
             ask = self._ask_service_port if kind == "service" else self._ask_topic_port
-            asking = self._context.tasks.spawn(ask(endpoint, name), f"TCPROS port of {name}")
-            self._asking[key] = asking
-            asking.add_done_callback(lambda _: self._asking.pop(key))
-        return await asyncio.shield(asking)
+            task = self._context.tasks.spawn(ask(endpoint, name), f"TCPROS port of {name}")
+            self._port_tasks[key] = task
+            task.add_done_callback(lambda _: self._port_tasks.pop(key))
+        return await asyncio.shield(task)
 
     async def _ask_topic_port(self, endpoint: Endpoint, topic: str) -> int | None:
         """The port that the node names for a topic, or NO_PORT; None if it can't be asked."""
@@ -214,8 +214,8 @@ class InsideNodes:
             port = await self._learn_port(endpoint, "topic", topic)
             ports = [port] if port else []
         for port in dict.fromkeys(ports):
-            where = HostPort(endpoint.address, port)
-            if await self._context.nodes.provider(where, service) in endpoint.callers:
+            server = HostPort(endpoint.address, port)
+            if await self._context.nodes.provider(server, service) in endpoint.callers:
                 self._context.registry.note_service_port(endpoint, service, port)
                 return port
         return None if service in endpoint.names(Kind.SERVICE) else NO_PORT
@@ -238,8 +238,8 @@ class InsideNode:
 
     def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why somebody outside may not have a topic or service; None if he may."""
-        asked = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
-        return self._access.outside_may_not(asked, name, self._endpoint, peer)
+        rule_kind = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
+        return self._access.outside_may_not(rule_kind, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; a port that is not known or refuses is asked for.
@@ -263,8 +263,8 @@ class InsideNode:
 
     def label(self, kind: str, name: str) -> str:
         """The topic or service if the node has registered it."""
-        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
-        return name if name in self._endpoint.names(wanted) else UNREGISTERED
+        wanted_kind = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
+        return name if name in self._endpoint.names(wanted_kind) else UNREGISTERED
 
     def note_connection(self) -> None:
         """Note that a connection is relayed."""
@@ -289,7 +289,7 @@ class InsideNode:
         self._context.problems.add(endpoint.label, text, endpoint.port)
 
 
-def _asked_for(fields: Mapping[str, str]) -> tuple[str, str, str]:
+def _requested(fields: Mapping[str, str]) -> tuple[str, str, str]:
     """Kind and name of what a header asks for, and who asks. Raises HeaderError."""
     if too_long := too_long_to_connect(fields):
         raise HeaderError(too_long)

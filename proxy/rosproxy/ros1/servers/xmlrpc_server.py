@@ -228,9 +228,9 @@ class XmlRpcServer(web.Server):
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
         source = _source(request)
-        refused = await self._guard(source) if self._guard else None
-        if refused:
-            return _forbid(refused)
+        denial = await self._guard(source) if self._guard else None
+        if denial:
+            return _forbid(denial)
         try:
             with Charge(self._context.buffered, source) as charge:
                 return await self._answer(request, IncomingCall(request, charge.add))
@@ -262,7 +262,7 @@ class XmlRpcServer(web.Server):
             return await self._send_long(request, call, reply)
         if len(reply) > passing.SHORT:
             call.hold(len(reply))
-        return await _sent(request, DocumentReply(reply))
+        return await _send(request, DocumentReply(reply))
 
     async def _read(
         self, request: web.BaseRequest, call: IncomingCall
@@ -317,9 +317,9 @@ class XmlRpcServer(web.Server):
         Raises TooLong, OverBudget.
         """
         while len(call.body) < passing.HEAD and not request.content.at_eof():
-            part = await request.content.readany()
-            call.hold(len(part))
-            call.body += part
+            chunk = await request.content.readany()
+            call.hold(len(chunk))
+            call.body += chunk
         method = passing.method_of(call.body)
         watch = service.watch(method, size) if method else None
         if method is None or watch is None:
@@ -333,12 +333,12 @@ class XmlRpcServer(web.Server):
         rest = await read_bounded(request.content, self._limits.size - len(call.body), call.hold)
         await self._take_in(call, call.body + rest, len(call.body) + len(rest))
 
-    async def _take_in(self, call: IncomingCall, body: bytes, held: int = 0) -> None:
-        """Take in a whole body, of which so many bytes are held already. Raises TooLong."""
+    async def _take_in(self, call: IncomingCall, body: bytes, charged: int = 0) -> None:
+        """Take in a whole body, of which ``charged`` bytes are held already. Raises TooLong."""
         if len(body) > self._limits.size:
             raise TooLong(self._limits.size)
         call.body, values = body, body.count(b"<value")
-        call.hold(len(body) - held + VALUE * values)
+        call.hold(len(body) - charged + VALUE * values)
         if values > MANY_VALUES:
             await self._context.yield_to_others()
 
@@ -373,8 +373,8 @@ def _nothing() -> None:
 
 
 @lru_cache(maxsize=1024)
-def _address(found: Any) -> HostPort:
-    return HostPort(plain_address(found[0]), found[1]) if found else HostPort("", 0)
+def _address(sockname: Any) -> HostPort:
+    return HostPort(plain_address(sockname[0]), sockname[1]) if sockname else HostPort("", 0)
 
 
 def _source(request: web.BaseRequest) -> str:
@@ -388,7 +388,7 @@ def _forbid(text: str) -> web.StreamResponse:
     return response
 
 
-async def _sent(request: web.BaseRequest, response: DocumentReply) -> DocumentReply:
+async def _send(request: web.BaseRequest, response: DocumentReply) -> DocumentReply:
     """Send a reply; that nobody is there any more the server sees for itself."""
     try:
         await response.prepare(request)

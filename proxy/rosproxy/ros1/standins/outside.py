@@ -1,8 +1,8 @@
-"""Nodes outside as those inside reach them through a stand-in: asked, connected to, refusing.
+"""How nodes inside reach nodes outside through a stand-in: by slave API calls and by TCPROS.
 
-Nothing leads to the proxy itself or to inside: whoever writes to the master names the addresses.
-Nodes of outside may run beside the proxy, though: at an address of its own machine only the proxy's
-own ports are refused. Loopback is everywhere, as it means another machine to whoever gave it.
+No connection leads to the proxy itself or to inside: whoever writes to the master names the
+addresses. Nodes of outside may run beside the proxy, though: at an address of its own machine only
+the proxy's own ports are refused. Loopback always is: whoever gave it meant another machine.
 """
 
 import logging
@@ -26,22 +26,22 @@ log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT = 2.0
 LOOK_TIMEOUT = 1.0
-"""Seconds for which a node waits at most for the URI of another one that was gone."""
+"""Seconds at most for which a node inside waits while one that refused before is tried again."""
 
 
 class Outside:
-    """Reaches nodes outside. ``note_refused`` is told of one that refuses: it has ended."""
+    """Reaches nodes outside. ``note_refused`` gets the stand-in of one that refuses: it ended."""
 
     def __init__(self, context: Context, note_refused: Callable[[StandIn], None]) -> None:
         self._context, self._note_refused = context, note_refused
 
-    async def refuses(self, uri: str, where: HostPort) -> bool:
-        """Whether nobody listens for the URI of a node outside, or of a service there.
+    async def refuses(self, uri: str, target: HostPort) -> bool:
+        """Whether a node outside, or a service there, refuses connections.
 
-        A node is asked something: roslisp ends if it is connected to and then told nothing.
+        A node gets a real call: roslisp ends if a connection to it says nothing.
         """
         try:
-            reached = await self.reach(where)
+            reached = await self.reach(target)
             if not parse_service_uri(uri):
                 answer = await self._context.nodes.probe(reached, LOOK_TIMEOUT)
                 return answer.probe is ProbeResult.REFUSED
@@ -49,11 +49,11 @@ class Outside:
         except ConnectionRefusedError:
             return True
         except OSError as error:
-            log.debug("%s: %s", where, error)
+            log.debug("%s: %s", target, error)
         return False
 
     async def ask(self, stand_in: StandIn, body: bytes, path: str) -> bytes:
-        """The answer of a node outside to a call to a path. Raises Unreachable."""
+        """Forward a slave API call to a node outside; its answer. Raises Unreachable."""
         path = path if stand_in.kept else path_of(stand_in.uri)
         try:
             await self.reach(stand_in.where)
@@ -70,8 +70,8 @@ class Outside:
     async def ask_topic_port(self, stand_in: StandIn, topic: str) -> int | None:
         """The TCPROS port that a node outside names for a topic; None if it names none."""
         try:
-            where = await self.reach(stand_in.where)
-            port = await self._context.nodes.topic_port(where, topic)
+            slave = await self.reach(stand_in.where)
+            port = await self._context.nodes.topic_port(slave, topic)
         except (OSError, Unreachable, MasterError) as error:
             log.debug("%s gives no TCPROS port for %s: %s", stand_in.uri, topic, error)
             return None
@@ -83,42 +83,42 @@ class Outside:
         """A connection to a TCPROS port of a node outside; None if there is none."""
         if port is None:
             return None
-        where = HostPort(stand_in.where.host, port)
+        target = HostPort(stand_in.where.host, port)
         try:
-            return await self._dial(where, CONNECT_TIMEOUT)
+            return await self._dial(target, CONNECT_TIMEOUT)
         except OSError as error:  # a time-out is one, too
-            log.debug("%s: %s", where, error)
-            if isinstance(error, ConnectionRefusedError) and where == stand_in.where:
+            log.debug("%s: %s", target, error)
+            if isinstance(error, ConnectionRefusedError) and target == stand_in.where:
                 self._note_refused(stand_in)
             return None
 
-    async def _dial(self, where: HostPort, within: float) -> socket.socket:
+    async def _dial(self, target: HostPort, within: float) -> socket.socket:
         """Connect to a port outside; refused where that leads back or inside. Raises OSError."""
-        return await sockets.dial(await self.reach(where), within)
+        return await sockets.dial(await self.reach(target), within)
 
-    async def reach(self, where: HostPort) -> HostPort:
-        """Where a host and port of outside are. Raises OSError: refused if that is not outside."""
-        reached = self._context.upstream.reach(where)
-        found = await resolve(reached.host, NODES)
-        if not found:
-            raise OSError(f"{where.host} can't be resolved")
-        outside = [one for one in found if not self._leads_back(HostPort(one, reached.port))]
+    async def reach(self, target: HostPort) -> HostPort:
+        """The address and port of a host outside. Raises OSError: refused if it is not outside."""
+        mapped = self._context.upstream.reach(target)
+        resolved = await resolve(mapped.host, NODES)
+        if not resolved:
+            raise OSError(f"{target.host} can't be resolved")
+        outside = [a for a in resolved if not self._leads_back(HostPort(a, mapped.port))]
         if not outside:
-            raise ConnectionRefusedError(f"{', '.join(found)} port {where.port} is not outside")
-        return HostPort(outside[0], where.port)
+            raise ConnectionRefusedError(f"{', '.join(resolved)} port {target.port} is not outside")
+        return HostPort(outside[0], target.port)
 
-    def _leads_back(self, where: HostPort) -> bool:
+    def _leads_back(self, target: HostPort) -> bool:
         """Whether an address and port are inside, or the proxy's own."""
-        stand_ins, address = self._context.stand_ins, where.host
+        stand_ins, address = self._context.stand_ins, target.host
         inside = stand_ins.both and is_inside(address, self._context.addressing.networks)
         if inside or is_loopback(address):
             return True
-        return is_own(address) and stand_ins.is_proxys(where.port)
+        return is_own(address) and stand_ins.is_proxys(target.port)
 
 
 @dataclass(slots=True)
 class OutsideNode:
-    """A node outside as a target of TCPROS, for those who connect from inside."""
+    """A node outside as the target of TCPROS connections from inside."""
 
     _outside: Outside
     _context: Context
@@ -133,16 +133,16 @@ class OutsideNode:
 
     def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why a node inside may not have a topic or service; None if it may."""
-        asked = RuleKind.CALL if kind == "service" else RuleKind.SUBSCRIBE
-        return self._access.inside_may_not(asked, name, peer, caller_id)
+        rule_kind = RuleKind.CALL if kind == "service" else RuleKind.SUBSCRIBE
+        return self._access.inside_may_not(rule_kind, name, peer, caller_id)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node; its port for a topic is asked for anew if the known refuses."""
+        """A connection to the node, which is asked for its port again if the known one refuses."""
         outside, stand_in = self._outside, self._stand_in
-        serves = parse_service_uri(stand_in.uri) is not None
-        if stand_in.kept or (serves and kind == "service"):
+        is_service = parse_service_uri(stand_in.uri) is not None
+        if stand_in.kept or (is_service and kind == "service"):
             return await outside.connect(stand_in, stand_in.where.port)
-        if serves or kind == "service":
+        if is_service or kind == "service":
             return None
         node = await outside.connect(stand_in, stand_in.topic_ports.get(name))
         return node or await outside.connect(stand_in, await outside.ask_topic_port(stand_in, name))
@@ -155,8 +155,8 @@ class OutsideNode:
         """Nothing to note: whether a stand-in is in use is counted by its relays."""
 
     def note_disconnection(self) -> None:
-        """Note that it was of use until now."""
+        """Note that the stand-in was in use until now."""
         self._context.stand_ins.note_used(self._stand_in)
 
     def note_failure(self, name: str) -> None:
-        """Nothing to note: a node outside that is gone is the master's to tell."""
+        """Nothing to note: that a node outside is gone is for the master to say."""

@@ -46,14 +46,14 @@ from rosproxy.ros1.standins.udpros import UdprosRelays
 
 log = logging.getLogger(__name__)
 
-TRIED_AT_ONCE = 32
-"""Nodes that refused and are tried again at the same time."""
+MOST_RETRIES = 32
+"""Nodes that refused before and are tried again at the same time."""
 PORTS_PER_TURN = 50
-"""How many are opened before all connections are looked at again."""
+"""Ports that are opened before the event loop does other work."""
 TIDY_INTERVAL = 30.0
 SERVICE_PROBLEM = 600.0
 """Seconds for which a problem with a service is kept: it is looked up anew for each call."""
-LONGEST_TOLD = 200
+LONGEST_SHOWN_URI = 200
 """Characters of a URI in the status."""
 
 
@@ -73,50 +73,50 @@ class StandInPorts:
         self._acceptors: dict[HostPort, Acceptor] = {}
         self._refused: dict[str, None] = {}
         """URIs of nodes that refused when they were last tried, the oldest first; not too many."""
-        self._trying = asyncio.Semaphore(TRIED_AT_ONCE)
+        self._retry_slots = asyncio.Semaphore(MOST_RETRIES)
         greeting = "rosproxy: a ROS node outside\n"
         self.server = XmlRpcServer(context, self._forward, greeting, context.master_call)
         self._outside = Outside(context, self._note_refused)
         self.udpros = UdprosRelays(context, access, self._outside)
         self._closed = False
-        self._asking = asyncio.Lock()
-        self._asked: set[str] = set()
-        """Topics whose publishers somebody waits to be told of."""
+        self._query_lock = asyncio.Lock()
+        self._pending_topics: set[str] = set()
+        """Topics whose publishers the master is to be asked for next: somebody waits for them."""
         self._publishers: dict[str, set[str]] = {}
-        """The master's last answer to that: slave URIs by topic."""
+        """The publishers in the master's last answer: slave URIs by topic."""
 
     async def listen_for(self, uris: Iterable[str], caller: Caller) -> None:
-        """Have a port listen for each of these URIs that needs one, before they are given away.
+        """Have a port listen for each of these URIs that needs one, before inside is told of them.
 
-        The URIs are the master's own word.
+        The URIs must be known to be the master's own.
         """
-        wanted = self._needed(uris)
-        if not wanted:
+        targets = self._targets(uris)
+        if not targets:
             return
-        again = self._refused.keys() & wanted.keys()
-        still = await asyncio.gather(*(self._refuses(uri, wanted[uri]) for uri in again))
-        for uri, gone in zip(again, still, strict=True):
-            if not gone:
+        retried = self._refused.keys() & targets.keys()
+        refusals = await asyncio.gather(*(self._refuses(uri, targets[uri]) for uri in retried))
+        for uri, refuses in zip(retried, refusals, strict=True):
+            if not refuses:
                 self._refused.pop(uri, None)
-        for number, (uri, where) in enumerate(wanted.items(), start=1):
+        for number, (uri, target) in enumerate(targets.items(), start=1):
             if number % PORTS_PER_TURN == 0:
                 await asyncio.sleep(0)
             if uri not in self._refused and not self._closed:
-                self._listen(uri, where, self._stand_ins.address(caller.proxy))
+                self._listen(uri, target, self._stand_ins.address(caller.proxy))
 
     async def listen_for_announced(self, topic: str, uris: Sequence[str], caller: Caller) -> None:
-        """The same for the publishers that a ``publisherUpdate`` names, as far as they are some.
+        """The same for those URIs in a ``publisherUpdate`` that are publishers at the master.
 
         Anybody may call that at a lease, and name any port. Its source proves nothing: every
         program on the master's host has that address, and NAT gives it to others. So where a
         port would have to be opened the master is asked whether it has that publisher.
         """
-        wanted = self._needed(uris)
+        targets = self._targets(uris)
         address = self._stand_ins.address(caller.proxy)
-        known = {uri for uri in wanted if self._stand_ins.find(address, uri)}
-        if len(known) < len(wanted):
-            known |= await self._publishers_of(topic)
-        await self.listen_for((uri for uri in wanted if uri in known), caller)
+        known_uris = {uri for uri in targets if self._stand_ins.find(address, uri)}
+        if len(known_uris) < len(targets):
+            known_uris |= await self._publishers_of(topic)
+        await self.listen_for((uri for uri in targets if uri in known_uris), caller)
 
     def with_address(self, body: bytes, call: xmlrpc.Call) -> bytes:
         """A call from outside, parsed as ``call``, in a form that an inside node can use."""
@@ -128,46 +128,46 @@ class StandInPorts:
     async def tidy(self) -> None:
         """Forget the problems of nodes that have ended, and of services not looked up any more.
 
-        rospy complains of connections to a service's port that say nothing: none is made.
+        A service's port is not tried: rospy complains of a connection that says nothing.
         """
         self.udpros.sweep()
         for problem in self._context.problems.all():
             uri = problem.subject
-            for where in self._needed([uri]).values():
+            for target in self._targets([uri]).values():
                 if parse_service_uri(uri):
                     ended = time.time() - problem.when > SERVICE_PROBLEM
                 else:
-                    ended = await self._outside.refuses(uri, where)
+                    ended = await self._outside.refuses(uri, target)
                 if ended:
                     self._context.problems.solved(uri)
 
     def status(self) -> list[dict[str, Any]]:
         """The ports with their nodes and open connections, for ``/status``."""
-        counts, told = self._connections(), []
+        counts, ports = self._connections(), []
         sent: defaultdict[int, float] = defaultdict(float)
         received: defaultdict[int, float] = defaultdict(float)
         for relay in self._tcpros.relays:
             sent[relay.port] += relay.sent_rate
             received[relay.port] += relay.received_rate
-        for one in sorted(
-            self._stand_ins.by_local.values(), key=lambda one: (one.local.port, one.uri)
+        for stand_in in sorted(
+            self._stand_ins.by_local.values(), key=lambda s: (s.local.port, s.uri)
         ):
-            plane = self._plane.status_of(one) if one.fast_candidate else None
-            told.append(
+            plane = self._plane.status_of(stand_in) if stand_in.fast_candidate else None
+            ports.append(
                 {
-                    "port": one.local.port,
-                    "uri": one.uri[:LONGEST_TOLD],
-                    "connections": counts[one.local.port],
-                    "sent_rate": sent[one.local.port] + (plane["sent_rate"] if plane else 0.0),
-                    "received_rate": received[one.local.port]
+                    "port": stand_in.local.port,
+                    "uri": stand_in.uri[:LONGEST_SHOWN_URI],
+                    "connections": counts[stand_in.local.port],
+                    "sent_rate": sent[stand_in.local.port] + (plane["sent_rate"] if plane else 0.0),
+                    "received_rate": received[stand_in.local.port]
                     + (plane["received_rate"] if plane else 0),
                     "data_plane": plane,
                 }
             )
-        return told
+        return ports
 
     def take_fast_ports(self) -> int:
-        """Have no topic go where no header is read; how many connections that has cut."""
+        """Close all fast ports, as no header is read there; how many connections that has cut."""
         count = 0
         for stand_in in self._stand_ins.by_local.values():
             if stand_in.fast_port is not None:
@@ -188,22 +188,22 @@ class StandInPorts:
         """Whether any URI may need a stand-in now."""
         return self._stand_ins.both or self._context.upstream.master_address is not None
 
-    def _needed(self, uris: Iterable[str]) -> dict[str, HostPort]:
-        """Those of the URIs that need a stand-in, with what it has to lead to."""
+    def _targets(self, uris: Iterable[str]) -> dict[str, HostPort]:
+        """The URIs that need a stand-in, each with the host and port that it has to lead to."""
         if not self._active or self._closed:
             return {}
-        found = ((uri, self._context.addressing.foreign(uri)) for uri in uris)
-        return {uri: where for uri, where in found if where}
+        pairs = ((uri, self._context.addressing.foreign(uri)) for uri in uris)
+        return {uri: target for uri, target in pairs if target}
 
     async def _publishers_of(self, topic: str) -> set[str]:
         """The slave URIs of a topic's publishers as the master has them now; none if it is away.
 
-        There is one question at a time, for all topics that have come up meanwhile.
+        The master gets one query at a time, for all topics that have come up meanwhile.
         """
-        self._asked.add(topic)
-        async with self._asking:
-            if topic in self._asked:  # nobody has asked since
-                topics, self._asked = self._asked, set()
+        self._pending_topics.add(topic)
+        async with self._query_lock:
+            if topic in self._pending_topics:  # nobody has asked since
+                topics, self._pending_topics = self._pending_topics, set()
                 self._publishers = await self._ask_publishers(topics)
             return self._publishers.get(topic, set())
 
@@ -213,8 +213,8 @@ class StandInPorts:
             state = await upstream.read_registrations()
             names = [
                 name
-                for name, held in state.items()
-                if any(one.kind is Kind.PUBLISHER and one.name in topics for one in held)
+                for name, registrations in state.items()
+                if any(r.kind is Kind.PUBLISHER and r.name in topics for r in registrations)
             ]
             graph = Graph(state, await upstream.look_up("lookupNode", names))
         except (Unreachable, MasterError) as error:
@@ -223,31 +223,33 @@ class StandInPorts:
         publishers = graph.by_topic(Kind.PUBLISHER)
         return {topic: set(publishers.get(topic, ())) for topic in topics}
 
-    def _listen(self, uri: str, where: HostPort, address: str) -> None:
+    def _listen(self, uri: str, target: HostPort, address: str) -> None:
         """Let a port listen that a URI needs, or report why none can."""
         problems = self._context.problems
-        if known := self._stand_ins.find(address, uri):
-            self._stand_ins.note_used(known)
-            self._open_fast_port(known)
+        if stand_in := self._stand_ins.find(address, uri):
+            self._stand_ins.note_used(stand_in)
+            self._open_fast_port(stand_in)
             return
         why = self._make_room()
         if why is None:
-            for candidate in self._stand_ins.candidates(uri, where, address):
+            for candidate in self._stand_ins.candidates(uri, target, address):
                 why = self._open(candidate)
                 if why is None:
                     problems.solved(uri)
                     return
-        text = self._stand_ins.advice(where, why or "", self._context.upstream.master_address or "")
+        text = self._stand_ins.advice(
+            target, why or "", self._context.upstream.master_address or ""
+        )
         if (uri, text) not in ((p.subject, p.text) for p in problems.all()):
             log.warning("%s: %s", uri, text)
         problems.add(uri, text)
 
     def _make_room(self) -> str | None:
-        """Close the port that was of no use for longest if there are too many; else why not."""
+        """Close the port unused for longest if there are too many; why not if all are in use."""
         if len(self._stand_ins.by_local) < stand_ins.MOST_STAND_INS:
             return None
         counts = self._connections()
-        unused = (one for one in self._stand_ins.by_local.values() if not counts[one.local.port])
+        unused = (s for s in self._stand_ins.by_local.values() if not counts[s.local.port])
         stand_in = next(unused, None)
         if stand_in is None:
             return f"is one too many: {stand_ins.MOST_STAND_INS} stand in for nodes and are in use"
@@ -275,21 +277,21 @@ class StandInPorts:
     def _open_fast_port(self, stand_in: StandIn) -> None:
         """Open a stand-in's second port where that can be of use, and can be had."""
         usable = self._plane.syncer.usable
-        there = self._stand_ins.choose_fast_candidate(stand_in) if usable else None
-        if there is None:
+        candidate = self._stand_ins.choose_fast_candidate(stand_in) if usable else None
+        if candidate is None:
             return
         if not self._access.inside_may_bypass() or stand_ins.obstacle(
-            there.port, self._context.settings
+            candidate.port, self._context.settings
         ):
             return
         try:
-            sock = sockets.listen(there.host, there.port)
+            sock = sockets.listen(candidate.host, candidate.port)
         except OSError as error:
-            log.debug("%s can't be opened: %s", there, error)
+            log.debug("%s can't be opened: %s", candidate, error)
             return
         serve, gate = partial(self._serve, stand_in), self._context.gate
-        self._acceptors[there] = Acceptor(self._context.tasks, sock, serve, gate)
-        self._stand_ins.note_fast_port(stand_in, there.port)
+        self._acceptors[candidate] = Acceptor(self._context.tasks, sock, serve, gate)
+        self._stand_ins.note_fast_port(stand_in, candidate.port)
 
     def _close_fast_port(self, stand_in: StandIn) -> None:
         if stand_in.fast_port is not None:
@@ -297,8 +299,8 @@ class StandInPorts:
             self._stand_ins.note_fast_port(stand_in, None)
             self._plane.syncer.note_change(stand_in)
 
-    async def _topics_at(self, stand_in: StandIn, said: int) -> HostPort:
-        """Where a node's topics are to be had, which has named its TCPROS port."""
+    async def _topic_listener(self, stand_in: StandIn, tcpros_port: int) -> HostPort:
+        """The proxy's port for a node's topics: the fast port if the kernel forwards that to it."""
         syncer, fast_port = self._plane.syncer, stand_in.fast_port
         if fast_port is None:
             return stand_in.local
@@ -307,7 +309,7 @@ class StandInPorts:
         except OSError as error:
             log.debug("%s: %s", stand_in.where, error)
             return stand_in.local
-        if syncer.may_forward(stand_in) and await syncer.forwards(stand_in, said):
+        if syncer.may_forward(stand_in) and await syncer.forwards(stand_in, tcpros_port):
             return HostPort(stand_in.local.host, fast_port)
         syncer.log_reason(stand_in)
         return stand_in.local
@@ -322,21 +324,23 @@ class StandInPorts:
             self.server.close_port(stand_in.local.port)
 
     def _note_refused(self, stand_in: StandIn) -> None:
-        """A node that refuses has ended: its port refuses as well, until it is found again."""
+        """Close the port of a node that refuses, since it has ended, until it is found again."""
         log.debug("%s refuses; so does %s", stand_in.uri, stand_in.local)
         self._close(stand_in)
         self._refused[stand_in.uri] = None
         if len(self._refused) > stand_ins.MOST_STAND_INS:
             del self._refused[next(iter(self._refused))]
 
-    async def _refuses(self, uri: str, where: HostPort) -> bool:
-        async with self._trying:
-            return await self._outside.refuses(uri, where)
+    async def _refuses(self, uri: str, target: HostPort) -> bool:
+        async with self._retry_slots:
+            return await self._outside.refuses(uri, target)
 
     def _connections(self) -> Counter[int]:
         counts = Counter(relay.port for relay in self._tcpros.relays if relay.inside_asks)
-        for one in self._stand_ins.by_local.values():
-            counts[one.local.port] += self.server.count(one.local.port) + one.fast_connections
+        for stand_in in self._stand_ins.by_local.values():
+            counts[stand_in.local.port] += (
+                self.server.count(stand_in.local.port) + stand_in.fast_connections
+            )
         return counts
 
     async def _serve(self, stand_in: StandIn, conn: socket.socket, peer: str) -> None:
@@ -378,9 +382,9 @@ class StandInPorts:
         if stand_in.kept:
             address = self._context.upstream.master_address or stand_in.where.host
             return slave_api.sent_directly(parsed, reply, stand_in.where.host.lower(), address)
-        reached, said = stand_in.local, slave_api.topic_port(parsed, reply)
-        if said is not None:
-            stand_in.note_topic_port(parsed.string(1) or "", said)
-            reached = await self._topics_at(stand_in, said)
+        listener, tcpros_port = stand_in.local, slave_api.topic_port(parsed, reply)
+        if tcpros_port is not None:
+            stand_in.note_topic_port(parsed.string(1) or "", tcpros_port)
+            listener = await self._topic_listener(stand_in, tcpros_port)
         await self.listen_for(slave_api.told_uris(parsed, reply), caller)
-        return slave_api.rewrite_reply(parsed, reply, reached, view)
+        return slave_api.rewrite_reply(parsed, reply, listener, view)

@@ -11,9 +11,9 @@ With ``--direction both`` neither side can send to the other:
   * an inside subscriber's offer to a node outside leads to a UDP port of the range as outside sees
     it, if the range is published for UDP (``--udp``), and from there inside (`lead_inwards`).
 
-An offer that can't be had is taken out of the call: the publisher then chooses TCPROS if that was
-offered, too. So is one whose connection header names another topic than the call: that header is
-what roscpp serves (topic_manager.cpp), and the policy has been asked for the other.
+An offer for which there is no relay is taken out of the call: the publisher then chooses TCPROS if
+that was offered, too. So is one whose connection header names another topic than the call: roscpp
+serves the topic of the header (topic_manager.cpp), and the policy was asked about the call's.
 
 A relay lasts as long as both ends of it: until the subscriber refuses, or one of them is not
 registered any more (`sweep`), or the subscriber may not have the topic any more (`cut_denied`).
@@ -46,10 +46,10 @@ log = logging.getLogger(__name__)
 
 MOST_RELAYS = 256
 MOST_RELAYS_EACH = 64
-"""Relays of one proxy, and of subscribers at one address; with one more the oldest of those that
-have most goes: who asks for many takes none from others."""
+"""Relays of one proxy, and of subscribers at one address. For one more the oldest relay of the
+address that has most is ended: who asks for many takes none from others."""
 TRIES = 64
-"""Ports that are tried for one."""
+"""Ports that are tried for one relay."""
 
 
 class UdprosSubscription(msgspec.Struct, frozen=True):
@@ -68,15 +68,15 @@ class UdprosSubscription(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class _Right:
-    """Asked anew each time: whether both ends are there still, and whether the policy lets them."""
+class _RelayCondition:
+    """Checked anew each time: whether both ends are registered, and the policy allows the relay."""
 
-    there: Callable[[], bool]
-    allowed: Callable[[], bool]
+    is_registered: Callable[[], bool]
+    is_allowed: Callable[[], bool]
 
     def holds(self) -> bool:
-        """Whether a relay may be."""
-        return self.there() and self.allowed()
+        """Whether the relay may be open."""
+        return self.is_registered() and self.is_allowed()
 
 
 class UdprosRelays:
@@ -84,110 +84,112 @@ class UdprosRelays:
 
     def __init__(self, context: Context, access: AccessChecks, outside: Outside) -> None:
         self._context, self._access, self._outside = context, access, outside
-        self._open: dict[UdprosSubscription, tuple[DatagramRelay, _Right]] = {}
+        self._open: dict[UdprosSubscription, tuple[DatagramRelay, _RelayCondition]] = {}
 
     def __iter__(self) -> Iterator[tuple[UdprosSubscription, DatagramRelay]]:
         """All that are open."""
-        return iter([(one, relay) for one, (relay, _) in self._open.items()])
+        return iter([(s, relay) for s, (relay, _) in self._open.items()])
 
     def __len__(self) -> int:
         """How many there are."""
         return len(self._open)
 
     def connections(self) -> set[tuple[int, str, str]]:
-        """Of each the publisher's port, the topic and the subscriber's name."""
-        return {(one.port, one.topic, one.caller_id) for one in self._open}
+        """The publisher's port, the topic and the subscriber's name of each."""
+        return {(s.port, s.topic, s.caller_id) for s in self._open}
 
     async def lead_outwards(
         self, endpoint: Endpoint, call: Call, body: bytes, source: str
     ) -> bytes:
-        """The call of a subscriber that asks through the proxy as a node inside is to have it."""
+        """The call of a subscriber, for a node inside: its offers lead to ports of the proxy."""
         proxy = self._context.caller_at(endpoint).proxy
         topic, caller_id = call.string(1) or "", call.string(0) or ""
 
-        def there() -> bool:
-            known = self._context.registry.by_port.get(endpoint.port) is endpoint
-            return known and topic in endpoint.names(Kind.PUBLISHER)
+        def is_registered() -> bool:
+            is_current = self._context.registry.by_port.get(endpoint.port) is endpoint
+            return is_current and topic in endpoint.names(Kind.PUBLISHER)
 
-        def allowed() -> bool:
+        def is_allowed() -> bool:
             kind = RuleKind.PUBLISH
             return not self._access.outside_may_not(kind, topic, endpoint, source, caller_id)
 
-        right = _Right(there, allowed)
+        condition = _RelayCondition(is_registered, is_allowed)
 
-        async def lead(where: HostPort) -> HostPort | None:
-            target = await self._reachable(where, source)
+        async def redirect(offered: HostPort) -> HostPort | None:
+            target = await self._reachable(offered, source)
             if target is None:
                 return None
             port, sources = endpoint.port, [endpoint.location.address]
-            one = UdprosSubscription(port, topic, caller_id, source, target, False)
-            led = self._lead(one, right, proxy, _tried(one, PORTS), sources)
-            return HostPort(proxy, led) if led else None
+            subscription = UdprosSubscription(port, topic, caller_id, source, target, False)
+            relay_port = self._relay_port(
+                subscription, condition, proxy, _candidates(subscription, PORTS), sources
+            )
+            return HostPort(proxy, relay_port) if relay_port else None
 
-        return await _rewritten(call, body, right, lead)
+        return await _rewritten(call, body, condition, redirect)
 
     async def lead_inwards(self, stand_in: StandIn, call: Call, body: bytes, source: str) -> bytes:
-        """The call of a subscriber inside as a node outside is to have it."""
+        """The call of a subscriber inside, for a node outside: its offers lead to the proxy."""
         topic, caller_id = call.string(1) or "", call.string(0) or ""
         settings, registry = self._context.settings, self._context.registry
 
-        def there() -> bool:
+        def is_registered() -> bool:
             endpoint = registry.by_caller.get(caller_id)
             if not settings.udp or endpoint is None or endpoint.address != source:
                 return False
             return (Kind.SUBSCRIBER, topic, caller_id) in endpoint.registrations
 
-        def allowed() -> bool:
+        def is_allowed() -> bool:
             return not self._access.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
 
-        right = _Right(there, allowed)
+        condition = _RelayCondition(is_registered, is_allowed)
 
-        async def lead(where: HostPort) -> HostPort | None:
-            target, port = HostPort(source, where.port), stand_in.local.port
-            one = UdprosSubscription(port, topic, caller_id, source, target, True)
+        async def redirect(offered: HostPort) -> HostPort | None:
+            target, port = HostPort(source, offered.port), stand_in.local.port
+            subscription = UdprosSubscription(port, topic, caller_id, source, target, True)
             publisher = self._context.upstream.reach(stand_in.where).host
             sources = await resolve(publisher, NODES)
-            ports = _tried(one, settings.ports.listen.ports())
-            led = self._lead(one, right, settings.bind, ports, sources)
-            return self._context.addressing.outside(led) if led else None
+            ports = _candidates(subscription, settings.ports.listen.ports())
+            relay_port = self._relay_port(subscription, condition, settings.bind, ports, sources)
+            return self._context.addressing.outside(relay_port) if relay_port else None
 
-        return await _rewritten(call, body, right, lead)
+        return await _rewritten(call, body, condition, redirect)
 
     def sweep(self) -> None:
-        """End those of which an end is gone."""
-        for one in [one for one, (_, right) in self._open.items() if not right.there()]:
-            self._end(one)
+        """End those whose publisher or subscriber is not registered any more."""
+        for subscription in [s for s, (_, c) in self._open.items() if not c.is_registered()]:
+            self._end(subscription)
 
     def cut_denied(self) -> int:
         """End those whose subscribers may not have the topic any more; how many."""
         self.sweep()
-        denied = [one for one, (_, right) in self._open.items() if not right.allowed()]
-        for one in denied:
-            self._end(one)
+        denied = [s for s, (_, c) in self._open.items() if not c.is_allowed()]
+        for subscription in denied:
+            self._end(subscription)
         return len(denied)
 
     def close(self) -> None:
         """End all."""
-        for one in list(self._open):
-            self._end(one)
+        for subscription in list(self._open):
+            self._end(subscription)
 
-    async def _reachable(self, where: HostPort, source: str) -> HostPort | None:
-        """Where a subscriber wants its datagrams that asks from an address; None: not to be had.
+    async def _reachable(self, offered: HostPort, source: str) -> HostPort | None:
+        """Where the datagrams go for a subscriber that asks from an address; None if nowhere.
 
         That is outside or, on another inside network, at the very address that asks.
         """
         if self._context.client_kind(source) is ClientKind.ADMITTED:
-            return HostPort(source, where.port)
+            return HostPort(source, offered.port)
         try:
-            return await self._outside.reach(where)
+            return await self._outside.reach(offered)
         except OSError as error:
-            log.debug("no datagrams to %s: %s", where, error)
+            log.debug("no datagrams to %s: %s", offered, error)
             return None
 
-    def _lead(
+    def _relay_port(
         self,
-        one: UdprosSubscription,
-        right: _Right,
+        subscription: UdprosSubscription,
+        condition: _RelayCondition,
         address: str,
         ports: Iterable[int],
         sources: Collection[str],
@@ -196,39 +198,48 @@ class UdprosRelays:
 
         ``address`` and ``ports`` are where it may be, ``sources`` from where datagrams may come.
         """
-        if known := self._open.get(one):
-            return known[0].port
-        self._make_room(one.peer)
+        if existing := self._open.get(subscription):
+            return existing[0].port
+        self._make_room(subscription.peer)
         for port in ports:
             try:
                 sock = bind(address, port)
-                relay = DatagramRelay(sock, sources, one.target, lambda: self._end(one))
+                relay = DatagramRelay(
+                    sock, sources, subscription.target, lambda: self._end(subscription)
+                )
             except OSError as error:
-                log.debug("no datagrams for %s at port %d: %s", one.topic, port, error)
+                log.debug("no datagrams for %s at port %d: %s", subscription.topic, port, error)
                 continue
-            self._open[one] = relay, right
-            log.debug("datagrams of %s at port %d go to %s", one.topic, relay.port, one.target)
+            self._open[subscription] = relay, condition
+            log.debug(
+                "datagrams of %s at port %d go to %s",
+                subscription.topic,
+                relay.port,
+                subscription.target,
+            )
             return relay.port
         return None
 
     def _make_room(self, peer: str) -> None:
         """End a relay if there are too many of a subscriber's address, or at all."""
-        crowds = Counter(one.peer for one in self._open)
-        if crowds[peer] < MOST_RELAYS_EACH:
+        counts = Counter(s.peer for s in self._open)
+        if counts[peer] < MOST_RELAYS_EACH:
             if len(self._open) < MOST_RELAYS:
                 return
-            peer = crowds.most_common(1)[0][0]
-        self._end(next(one for one in self._open if one.peer == peer))
+            peer = counts.most_common(1)[0][0]
+        self._end(next(s for s in self._open if s.peer == peer))
 
-    def _end(self, one: UdprosSubscription) -> None:
-        relay, _ = self._open.pop(one, (None, None))
+    def _end(self, subscription: UdprosSubscription) -> None:
+        relay, _ = self._open.pop(subscription, (None, None))
         if relay is not None:
             relay.close()
 
 
-def _tried(one: UdprosSubscription, ports: range) -> list[int]:
+def _candidates(subscription: UdprosSubscription, ports: range) -> list[int]:
     """The ports to try for a subscription: after a restart the same comes first."""
-    seed = blake2b(f"{one.port} {one.topic} {one.caller_id}".encode(), digest_size=8).digest()
+    seed = blake2b(
+        f"{subscription.port} {subscription.topic} {subscription.caller_id}".encode(), digest_size=8
+    ).digest()
     first, count = int.from_bytes(seed, "big"), len(ports)
     return [ports[(first + number) % count] for number in range(min(TRIES, count))]
 
@@ -236,14 +247,14 @@ def _tried(one: UdprosSubscription, ports: range) -> list[int]:
 async def _rewritten(
     call: Call,
     body: bytes,
-    right: _Right,
-    lead: Callable[[HostPort], Awaitable[HostPort | None]],
+    condition: _RelayCondition,
+    redirect: Callable[[HostPort], Awaitable[HostPort | None]],
 ) -> bytes:
-    """A call with each of its offers led elsewhere, or taken out if it may not or can't be had."""
+    """A call with each of its offers redirected, or taken out if there may or can be no relay."""
     topic, edits = call.string(1) or "", list[Edit]()
     for offer in read_offers(call):
-        led = None
-        if offer.where and offer.topic == topic and right.holds():
-            led = await lead(offer.where)
-        edits += lead_to(offer, led)
+        target = None
+        if offer.where and offer.topic == topic and condition.holds():
+            target = await redirect(offer.where)
+        edits += lead_to(offer, target)
     return xmlrpc.apply(body, edits)

@@ -10,6 +10,6 @@ Where to look:
 - A container went, moved or arrived, or the proxy is to retire: `containers`.
 - What the proxy itself registers and unregisters at the master: `registrar`.
 
-Data goes one way: an answer of the master or a node is read by a client, a module of `policy` says
-what follows, and the `Registrar` makes the calls. Nothing below knows who asked for it.
+Data goes one way: an answer of the master or a node is read by a client, a module of `decisions`
+says what follows, and the `Registrar` makes the calls. Nothing below knows who asked for it.
 """

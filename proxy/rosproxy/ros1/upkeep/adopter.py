@@ -42,7 +42,7 @@ class Adopter:
     _leases: Leases[Endpoint]
     _admission: NodeAdmission
     _registrar: Registrar
-    _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def adopt(self, arrived: Sequence[Container]) -> int:
         """Adopt the nodes of containers that have arrived.
@@ -57,18 +57,18 @@ class Adopter:
             if is_inside(address, context.addressing.networks):
                 inside.append((address, names))
             else:
-                text = "is in none of the inside networks: its nodes are not looked at"
-                context.problems.add(address, text)
+                problem = "is in none of the inside networks: its nodes are not looked at"
+                context.problems.add(address, problem)
         if not inside:
             return 0
-        async with self._one_at_a_time:
+        async with self._lock:
             graph = await context.upstream.read_graph()
             nodes = decisions.find_direct(graph, inside, context.addressing)
-            infos = await self._inspect({place for node in nodes for place in node.places})
-            sure = await self._verify(nodes, infos)
-            located, doubts = decisions.locate(nodes, infos, sure)
-            for name, why in doubts.items():
-                self._report(name, why)
+            infos = await self._inspect({slave for node in nodes for slave in node.places})
+            verified = await self._verify(nodes, infos)
+            located, doubts = decisions.locate(nodes, infos, verified)
+            for name, reason in doubts.items():
+                self._report(name, reason)
             return await self._take_in(located, infos)
 
     async def take_over(self, endpoint: Endpoint, caller_id: str) -> None:
@@ -83,7 +83,7 @@ class Adopter:
         if uri and uri != advertised and known_as(endpoint, uri):
             log.info("%s was registered as %s around the proxy; taken over", caller_id, uri)
             try:
-                async with self._one_at_a_time:
+                async with self._lock:
                     await self._registrar.reclaim({caller_id: (endpoint, uri)})
             except MasterError as error:
                 raise Unreachable(str(error)) from error
@@ -91,8 +91,8 @@ class Adopter:
     async def absorb_shutdown(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
         """Keep a ``shutdown`` from a node that no other has replaced; whether that is so.
 
-        What the node registered around the proxy is then registered anew. Nor is it meant for one
-        that never had the name: another had this port before.
+        What the node registered around the proxy is then registered anew. A ``shutdown`` for a
+        name that it never had is kept from it, too: another node had this port before.
         """
         name = decisions.renamed_node(caller_id, reason)
         if name is None:
@@ -109,52 +109,52 @@ class Adopter:
             return False
         log.info("%s registered around the proxy; not shut down", name)
         former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
-        self._context.tasks.spawn(self._repeat(endpoint, former), f"taking over {endpoint.uri}")
+        self._context.tasks.spawn(self._reclaim(endpoint, former), f"taking over {endpoint.uri}")
         return True
 
-    async def _repeat(self, endpoint: Endpoint, former: FormerUris) -> None:
-        """Take names over once more; and what is at the master neither way by now."""
+    async def _reclaim(self, endpoint: Endpoint, former: FormerUris) -> None:
+        """Reclaim names once more, and register what the master has by neither URI by now."""
         try:
-            async with self._one_at_a_time:
+            async with self._lock:
                 await self._registrar.reclaim(former)
                 await self._registrar.reconcile(endpoint)
         except (Unreachable, MasterError) as error:
             log.warning("%s; what is lost is registered later", error)
 
-    async def _inspect(self, places: set[HostPort]) -> dict[HostPort, NodeInfo]:
-        """What nodes say of themselves, where one answers."""
-        found = await asyncio.gather(*map(self._context.nodes.inspect, places))
-        return {place: info for place, info in zip(places, found, strict=True) if info}
+    async def _inspect(self, slaves: set[HostPort]) -> dict[HostPort, NodeInfo]:
+        """What the nodes at slave addresses say of themselves, where one answers."""
+        answers = await asyncio.gather(*map(self._context.nodes.inspect, slaves))
+        return {slave: info for slave, info in zip(slaves, answers, strict=True) if info}
 
     async def _verify(
         self, nodes: Sequence[DirectNode], infos: Mapping[HostPort, NodeInfo]
     ) -> set[tuple[str, HostPort]]:
-        """Which nodes are at which of their places for sure, by name."""
+        """The names with the slave addresses at which their nodes bear out what is registered."""
         judge = Verifier(self._context.nodes).judge
-        tried = [(node, place) for node in nodes for place in node.places if place in infos]
+        tried = [(node, slave) for node in nodes for slave in node.places if slave in infos]
         borne_out = await asyncio.gather(
-            *(judge(place, node.registrations, infos[place]) for node, place in tried)
+            *(judge(slave, node.registrations, infos[slave]) for node, slave in tried)
         )
         return {
-            (node.caller_id, place)
-            for (node, place), sure in zip(tried, borne_out, strict=True)
-            if sure
+            (node.caller_id, slave)
+            for (node, slave), is_verified in zip(tried, borne_out, strict=True)
+            if is_verified
         }
 
     async def _take_in(
         self, located: Mapping[HostPort, list[DirectNode]], infos: Mapping[HostPort, NodeInfo]
     ) -> int:
-        """Give each a port and register all of them anew; how many names could be."""
+        """Give each node a port and register all anew; how many names were adopted."""
         former: dict[str, tuple[Endpoint, str]] = {}
         endpoints: dict[Endpoint, NodeInfo] = {}
         try:
-            for place, nodes in located.items():
-                endpoint = await self._make_endpoint(place, nodes, infos[place])
+            for slave, nodes in located.items():
+                endpoint = await self._make_endpoint(slave, nodes, infos[slave])
                 if endpoint is None:
                     for node in nodes:
                         self._report(node.caller_id, NO_PORT)
                     continue
-                endpoints[endpoint] = infos[place]
+                endpoints[endpoint] = infos[slave]
                 former |= {node.caller_id: (endpoint, node.uri) for node in nodes}
             await self._registrar.reclaim(former)
             for endpoint, info in endpoints.items():
@@ -169,19 +169,19 @@ class Adopter:
         return len(adopted)
 
     async def _make_endpoint(
-        self, place: HostPort, nodes: Sequence[DirectNode], info: NodeInfo
+        self, slave: HostPort, nodes: Sequence[DirectNode], info: NodeInfo
     ) -> Endpoint | None:
-        """The endpoint of nodes at a place, with what they hold; marked as ``pending``.
+        """The endpoint of nodes at a slave address, with what they registered; it is ``pending``.
 
-        So what they hold is registered anew even if that fails at first.
+        So what they registered is registered anew even if that fails at first.
         """
         uri = nodes[0].uri
-        own = parse_slave_uri(uri) or place
-        host = self._context.upstream.reach(own).host
-        named = place.host in await resolve(host, place.host)
-        caller = Caller(place.host, "", nodes[0].caller_id)
-        where = NodeLocation(place.host, named, confirmed=False)
-        endpoint = await self._admission.take_in(uri, own, where, caller, answers=True)
+        own_slave = parse_slave_uri(uri) or slave
+        host = self._context.upstream.reach(own_slave).host
+        named = slave.host in await resolve(host, slave.host)
+        caller = Caller(slave.host, "", nodes[0].caller_id)
+        location = NodeLocation(slave.host, named, confirmed=False)
+        endpoint = await self._admission.take_in(uri, own_slave, location, caller, answers=True)
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.hold()
@@ -193,15 +193,19 @@ class Adopter:
         self._leases.open(endpoint)
         for node in nodes:
             endpoint.note_former_uri(node.uri)
-            for held in node.registrations:
-                type_ = info.by_kind.get(held.kind, {}).get(held.name, held.type)
-                self._context.registry.register(endpoint, replace(held, type=type_, since=now))
+            for registration in node.registrations:
+                type_ = info.by_kind.get(registration.kind, {}).get(
+                    registration.name, registration.type
+                )
+                self._context.registry.register(
+                    endpoint, replace(registration, type=type_, since=now)
+                )
         return endpoint
 
-    def _report(self, name: str, why: str) -> None:
-        log.warning("%s: %s", name, why)
-        self._context.problems.add(name, why)
+    def _report(self, name: str, reason: str) -> None:
+        log.warning("%s: %s", name, reason)
+        self._context.problems.add(name, reason)
 
     async def _look_up(self, caller_id: str) -> str | None:
-        known = await self._context.upstream.look_up("lookupNode", [caller_id])
-        return known.get(caller_id)
+        uris = await self._context.upstream.look_up("lookupNode", [caller_id])
+        return uris.get(caller_id)

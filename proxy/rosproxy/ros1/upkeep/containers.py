@@ -36,7 +36,7 @@ GONE_TIMEOUT = 0.5
 YOUNG = 3.0
 """Seconds since its last registration in which a silent node gets a second chance."""
 SECOND_CHANCE = 1.0
-"""Seconds after which it gets it."""
+"""Seconds after which a silent node gets its second chance."""
 RETIRE_TIMEOUT = 3.0
 """Seconds that registrations under way get to end before a proxy retires."""
 
@@ -53,14 +53,14 @@ class ContainerEvents:
     resubscriber: Resubscriber
     tcpros: TcprosServer
     plane: KernelPlane
-    _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def handle(
         self, gone: Collection[str], moved: Mapping[str, str], arrived: Sequence[Container]
     ) -> dict[str, int]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
 
-        ``moved``: old address to new address. All of it is safe to be told again. Raises
+        ``moved``: old address to new address. All of it may safely be sent again. Raises
         Unreachable, MasterError, once all has been tried.
         """
         steps = {
@@ -70,12 +70,12 @@ class ContainerEvents:
         }
         counts: dict[str, int] = {}
         failed: Exception | None = None
-        async with self._one_at_a_time:
+        async with self._lock:
             await self.recovery.ensure()
             self.context.read_networks()
-            for what, step in steps.items():
+            for action, step in steps.items():
                 try:
-                    counts[what] = await step()
+                    counts[action] = await step()
                 except (Unreachable, MasterError) as error:
                     failed = failed or error
         if failed:
@@ -88,7 +88,7 @@ class ContainerEvents:
         Raises Unreachable, MasterError.
         """
         self.context.retired = True
-        async with self._one_at_a_time:
+        async with self._lock:
             await self.recovery.ensure()
             end, registry = self.context.now() + RETIRE_TIMEOUT, self.context.registry
             while any(e.pending for e in registry) and self.context.now() < end:  # noqa: ASYNC110
@@ -103,18 +103,18 @@ class ContainerEvents:
 
     async def _remove(self, addresses: Collection[str]) -> int:
         """Unregister the nodes at addresses that are gone; those that answer live on."""
-        found = [e for e in self.context.registry if e.location.address in addresses]
-        return await self._remove_dead(found, self.context.now() - YOUNG)
+        endpoints = [e for e in self.context.registry if e.location.address in addresses]
+        return await self._remove_dead(endpoints, self.context.now() - YOUNG)
 
-    async def _remove_dead(self, found: Sequence[Endpoint], since: float) -> int:
-        """Unregister those that don't answer; who is silent and registered ``since``, later."""
+    async def _remove_dead(self, endpoints: Sequence[Endpoint], since: float) -> int:
+        """Unregister nodes that don't answer; silent ones that registered ``since`` then, later."""
         probe = self.context.nodes.probe
-        answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in found))
-        outcomes = {e: answer.probe for e, answer in zip(found, answers, strict=True)}
+        answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in endpoints))
+        outcomes = {e: answer.probe for e, answer in zip(endpoints, answers, strict=True)}
         dead = liveness.dead(outcomes, since)
         for endpoint in dead:
             self._close(endpoint)
-        alive = [endpoint for endpoint in found if endpoint not in dead]
+        alive = [endpoint for endpoint in endpoints if endpoint not in dead]
         for endpoint in alive:
             endpoint.health.probe_soon()  # another process may have the address by now
         silent = [e for e in alive if outcomes[e] is ProbeResult.SILENT]
@@ -123,50 +123,50 @@ class ContainerEvents:
         return await self._unregister(e for e in dead if not e.health.cleaned)
 
     async def _remove_later(self, silent: Sequence[Endpoint]) -> None:
-        """Look again at silent nodes; the prober unregisters what can't be now."""
+        """Probe silent nodes again; the prober unregisters those that can't be unregistered now."""
         await asyncio.sleep(SECOND_CHANCE)
-        async with self._one_at_a_time:
-            there = [e for e in silent if self.context.registry.by_port.get(e.port) is e]
+        async with self._lock:
+            current = [e for e in silent if self.context.registry.by_port.get(e.port) is e]
             with contextlib.suppress(Unreachable, MasterError):
-                await self._remove_dead(there, float("inf"))
+                await self._remove_dead(current, float("inf"))
 
     async def _move(self, moved: Mapping[str, str]) -> int:
         """Take in that containers have other addresses now; how many nodes that concerns."""
         registry, addressing = self.context.registry, self.context.addressing
         candidates = liveness.movable(registry, moved, addressing.networks)
-        found = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
-        infos = {e: info for e, info in zip(candidates, found, strict=True) if info}
-        before = {endpoint: addressing.advertised_uri(endpoint) for endpoint in infos}
-        places = {e: liveness.new_place(e, candidates[e]) for e in infos}
-        there = registry.move(places)
-        for endpoint in there:
-            self._settle(endpoint, before[endpoint], infos[endpoint])
-        await self.registrar.resettle(there)
-        await self.resubscriber.announce(there)  # their URI is as before, their connections not
-        for endpoint in set(infos) - set(there):
+        answers = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
+        infos = {e: info for e, info in zip(candidates, answers, strict=True) if info}
+        former_uris = {endpoint: addressing.advertised_uri(endpoint) for endpoint in infos}
+        locations = {e: liveness.new_place(e, candidates[e]) for e in infos}
+        relocated = registry.move(locations)
+        for endpoint in relocated:
+            self._settle(endpoint, former_uris[endpoint], infos[endpoint])
+        await self.registrar.resettle(relocated)
+        await self.resubscriber.announce(relocated)  # their URI is as before, their connections not
+        for endpoint in set(infos) - set(relocated):
             # The node has registered from its new address already, and holds another port there.
-            there_now = HostPort(places[endpoint].address, endpoint.node.port)
-            successor = registry.by_slave.get(there_now)
+            slave = HostPort(locations[endpoint].address, endpoint.node.port)
+            successor = registry.by_slave.get(slave)
             self._close(endpoint)
             await self.registrar.clean_up(endpoint)
             if successor is not None:
                 await self.registrar.register_missing(successor, infos[endpoint])
-        return sum(len(endpoint.caller_ids) for endpoint in there)
+        return sum(len(endpoint.caller_ids) for endpoint in relocated)
 
     async def _inspect(self, endpoint: Endpoint, address: str) -> NodeInfo | None:
         """What the node of an endpoint says, if it is the one that answers at another address."""
-        held = list(endpoint.registrations.values())
-        where = HostPort(address, endpoint.node.port)
+        registrations = list(endpoint.registrations.values())
+        slave = HostPort(address, endpoint.node.port)
         ports = list(endpoint.service_ports)
-        info, borne_out = await Verifier(self.context.nodes).ask(where, held, ports)
-        known = endpoint.health.pid
-        if info is None or not liveness.is_same_process(known, info.pid, borne_out):
+        info, borne_out = await Verifier(self.context.nodes).ask(slave, registrations, ports)
+        known_pid = endpoint.health.pid
+        if info is None or not liveness.is_same_process(known_pid, info.pid, borne_out):
             return None
         return info
 
-    def _settle(self, endpoint: Endpoint, before: str, info: NodeInfo) -> None:
-        """Serve a node at its new address; the master has the former URI yet."""
-        endpoint.note_moved(before, self.context.addressing.advertised_uri(endpoint))
+    def _settle(self, endpoint: Endpoint, former_uri: str, info: NodeInfo) -> None:
+        """Serve a node at its new address; the master still has the former URI."""
+        endpoint.note_moved(former_uri, self.context.addressing.advertised_uri(endpoint))
         endpoint.mark_alive(info.pid, info.topic_ports, self.context.now())
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
@@ -176,9 +176,9 @@ class ContainerEvents:
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:
         """Unregister nodes; how many names that were."""
-        held = [endpoint for endpoint in endpoints if endpoint.registrations]
-        await asyncio.gather(*map(self.registrar.clean_up, held))
-        return sum(len(endpoint.caller_ids) for endpoint in held)
+        registered = [endpoint for endpoint in endpoints if endpoint.registrations]
+        await asyncio.gather(*map(self.registrar.clean_up, registered))
+        return sum(len(endpoint.caller_ids) for endpoint in registered)
 
     def _close(self, endpoint: Endpoint) -> None:
         """Let a port refuse whose node has ended, and end what is still connected to it."""

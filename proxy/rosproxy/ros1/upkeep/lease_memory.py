@@ -24,37 +24,37 @@ class LeaseMemory:
     """Reads and writes the parameter of this proxy."""
 
     def __init__(self, context: Context) -> None:
-        self._context, self._one_at_a_time = context, asyncio.Lock()
+        self._context, self._lock = context, asyncio.Lock()
         settings = context.settings
         self.parameter = memory.parameter_of(settings.advertise_host, settings.ports)
-        self._written = -1
-        self._kept: object = None
+        self._written_changes = -1
+        self._stored: object = None
         """What the master has, as far as is known."""
 
     async def read(self) -> Mapping[int, Remembered]:
         """What a former process has left, by port. Raises Unreachable."""
-        self._kept = await self._read()
-        return memory.remembered(self._kept, self._context.settings.ports)
+        self._stored = await self._read()
+        return memory.remembered(self._stored, self._context.settings.ports)
 
     async def write(self) -> None:
         """Have the master keep what is known of all leases, unless it does. Raises Unreachable."""
         registry = self._context.registry
-        while self._written != registry.lease_changes:
-            async with self._one_at_a_time:
+        while self._written_changes != registry.lease_changes:
+            async with self._lock:
                 changes = registry.lease_changes
-                if self._written != changes:
+                if self._written_changes != changes:
                     await self._write(memory.to_remember(registry, self._context.settings.ports))
-                    self._written = changes
+                    self._written_changes = changes
 
     async def look(self) -> None:
         """Write it again if the master has lost it, or if somebody else has written there.
 
         Raises Unreachable.
         """
-        async with self._one_at_a_time:
-            kept = await self._read()
-            if kept != self._kept:
-                self._kept, self._written = kept, -1
+        async with self._lock:
+            stored = await self._read()
+            if stored != self._stored:
+                self._stored, self._written_changes = stored, -1
         await self.write()
 
     async def _read(self) -> object:
@@ -64,7 +64,7 @@ class LeaseMemory:
             return ""
 
     async def _write(self, text: str) -> None:
-        if text == self._kept:
+        if text == self._stored:
             return
         upstream, problems = self._context.upstream, self._context.problems
         try:
@@ -76,4 +76,4 @@ class LeaseMemory:
         except MasterError as error:
             if text:  # nothing else depends on it; to delete what is not there is refused as well
                 problems.add(self.parameter, REFUSED.format(error))
-        self._kept = text
+        self._stored = text

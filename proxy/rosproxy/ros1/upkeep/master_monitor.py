@@ -56,7 +56,7 @@ class MasterMonitor:
             self._looks += 1
             await self._memory.write()
             if restarted or self._looks % LOOKS_PER_CHECK == 0:
-                await self._memory.look()  # before what is registered, which it is needed for
+                await self._memory.look()  # first: what is registered next needs it
                 await self._registrar.register_lost()
             self._mark(True)
         except (Unreachable, MasterError) as error:

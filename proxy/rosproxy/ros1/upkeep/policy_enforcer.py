@@ -3,7 +3,7 @@
 What is denied now is taken back at the master and hidden; the nodes inside that use it stay
 connected. What is allowed again is registered. Connections from outside to what outside may not
 have are cut, and a node of which anything may be denied loses its fast port, as do all stand-ins
-for nodes outside where a rule is about those: what the kernel forwards nobody looks at. Nothing
+for nodes outside where a rule is about those: what the kernel forwards is not checked. Nothing
 else is touched, so that it may be done at any time, and is done again until it has worked.
 """
 
@@ -42,7 +42,7 @@ class Enforced(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True, eq=False)
 class PolicyEnforcer:
-    """Makes what there is fit the policy."""
+    """Makes registrations and connections fit the policy."""
 
     _context: Context
     _leases: Leases[Endpoint]
@@ -52,17 +52,17 @@ class PolicyEnforcer:
     _plane: KernelPlane
     _access: AccessChecks
     _stand_ins: StandInPorts
-    _enforced: int = -1
-    _again: bool = False
-    _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _enforced_version: int = -1
+    _must_enforce: bool = False
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def look_again(self) -> None:
-        """Note that something may have happened by a policy that is no longer in force."""
-        self._again = True
+        """Note that something may have been done by a policy that is no longer in force."""
+        self._must_enforce = True
 
     async def look(self) -> None:
         """Enforce the policy if that has not been done since it changed."""
-        if self._again or self._enforced != self._context.policy.version:
+        if self._must_enforce or self._enforced_version != self._context.policy.version:
             try:
                 await self.enforce()
             except (Unreachable, MasterError) as error:
@@ -70,26 +70,26 @@ class PolicyEnforcer:
 
     async def enforce(self) -> Enforced:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
-        async with self._one_at_a_time:
-            version, self._again = self._context.policy.version, False
+        async with self._lock:
+            version, self._must_enforce = self._context.policy.version, False
             cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
             try:
                 await self._recovery.ensure()
                 hidden, shown = await self._registrar.apply_policy()
             except (Unreachable, MasterError):
-                self._again = True
+                self._must_enforce = True
                 raise
-            self._enforced = version
-        done = Enforced(hidden, shown, cut)
-        if done != Enforced():
+            self._enforced_version = version
+        enforced = Enforced(hidden, shown, cut)
+        if enforced != Enforced():
             text = "policy: %d registrations are hidden now, %d shown, %d connections were cut"
             log.info(text, hidden, shown, cut)
-        return done
+        return enforced
 
     def _cut_relays(self) -> int:
         """End the connections that outside, or a node inside, may not have; how many.
 
-        Of one for what is not registered the name is not known: it may be denied as well.
+        The name of what is not registered is not known: a connection to it may be denied as well.
         """
         count = 0
         for relay in self._tcpros.relays:

@@ -8,7 +8,7 @@ served again, and registered again if need be. Another pid than before means ano
 the former one left is taken back.
 
 What follows from a probe: `Health.note` says how the node is, `liveness` what is due, and the
-`Registrar` and the rooms beside this one do it.
+`Registrar` and the modules beside this one do it.
 """
 
 import asyncio
@@ -62,7 +62,7 @@ class Prober:
             return
         now, interval = context.now(), context.settings.probe_interval
         for endpoint, result in self.kept.collect(now).items():
-            self._heard(endpoint, result, now)
+            self._note_result(endpoint, result, now)
         busy = self._probing | self._recovery.verifying
         for endpoint in liveness.to_look_at(context.registry, now, interval):
             if endpoint not in busy and liveness.is_due(endpoint, now, interval):
@@ -76,20 +76,20 @@ class Prober:
         """Find out how a node is, in the cheapest way that there is."""
         pid = endpoint.health.pid if liveness.may_be_kept(endpoint) else None
         if pid is None or not self.kept.ask(endpoint, endpoint.slave, pid, now):
-            self._begin(endpoint)
+            self._begin_probe(endpoint)
 
-    def _heard(self, endpoint: Endpoint, result: ProbeResult | None, now: float) -> None:
-        """Take in what has become of a kept connection."""
+    def _note_result(self, endpoint: Endpoint, result: ProbeResult | None, now: float) -> None:
+        """Note what a kept connection has shown; None: the node has ended it."""
         if result is None:
             endpoint.health.note_hung_up()
         elif endpoint in self._probing or not liveness.may_be_kept(endpoint):
-            return  # somebody suspects it meanwhile: it is asked by a call
+            return  # it is suspected meanwhile: it is asked by a call
         elif result is ProbeResult.ANSWERED:
             endpoint.health.note(result, now)
         else:
-            self._begin(endpoint, ProbeAnswer(result, reason=f"{endpoint.slave}: {OVERDUE}"))
+            self._begin_probe(endpoint, ProbeAnswer(result, reason=f"{endpoint.slave}: {OVERDUE}"))
 
-    def _begin(self, endpoint: Endpoint, answer: ProbeAnswer | None = None) -> None:
+    def _begin_probe(self, endpoint: Endpoint, answer: ProbeAnswer | None = None) -> None:
         self._probing.add(endpoint)
         self._context.tasks.spawn(self._probe(endpoint, answer), f"probe of {endpoint.uri}")
 
@@ -104,15 +104,15 @@ class Prober:
 
     async def _look_after(self, endpoint: Endpoint, answer: ProbeAnswer | None) -> None:
         """Act on how a node has answered, or answers when it is called."""
-        where, health = endpoint.slave, endpoint.health
-        answer = answer or await self._context.nodes.probe(where)
-        if endpoint.slave != where:
+        slave, health = endpoint.slave, endpoint.health
+        answer = answer or await self._context.nodes.probe(slave)
+        if endpoint.slave != slave:
             return  # it has moved meanwhile
-        failing = health.failures > 0
+        was_failing = health.failures > 0
         went_down = health.note(answer.probe, self._context.now())
         if answer.probe is ProbeResult.ANSWERED:
-            await self._answered(endpoint, answer.pid)
-            if failing:
+            await self._note_answer(endpoint, answer.pid)
+            if was_failing:
                 self._context.problems.solved_at(endpoint.port)
         elif went_down:
             self._report_down(endpoint, answer.reason)
@@ -121,7 +121,7 @@ class Prober:
         if liveness.is_to_be_unregistered(endpoint, self._context.now(), after):
             await self._registrar.clean_up(endpoint)
 
-    async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
+    async def _note_answer(self, endpoint: Endpoint, pid: int | None) -> None:
         health = endpoint.health
         if not endpoint.trusted:
             await self._recovery.serve(endpoint)
@@ -149,8 +149,8 @@ class Prober:
         if not endpoint.unused:
             endpoint.note_used()
             return
-        lasts = liveness.lease_lasts(endpoint, self._context.settings.linger)
-        if endpoint.note_unused(now) >= lasts:
+        lease_time = liveness.lease_lasts(endpoint, self._context.settings.linger)
+        if endpoint.note_unused(now) >= lease_time:
             log.info(
                 "port %d is free again: %s", endpoint.port, endpoint.uri, extra=endpoint.log_fields
             )

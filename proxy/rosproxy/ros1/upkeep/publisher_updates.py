@@ -1,11 +1,11 @@
-"""The master's part where it is told nothing: which publishers subscribers inside hear of.
+"""The master's part for what it does not know: which publishers subscribers inside hear of.
 
 A list of publishers for a node inside is what the master says, and the hidden publishers besides
 (`rosproxy.ros1.registry.hidden`). When those change, the subscribers inside are told. The ones that
 the master knows need the master's list for that: registering them again yields it, and tells
 nobody anything.
 
-News of one topic wait for each other, so that an older list never comes after a newer one.
+Updates of one topic wait for each other, so that an older list never comes after a newer one.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 PARALLEL_CALLS = 32
 RETRY = 2.0
-"""Seconds after which the master is asked again that was away."""
+"""Seconds after which a master that could not be reached is asked again."""
 
 
 class PublisherUpdates:
@@ -37,8 +37,8 @@ class PublisherUpdates:
     def __init__(self, context: Context, stand_ins: StandInPorts) -> None:
         self._context, self._stand_ins = context, stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
-        self._telling: set[str] = set()
-        self._changed: dict[str, bool] = {}
+        self._topics_underway: set[str] = set()
+        self._changed_topics: dict[str, bool] = {}
 
     async def update(self, subscriber: str, topic: str, publishers: Sequence[str]) -> bool:
         """Hand the node at a slave URI the publishers of a topic; whether it has answered.
@@ -48,74 +48,74 @@ class PublisherUpdates:
         endpoint = self._context.addressing.stands_for(subscriber)
         if endpoint:
             return await self.update_inside(endpoint, topic, publishers)
-        where = parse_slave_uri(subscriber)
-        return where is not None and await self._update(where, topic, publishers)
+        slave = parse_slave_uri(subscriber)
+        return slave is not None and await self._update(slave, topic, publishers)
 
     async def update_inside(
         self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
     ) -> bool:
-        """The same for an endpoint's node, which gets the hidden ones, too, in its own form."""
+        """The same for an endpoint's node: with the hidden publishers, by URIs that it can use."""
         caller, addressing = self._context.caller_at(endpoint), self._context.addressing
         await self._stand_ins.listen_for(publishers, caller)
-        found = policing.publishers_for(endpoint, topic, publishers, addressing)
-        imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in found)
+        uris = policing.publishers_for(endpoint, topic, publishers, addressing)
+        imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
         return await self._update(endpoint.slave, topic, [*imported])
 
-    def note(self, held: Registration) -> None:
-        """Note that a registration was made or has ended: who needs to know of it is told."""
-        if held.kind is Kind.PUBLISHER:
-            self.tell([held.name], held.hidden)
+    def note(self, registration: Registration) -> None:
+        """Note that a registration was made or has ended: subscribers that need it are told."""
+        if registration.kind is Kind.PUBLISHER:
+            self.tell([registration.name], registration.hidden)
 
     def tell(self, topics: Iterable[str], everybody: bool = True) -> None:
         """Tell the subscribers inside that publishers of some topics have changed.
 
-        Not ``everybody``: only the hidden ones, since the master tells the others.
+        Not ``everybody``: only the hidden subscribers, since the master tells the others.
         """
         for topic in topics:
             if everybody or (Kind.SUBSCRIBER, topic) in self._context.registry.hidden:
-                self._changed[topic] = everybody or self._changed.get(topic, False)
-                if topic not in self._telling:
-                    self._telling.add(topic)
-                    self._context.tasks.spawn(self._tell(topic), f"publishers of {topic}")
+                self._changed_topics[topic] = everybody or self._changed_topics.get(topic, False)
+                if topic not in self._topics_underway:
+                    self._topics_underway.add(topic)
+                    self._context.tasks.spawn(self._update_topic(topic), f"publishers of {topic}")
 
-    async def _tell(self, topic: str) -> None:
-        """Tell the subscribers inside of a topic, until nothing of it has changed meanwhile."""
+    async def _update_topic(self, topic: str) -> None:
+        """Tell a topic's subscribers inside, until nothing of it has changed meanwhile."""
         try:
-            while topic in self._changed:
-                everybody = self._changed.pop(topic)
-                held = hidden.subscribers_inside(self._context.registry, topic)
-                held = [(e, one) for e, one in held if e.answers and (everybody or one.hidden)]
+            while topic in self._changed_topics:
+                everybody = self._changed_topics.pop(topic)
+                inside = hidden.subscribers_inside(self._context.registry, topic)
+                inside = [(e, r) for e, r in inside if e.answers and (everybody or r.hidden)]
                 try:
-                    await self._hand_out(held)
+                    await self._hand_out(inside)
                 except Unreachable as error:
                     log.debug("publishers of %s: %s", topic, error)
-                    self._changed[topic] = True
+                    self._changed_topics[topic] = True
                     await asyncio.sleep(RETRY)
         finally:
-            self._telling.discard(topic)
+            self._topics_underway.discard(topic)
 
-    async def _hand_out(self, held: Sequence[EndpointRegistration]) -> None:
+    async def _hand_out(self, subscribers: Sequence[EndpointRegistration]) -> None:
         """Hand subscribers of one topic their publishers. Raises Unreachable."""
         addressing = self._context.addressing
-        shown = [(e, one) for e, one in held if not one.hidden]
-        calls = [decisions.register_call(one, addressing.advertised_uri(e), "") for e, one in shown]
+        shown = [(e, r) for e, r in subscribers if not r.hidden]
+        calls = [decisions.register_call(r, addressing.advertised_uri(e), "") for e, r in shown]
         values = await self._context.upstream.multicall(calls)
         lists = {
             e: value if isinstance(value, list) else []
             for (e, _), value in zip(shown, values, strict=True)
         }
-        await asyncio.gather(*(self._hand(e, one.name, lists.get(e, [])) for e, one in held))
+        await asyncio.gather(*(self._hand(e, r.name, lists.get(e, [])) for e, r in subscribers))
 
     async def _hand(self, endpoint: Endpoint, topic: str, publishers: Sequence[str]) -> None:
         await self._context.after_registration(endpoint)
         await self.update_inside(endpoint, topic, publishers)
 
-    async def _update(self, where: HostPort, topic: str, publishers: Sequence[str]) -> bool:
+    async def _update(self, slave: HostPort, topic: str, publishers: Sequence[str]) -> bool:
         body = xmlrpc.dump_call("publisherUpdate", "/master", topic, list(publishers))
         async with self._limit:
             try:
                 timeout = self._context.settings.probe_timeout
-                await self._context.upstream.post_to_node(where, body, timeout)
+                await self._context.upstream.post_to_node(slave, body, timeout)
             except Unreachable as error:
                 log.debug("publisherUpdate of %s: %s", topic, error)
                 return False

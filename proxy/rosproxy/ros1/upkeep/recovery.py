@@ -3,9 +3,9 @@
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
 graph once, and what the proxy has it remember (`LeaseMemory`), finds the URIs that this proxy
 advertised (`decisions.claims`), and rebuilds the endpoints on the ports that they had. Calls that
-register wait for it: a node that registered before would
-get another port, and the master would shut it down for having moved. Before that an operator's
-policy is waited for (``--await-policy``), or what it denies would be registered for a moment.
+register wait for it: a node that registered before would get another port, and the master would
+shut it down for having moved. Before that an operator's policy is waited for (``--await-policy``),
+or what it denies would be registered for a moment.
 
 What the master says is only a claim, since anybody can write to it. Until the node itself has
 borne it out (`Verifier`), the endpoint's port is held but refuses. Then subscribers are made to
@@ -77,8 +77,8 @@ class Recovery:
         self.verifying: set[Endpoint] = set()
         self._inspecting: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
-        self._done = asyncio.Event()
-        self._one_at_a_time = asyncio.Lock()
+        self._recovered = asyncio.Event()
+        self._lock = asyncio.Lock()
         self._failures = 0
         self._unannounced: list[Endpoint] = []
         self._announcing = asyncio.Lock()
@@ -89,13 +89,13 @@ class Recovery:
         All who wait for the same attempt share its failure: a master that hangs would keep the
         last of them waiting for as many attempts as there are callers.
         """
-        if self._done.is_set():
+        if self._recovered.is_set():
             return
-        failures = self._failures
-        async with self._one_at_a_time:
-            if self._done.is_set():
+        failures_before = self._failures
+        async with self._lock:
+            if self._recovered.is_set():
                 return
-            if self._failures != failures:
+            if self._failures != failures_before:
                 raise Unreachable("the master has not told its state")
             try:
                 await self._context.policy.wait_for_operator(self._context.settings.await_policy)
@@ -103,7 +103,7 @@ class Recovery:
             except (Unreachable, MasterError) as error:
                 self._failures += 1
                 raise Unreachable(str(error)) from None
-            self._done.set()
+            self._recovered.set()
 
     async def serve(self, endpoint: Endpoint) -> None:
         """Serve a recovered endpoint if its node bears it out, and have subscribers connect again.
@@ -117,47 +117,47 @@ class Recovery:
             self.verifying.discard(endpoint)
         if not self._leases.is_open(endpoint):
             return
-        # Each time the whole graph is read: one by one, that would grow with the square of nodes.
-        # So those that came up during the announcement before are announced together.
+        # Each announcement reads the whole graph: one per node would cost the square of the nodes.
+        # So nodes that came up during the announcement before are announced together.
         self._unannounced.append(endpoint)
         async with self._announcing:
-            found, self._unannounced = self._unannounced, []
-            if found:
-                await self._resubscriber.announce(found)
+            endpoints, self._unannounced = self._unannounced, []
+            if endpoints:
+                await self._resubscriber.announce(endpoints)
 
     async def hasten(self) -> None:
-        """Wait until a node that is being verified turns out dead, for a moment.
+        """Wait a moment for a node that is being verified to turn out dead.
 
-        Those that were being asked all that time and are silent count as failing from then on.
+        Those that were inspected all that time and are silent count as failing from then on.
         """
-        end, waited = self._context.now() + CLAIM_GRACE, set(self.verifying)
-        asked = set(self._inspecting)
-        while waited & self.verifying and self._context.now() < end:
+        end, awaited = self._context.now() + CLAIM_GRACE, set(self.verifying)
+        inspected = set(self._inspecting)
+        while awaited & self.verifying and self._context.now() < end:
             if self._context.registry.pool.free or self._context.registry.dead() is not None:
                 return
             await asyncio.sleep(0.01)
-        for endpoint in asked & self._inspecting:
+        for endpoint in inspected & self._inspecting:
             endpoint.health.note(ProbeResult.SILENT, self._context.now())
 
     async def _recover(self) -> None:
         self._context.refresh_networks()
         memory = await self._memory.read()
         graph = await self._context.upstream.read_graph()
-        found, forgotten = decisions.claims(graph, self._context.addressing, memory)
-        restored = [(claim, self._restore(claim)) for claim in await self._settle(found)]
+        claims, forgotten = decisions.claims(graph, self._context.addressing, memory)
+        restored = [(claim, self._restore(claim)) for claim in await self._settle(claims)]
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
-        served = {id(claim) for claim, endpoint in restored if endpoint is not None}
-        left = [claim for claim in found if id(claim) not in served]
+        served_ids = {id(claim) for claim, endpoint in restored if endpoint is not None}
+        unserved = [claim for claim in claims if id(claim) not in served_ids]
         self._plane.recovered([e for e in endpoints if self._access.may_bypass(e)])
-        if (left or forgotten) and self._context.settings.cleanup_after:
-            sweep = self._sweep(left, forgotten)
+        if (unserved or forgotten) and self._context.settings.cleanup_after:
+            sweep = self._sweep(unserved, forgotten)
             self._context.tasks.spawn(sweep, "taking back what former proxies left")
         self.verifying |= set(endpoints)
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
             self._context.tasks.spawn(self._resume(endpoints), "recovery")
 
-    async def _settle(self, found: Sequence[Claim]) -> list[Claim]:
+    async def _settle(self, claims: Sequence[Claim]) -> list[Claim]:
         """One claim per port: where several are made, the nodes themselves are asked first."""
 
         async def ask(claim: Claim) -> None:
@@ -165,28 +165,28 @@ class Recovery:
             if is_inside(claim.slave.host, self._context.addressing.networks):
                 claim.said = await self._context.nodes.inspect(claim.slave)
 
-        await asyncio.gather(*map(ask, decisions.contested(found)))
-        return decisions.settle(found)
+        await asyncio.gather(*map(ask, decisions.contested(claims)))
+        return decisions.settle(claims)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
-        """The endpoint of a claim, not trusted yet; None if it may not be, or its port is taken."""
+        """The endpoint of a claim, not trusted yet; None if it is outside, or its port is taken."""
         address = claim.slave.host
         if self._context.client_kind(address) is ClientKind.OUTSIDE:
             text = "port %d: the master has %s for it, which is not in an inside network; refused"
             log.warning(text, claim.port, address)
             return None
-        place = NodeLocation(address, named=claim.node.host == address, confirmed=False)
+        location = NodeLocation(address, named=claim.node.host == address, confirmed=False)
         registry = self._context.registry
-        endpoint = registry.restore(claim.uri, claim.node, place, claim.port)
+        endpoint = registry.restore(claim.uri, claim.node, location, claim.port)
         if endpoint is None:
             log.warning("port %d of %s is not free; not recovered", claim.port, claim.uri)
             return None
-        for held in claim.registrations:
-            registry.register(endpoint, held)
+        for registration in claim.registrations:
+            registry.register(endpoint, registration)
         for port in claim.service_ports:
             endpoint.note_service_port(port)
         if claim.advertised != self._context.addressing.advertised_uri(endpoint):
-            endpoint.note_former_uri(claim.advertised)  # that of a former version
+            endpoint.note_former_uri(claim.advertised)  # the URI of a former version
         return endpoint
 
     async def _resume(self, endpoints: Sequence[Endpoint]) -> None:
@@ -198,20 +198,20 @@ class Recovery:
             log.warning("recovery is incomplete: %s", error)
 
     async def _sweep(
-        self, left: Sequence[Claim], forgotten: Mapping[str, Sequence[Registration]]
+        self, unserved: Sequence[Claim], forgotten: Mapping[str, Sequence[Registration]]
     ) -> None:
-        """Take back at the master what nobody stands for, after the time for nodes that are gone.
+        """Take back at the master what no endpoint stands for, after ``--cleanup-after``.
 
-        A node that bears out what the master says of it is not: it gets its port if that is free
-        by now, and if it is inside, which an operator may have told meanwhile. One that does not
+        Not of a node that bears out what the master has of it: it gets its port, if that is free
+        by now and the node is inside, as an operator may have said meanwhile. One that does not
         tell who it is is left alone.
         """
         await asyncio.sleep(self._context.settings.cleanup_after)
         self._context.refresh_networks()
-        for uri, held in forgotten.items():
+        for uri, registrations in forgotten.items():
             with contextlib.suppress(Unreachable):
-                await self._registrar.take_back(uri, held)
-        for claim in left:
+                await self._registrar.take_back(uri, registrations)
+        for claim in unserved:
             try:
                 borne_out = await self._is_borne_out(claim)
                 if borne_out is False:
@@ -229,16 +229,16 @@ class Recovery:
         """
         if self._context.client_kind(claim.slave.host) is ClientKind.OUTSIDE:
             return False
-        held, ports = claim.registrations, claim.service_ports
-        info, borne_out = await self._verifier.ask(claim.slave, held, ports)
+        registrations, ports = claim.registrations, claim.service_ports
+        info, borne_out = await self._verifier.ask(claim.slave, registrations, ports)
         return False if info is None else borne_out
 
     async def _verify(self, endpoint: Endpoint) -> None:
         self._inspecting.add(endpoint)
-        held = list(endpoint.registrations.values())
+        registrations = list(endpoint.registrations.values())
         try:
             ports = list(endpoint.service_ports)
-            info, borne_out = await self._verifier.ask(endpoint.slave, held, ports)
+            info, borne_out = await self._verifier.ask(endpoint.slave, registrations, ports)
         finally:
             self._inspecting.discard(endpoint)
         if endpoint.trusted or self._context.registry.by_port.get(endpoint.port) is not endpoint:
@@ -262,18 +262,17 @@ class Recovery:
         address = endpoint.location.address
         host = self._context.upstream.reach(endpoint.node).host
         addresses = await resolve(host, address)
-        if (
-            endpoint.location.address == address
-        ):  # neighbours can use the host's name if it leads here
+        # Neighbours can use the host's name if it leads here.
+        if endpoint.location.address == address:
             endpoint.note_named(address in addresses)
-        await self._registrar.disown(endpoint, decisions.others(held, info))
+        await self._registrar.disown(endpoint, decisions.others(registrations, info))
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
-            held_now = list(endpoint.registrations.values())
-            await self._registrar.register([(endpoint, one) for one in held_now])
+            current = list(endpoint.registrations.values())
+            await self._registrar.register([(endpoint, r) for r in current])
             endpoint.former_uris.clear()
         await self._registrar.register_missing(endpoint, info)
 
     def _note_doubt(self, endpoint: Endpoint) -> None:
-        """Note that something lives there that does not tell who it is: it stays registered."""
+        """Note that the node that answers does not tell who it is: it stays registered."""
         endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
         self._context.problems.add(endpoint.label, DOUBT, endpoint.port)

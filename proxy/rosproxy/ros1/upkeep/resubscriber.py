@@ -1,10 +1,10 @@
 """A subscriber that hears nothing though its publisher is there: having it connect again.
 
 After the proxy was away, or a port has refused for a time, subscribers may have given up for good
-(see `policy`). There is one cure for roscpp and rospy: a ``publisherUpdate`` without the publisher,
-then one with it. The proxy sends the first itself (`_withdraw`), and only to subscribers without a
-connection, since it costs the others theirs. For the second one publisher of each topic is
-registered again, which makes the master tell all of the topic's subscribers.
+(see `decisions.resubscription`). There is one cure for roscpp and rospy: a ``publisherUpdate``
+without the publisher, then one with it. The proxy sends the first itself (`_withdraw`), and only
+to subscribers without a connection, since it costs the others theirs. For the second, one publisher
+of each topic is registered again, which makes the master tell all of the topic's subscribers.
 
 Inside subscribers can have missed publishers outside in the same way. Registering a subscriber
 again yields its publishers, which it is then handed; with ``--direction both`` those that it has no
@@ -47,10 +47,10 @@ keep-alive probes begin after 60 seconds, and are answered by a reset, or for 90
 """
 RESUBSCRIBE_TICK = 1.0
 """Seconds between checks whether it is time to look at any."""
-Missed = tuple[str, str, str]
+MissedPublisher = tuple[str, str, str]
 """A topic, a subscriber's name, and the URI at the master of a publisher that it does not hear."""
-Way = tuple[StandIn | None, str]
-"""What stands in for a node outside, and the address of a node inside."""
+OutsidePath = tuple[StandIn | None, str]
+"""The stand-in for a node outside (None: it has none), and the address of a node inside."""
 
 
 class Resubscriber:
@@ -72,13 +72,13 @@ class Resubscriber:
         )
         self._tcpros, self._plane, self._stand_ins = tcpros, plane, stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
-        self._looks: dict[Endpoint, list[float]] = {}
+        self._look_times: dict[Endpoint, list[float]] = {}
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:
         """Have endpoints looked at some times from now on."""
         now = self._context.now()
         for endpoint in endpoints:
-            self._looks[endpoint] = [now + after for after in LOOKS]
+            self._look_times[endpoint] = [now + delay for delay in LOOKS]
 
     async def announce(self, endpoints: Sequence[Endpoint]) -> None:
         """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError."""
@@ -95,9 +95,9 @@ class Resubscriber:
         its publishers once more when one registers. Connections that have lasted stay.
         """
         self.watch([endpoint])
-        topics = (Kind.PUBLISHER, Kind.SUBSCRIBER)
-        held = [one for one in endpoint.registrations.values() if one.kind in topics]
-        await self._registrar.register([(endpoint, one) for one in held])
+        kinds = (Kind.PUBLISHER, Kind.SUBSCRIBER)
+        registrations = [r for r in endpoint.registrations.values() if r.kind in kinds]
+        await self._registrar.register([(endpoint, r) for r in registrations])
 
     async def look(self) -> None:
         """Have subscribers connect that have lost a publisher in spite of `announce`."""
@@ -106,18 +106,18 @@ class Resubscriber:
             topics = await self._withdraw(endpoints) if endpoints else set()
             if topics:
                 log.info("subscribers of %d topics had no connection; told anew", len(topics))
-                held = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
-                await self._registrar.register([one for one in held if one[1].name in topics])
+                pairs = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
+                await self._registrar.register([pair for pair in pairs if pair[1].name in topics])
         except (Unreachable, MasterError) as error:
             log.debug("looking for subscribers without a connection: %s", error)
 
     def _due(self) -> list[Endpoint]:
-        """The endpoints for which it is time; each is named once per look."""
+        """The endpoints that it is time to look at; each is named once per look."""
         now, by_port = self._context.now(), self._context.registry.by_port
-        there = {e: times for e, times in self._looks.items() if by_port.get(e.port) is e}
-        left = {e: [time for time in times if time > now] for e, times in there.items()}
-        self._looks = {e: times for e, times in left.items() if times}
-        due = [e for e, times in left.items() if len(times) < len(there[e])]
+        current = {e: times for e, times in self._look_times.items() if by_port.get(e.port) is e}
+        remaining = {e: [time for time in times if time > now] for e, times in current.items()}
+        self._look_times = {e: times for e, times in remaining.items() if times}
+        due = [e for e, times in remaining.items() if len(times) < len(current[e])]
         return [e for e in due if e.answers and not e.health.cleaned]
 
     async def _withdraw(self, endpoints: Sequence[Endpoint], ask: bool = True) -> set[str]:
@@ -127,47 +127,47 @@ class Resubscriber:
         the publishers are asked (``ask``), those served by UDPROS are told as well. Raises
         Unreachable, MasterError.
         """
-        held = await self._context.upstream.read_registrations()
-        wanted = decisions.subscriptions(held, endpoints, self._context.addressing)
-        left = decisions.without_relay(wanted, self._tcpros.topic_connections())
-        if not left and not self._context.stand_ins.both:
+        state = await self._context.upstream.read_registrations()
+        subscriptions = decisions.subscriptions(state, endpoints, self._context.addressing)
+        unrelayed = decisions.without_relay(subscriptions, self._tcpros.topic_connections())
+        if not unrelayed and not self._context.stand_ins.both:
             return set()
-        graph = Graph(held, await self._context.upstream.look_up("lookupNode", held))
-        left = self._through_proxy(graph, left)
-        bus = await self._read_buses(left) if ask else {}
-        outside = self._outside_publishers(graph, endpoints)
-        for endpoint, _, uris in outside:
+        graph = Graph(state, await self._context.upstream.look_up("lookupNode", state))
+        unrelayed = self._through_proxy(graph, unrelayed)
+        buses = await self._read_buses(unrelayed) if ask else {}
+        outside_publishers = self._outside_publishers(graph, endpoints)
+        for endpoint, _, uris in outside_publishers:
             await self._stand_ins.listen_for(uris, self._context.caller_at(endpoint))
         if self._context.stand_ins.by_port or any(
-            one.endpoint.fast_port or one.endpoint.fast_peers for one in left
+            s.endpoint.fast_port or s.endpoint.fast_peers for s in unrelayed
         ):
             await self._plane.look()
-        addresses = await self._resolve_hosts(graph, left)
-        left = decisions.without_relay(left, self._tcpros.topic_connections())
+        addresses = await self._resolve_hosts(graph, unrelayed)
+        unrelayed = decisions.without_relay(unrelayed, self._tcpros.topic_connections())
         missed = [
-            (one.topic, one.caller_id, self._context.addressing.advertised_uri(one.endpoint))
-            for one in decisions.unconnected(left, bus, addresses)
+            (s.topic, s.caller_id, self._context.addressing.advertised_uri(s.endpoint))
+            for s in decisions.unconnected(unrelayed, buses, addresses)
         ]
-        return await self._send_without(graph, missed + self._without_outside(outside))
+        return await self._send_without(graph, missed + self._missed_outside(outside_publishers))
 
     def _through_proxy(
-        self, graph: Graph, left: Iterable[TopicSubscription]
+        self, graph: Graph, unrelayed: Iterable[TopicSubscription]
     ) -> list[TopicSubscription]:
-        """Those whose subscribers reach the publisher through the proxy."""
+        """The subscriptions whose nodes reach the publisher through the proxy."""
         addressing = self._context.addressing
 
-        def is_relayed(one: TopicSubscription) -> bool:
-            uri = graph.uris.get(one.caller_id)
+        def is_relayed(sub: TopicSubscription) -> bool:
+            uri = graph.uris.get(sub.caller_id)
             subscriber = addressing.stands_for(uri) if uri else None
             if subscriber is None:
                 return uri is not None
             caller = self._context.caller_at(subscriber)
-            handed = addressing.import_slave(addressing.advertised_uri(one.endpoint), caller)
-            return addressing.handed_out(handed, caller)
+            inside_uri = addressing.import_slave(addressing.advertised_uri(sub.endpoint), caller)
+            return addressing.handed_out(inside_uri, caller)
 
-        return [one for one in left if is_relayed(one)]
+        return [s for s in unrelayed if is_relayed(s)]
 
-    async def _read_buses(self, left: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
+    async def _read_buses(self, subs: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
         """What the publishers themselves say of their connections."""
 
         async def read(endpoint: Endpoint) -> list[BusRow]:
@@ -180,23 +180,23 @@ class Resubscriber:
                     return []
             return decisions.read_bus(rows)
 
-        endpoints = list(dict.fromkeys(one.endpoint for one in left))
-        found = await asyncio.gather(*map(read, endpoints))
-        return dict(zip(endpoints, found, strict=True))
+        endpoints = list(dict.fromkeys(s.endpoint for s in subs))
+        buses = await asyncio.gather(*map(read, endpoints))
+        return dict(zip(endpoints, buses, strict=True))
 
     async def _resolve_hosts(
-        self, graph: Graph, left: Iterable[TopicSubscription]
+        self, graph: Graph, unrelayed: Iterable[TopicSubscription]
     ) -> dict[str, list[str]]:
         """The addresses of the subscribers' hosts, where the kernel's connections are by host."""
 
-        async def find(uri: str) -> list[str]:
+        async def resolve_host(uri: str) -> list[str]:
             endpoint = self._context.addressing.stands_for(uri)
-            where = endpoint.slave if endpoint else parse_slave_uri(uri)
-            return await resolve(self._context.upstream.reach(where).host, NODES) if where else []
+            slave = endpoint.slave if endpoint else parse_slave_uri(uri)
+            return await resolve(self._context.upstream.reach(slave).host, NODES) if slave else []
 
-        nodes = sorted({one.caller_id for one in left if one.endpoint.fast_peers})
-        found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
-        return dict(zip(nodes, found, strict=True))
+        nodes = sorted({s.caller_id for s in unrelayed if s.endpoint.fast_peers})
+        addresses = await asyncio.gather(*(resolve_host(graph.uris[node]) for node in nodes))
+        return dict(zip(nodes, addresses, strict=True))
 
     def _outside_publishers(
         self, graph: Graph, endpoints: Iterable[Endpoint]
@@ -208,15 +208,15 @@ class Resubscriber:
         both, publishers = self._context.stand_ins.both, graph.by_topic(Kind.PUBLISHER)
         foreign = self._context.addressing.foreign
         return [
-            (endpoint, held, list(filter(foreign, publishers.get(held.name, ()))))
+            (endpoint, r, list(filter(foreign, publishers.get(r.name, ()))))
             for endpoint in (endpoints if both else ())
-            for held in endpoint.registrations.values()
-            if held.kind is Kind.SUBSCRIBER and not held.hidden
+            for r in endpoint.registrations.values()
+            if r.kind is Kind.SUBSCRIBER and not r.hidden
         ]
 
-    def _without_outside(
-        self, outside: Iterable[tuple[Endpoint, Registration, list[str]]]
-    ) -> list[Missed]:
+    def _missed_outside(
+        self, outside_publishers: Iterable[tuple[Endpoint, Registration, list[str]]]
+    ) -> list[MissedPublisher]:
         """The publishers outside that subscribers inside are not connected to, but ought to be.
 
         What the kernel forwards is known by addresses alone: unless there are as many connections
@@ -224,36 +224,36 @@ class Resubscriber:
         """
         context = self._context
         relays = self._tcpros.topic_connections() | self._stand_ins.udpros.connections()
-        left: dict[Way, list[Missed]] = {}
-        for endpoint, held, uris in outside:
+        unconnected: dict[OutsidePath, list[MissedPublisher]] = {}
+        for endpoint, sub, uris in outside_publishers:
             proxy = context.caller_at(endpoint).proxy
             for uri in uris:
-                there = context.stand_ins.find(proxy, uri)
-                if there is None or (there.local.port, held.name, held.caller_id) not in relays:
-                    missed = held.name, held.caller_id, uri
-                    left.setdefault((there, endpoint.address), []).append(missed)
+                stand_in = context.stand_ins.find(proxy, uri)
+                if stand_in is None or (stand_in.local.port, sub.name, sub.caller_id) not in relays:
+                    publisher = sub.name, sub.caller_id, uri
+                    unconnected.setdefault((stand_in, endpoint.address), []).append(publisher)
         return [
-            one
-            for (there, address), missing in left.items()
-            if there is None or there.fast_peers.get(address, 0) < len(missing)
-            for one in missing
+            publisher
+            for (stand_in, address), missing in unconnected.items()
+            if stand_in is None or stand_in.fast_peers.get(address, 0) < len(missing)
+            for publisher in missing
         ]
 
-    async def _send_without(self, graph: Graph, found: Iterable[Missed]) -> set[str]:
+    async def _send_without(self, graph: Graph, missed: Iterable[MissedPublisher]) -> set[str]:
         """Send each subscriber its publishers without those that it misses; the topics."""
-        missed: dict[tuple[str, str], set[str]] = {}
-        for topic, node, uri in found:
-            missed.setdefault((topic, node), set()).add(uri)
+        missed_uris: dict[tuple[str, str], set[str]] = {}
+        for topic, node, uri in missed:
+            missed_uris.setdefault((topic, node), set()).add(uri)
         publishers = graph.by_topic(Kind.PUBLISHER)
         calls = (
             self._publisher_updates.update(
                 graph.uris[node], topic, [u for u in publishers.get(topic, []) if u not in uris]
             )
-            for (topic, node), uris in missed.items()
+            for (topic, node), uris in missed_uris.items()
         )
         topics = set()
-        for (topic, node), heard in zip(missed, await asyncio.gather(*calls), strict=True):
-            if heard:
+        for (topic, node), answered in zip(missed_uris, await asyncio.gather(*calls), strict=True):
+            if answered:
                 log.debug("%s has no connection for %s; it is told anew", node, topic)
                 topics.add(topic)
         return topics
@@ -261,5 +261,5 @@ class Resubscriber:
 
 def _subscribers(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
     """All that the nodes of some endpoints subscribe to."""
-    held = [(e, held) for e in endpoints for held in e.registrations.values()]
-    return [one for one in held if one[1].kind is Kind.SUBSCRIBER]
+    registrations = [(e, r) for e in endpoints for r in e.registrations.values()]
+    return [pair for pair in registrations if pair[1].kind is Kind.SUBSCRIBER]

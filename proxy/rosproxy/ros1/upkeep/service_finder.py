@@ -29,10 +29,10 @@ class ServiceFinder:
     """Finds hidden services that a former process of the proxy knew."""
 
     _context: Context
-    _asked: dict[str, float] = field(default_factory=dict)
+    _asked_at: dict[str, float] = field(default_factory=dict)
 
     async def find_for(self, request: Request) -> None:
-        """Take in what nodes inside have of the services that a request looks up."""
+        """Register as hidden what nodes inside have of the services that a request looks up."""
         looked_up = {
             second_name(call) for call in request.calls if call and call.method == "lookupService"
         }
@@ -42,12 +42,12 @@ class ServiceFinder:
     async def _find(self, name: str) -> None:
         now = self._context.now()
         endpoints = [e for e in self._context.registry if self._may_have(e, name)]
-        if not endpoints or now - self._asked.get(name, -ASK_AGAIN) < ASK_AGAIN:
+        if not endpoints or now - self._asked_at.get(name, -ASK_AGAIN) < ASK_AGAIN:
             return
-        self._asked.pop(name, None)
-        if len(self._asked) >= MOST_REMEMBERED:
-            del self._asked[next(iter(self._asked))]
-        self._asked[name] = now
+        self._asked_at.pop(name, None)
+        if len(self._asked_at) >= MOST_REMEMBERED:
+            del self._asked_at[next(iter(self._asked_at))]
+        self._asked_at[name] = now
         await asyncio.gather(*(self._ask(endpoint, name) for endpoint in endpoints))
 
     def _may_have(self, endpoint: Endpoint, name: str) -> bool:
@@ -59,11 +59,13 @@ class ServiceFinder:
 
     async def _ask(self, endpoint: Endpoint, name: str) -> None:
         for port in endpoint.node_ports:
-            where = HostPort(endpoint.address, port)
-            caller_id = await self._context.nodes.provider(where, name)
+            service = HostPort(endpoint.address, port)
+            caller_id = await self._context.nodes.provider(service, name)
             if caller_id is not None and caller_id in endpoint.caller_ids:
                 api = service_uri(HostPort(endpoint.node.host, port))
                 now = self._context.now()
-                held = Registration(Kind.SERVICE, name, caller_id, "*", api, now, hidden=True)
-                self._context.registry.register(endpoint, held)
+                registration = Registration(
+                    Kind.SERVICE, name, caller_id, "*", api, now, hidden=True
+                )
+                self._context.registry.register(endpoint, registration)
                 return

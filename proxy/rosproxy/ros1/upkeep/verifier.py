@@ -28,62 +28,62 @@ class Verifier:
 
     async def ask(
         self,
-        where: HostPort,
-        held: Collection[Registration],
+        slave: HostPort,
+        registrations: Collection[Registration],
         service_ports: Iterable[int] = (),
     ) -> tuple[NodeInfo | None, bool | None]:
         """What the node at an address says of itself, and whether it is the one that registered.
 
-        The second is None if it can't be told; the first is, if nothing answers there.
+        Both are None if nothing answers there; the second is, too, if it can't be told.
         ``service_ports`` are TCPROS ports at which it may have services.
         """
-        info = await self._nodes.inspect(where)
+        info = await self._nodes.inspect(slave)
         if info is None:
             return None, None
-        return info, await self.judge(where, held, info, service_ports)
+        return info, await self.judge(slave, registrations, info, service_ports)
 
     async def judge(
         self,
-        where: HostPort,
-        held: Collection[Registration],
+        slave: HostPort,
+        registrations: Collection[Registration],
         info: NodeInfo,
         service_ports: Iterable[int] = (),
     ) -> bool | None:
-        """The same of a node that has said something of itself: one of the names is enough."""
-        names = decisions.by_name(held)
-        verdicts = {name: decisions.confirmed_by(names[name], info) for name in names}
+        """Whether the node that says this of itself is the one: one of the names is enough."""
+        by_name = decisions.by_name(registrations)
+        verdicts = {name: decisions.confirmed_by(by_name[name], info) for name in by_name}
         if True in verdicts.values():
             return True
-        untold = [one for one in held if verdicts[one.caller_id] is None]
+        undecided = [r for r in registrations if verdicts[r.caller_id] is None]
         ports = {*info.topic_ports.values(), *service_ports}
-        if await self._answers_for(where, untold, info, ports):
+        if await self._answers_for(slave, undecided, info, ports):
             return True
-        return None if untold or not held else False
+        return None if undecided or not registrations else False
 
     async def _answers_for(
-        self, where: HostPort, held: Collection[Registration], info: NodeInfo, ports: set[int]
+        self, slave: HostPort, undecided: Collection[Registration], info: NodeInfo, ports: set[int]
     ) -> bool:
         """Whether it answers for a topic or service, by a name that has registered it."""
-        callers = {one.caller_id for one in held}
-        topics, services = decisions.to_ask(held)
+        callers = {r.caller_id for r in undecided}
+        topics, services = decisions.to_ask(undecided)
         for topic in topics:
-            port = info.topic_ports.get(topic) or await self._port(where, topic)
+            port = info.topic_ports.get(topic) or await self._topic_port(slave, topic)
             if port is None:
                 continue
             ports.add(port)
-            name = await self._nodes.publisher(HostPort(where.host, port), topic)
+            name = await self._nodes.publisher(HostPort(slave.host, port), topic)
             if name in callers or (name is None and topic != ROSOUT):
                 return True
         for service in services:
-            own = parse_service_uri(service.service_api or "")
-            for port in {own.port} if own else ports:
-                name = await self._nodes.provider(HostPort(where.host, port), service.name)
+            provider = parse_service_uri(service.service_api or "")
+            for port in {provider.port} if provider else ports:
+                name = await self._nodes.provider(HostPort(slave.host, port), service.name)
                 if name in callers:
                     return True
         return False
 
-    async def _port(self, where: HostPort, topic: str) -> int | None:
+    async def _topic_port(self, slave: HostPort, topic: str) -> int | None:
         try:
-            return await self._nodes.topic_port(where, topic)
+            return await self._nodes.topic_port(slave, topic)
         except (Unreachable, MasterError):
             return None

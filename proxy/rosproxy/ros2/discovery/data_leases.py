@@ -1,9 +1,9 @@
 """Which ports of the range the kernel may forward, and to which locators: those of user data.
 
 Metatraffic is read and rewritten, so that it stays in user space; what arrives at a lease of user
-data goes to one locator, whatever it is. Whoever had a port before the proxy started has it here
-until it is given to somebody, or until nobody is left who could claim it: meanwhile the kernel goes
-on forwarding as the former process had told it to.
+data goes to one locator, whatever it is. A port that the kernel forwarded before the proxy started
+is here until it is given to somebody, or until nobody is left who could claim it: meanwhile the
+kernel goes on forwarding as the former process had told it to.
 """
 
 from collections.abc import Iterator, Mapping
@@ -56,50 +56,50 @@ class ForwardedLease:
 class DataLeases:
     """The leases of user data of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
 
-    ``domains`` are those inside of each; ``pool`` are the ports of all.
+    ``domains`` are the participants inside of each; ``pool`` are the ports of all.
     """
 
     def __init__(self, pool: PortPool) -> None:
         self.pool = pool
         self.domains: list[InsideParticipants] = []
         self._former: dict[int, ForwardedLease] = {}
-        self._held: dict[int, ForwardedLease] = {}
-        self._seen = -1
+        self._cached: dict[int, ForwardedLease] = {}
+        self._cached_changes = -1
 
     @property
     def by_port(self) -> Mapping[int, ForwardedLease]:
         """All of them by their ports."""
-        seen = sum(inside.changes for inside in self.domains)
-        if seen != self._seen:
-            self._seen = seen
-            self._held = {lease.port: lease for lease in self._leases()}
-            given = {port for inside in self.domains for port in inside.leases}
-            for port in given & self._former.keys():
+        changes = sum(inside.changes for inside in self.domains)
+        if changes != self._cached_changes:
+            self._cached_changes = changes
+            self._cached = {lease.port: lease for lease in self._leases()}
+            lent_ports = {port for inside in self.domains for port in inside.leases}
+            for port in lent_ports & self._former.keys():
                 del self._former[port]
-            self._held |= self._former
-        return self._held
+            self._cached |= self._former
+        return self._cached
 
     def __iter__(self) -> Iterator[ForwardedLease]:
         """All of them."""
         return iter(list(self.by_port.values()))
 
     def note_former(self, forwards: Mapping[int, HostPort]) -> None:
-        """Note what a former process had the kernel forward; with nothing: forget it."""
+        """Note what a former process had the kernel forward; with an empty mapping, forget it."""
         self._former = {
-            port: ForwardedLease(port, where, "a participant of before the start")
-            for port, where in forwards.items()
+            port: ForwardedLease(port, target, "a participant of before the start")
+            for port, target in forwards.items()
         }
-        self._seen = -1
+        self._cached_changes = -1
 
     def _leases(self) -> Iterator[ForwardedLease]:
-        """Those that are given, each as the same object for as long as it leads to the same."""
+        """The leases that are lent, each the same object for as long as it leads to the same."""
         for inside in self.domains:
             for port, (participant, lease) in inside.leases.items():
                 if lease.kind is not LeaseKind.DATA:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
-                known = self._held.get(port)
-                if known is not None and (known.where, known.label) == (lease.where, label):
-                    yield known
+                cached = self._cached.get(port)
+                if cached is not None and (cached.where, cached.label) == (lease.where, label):
+                    yield cached
                 else:
                     yield ForwardedLease(port, lease.where, label)

@@ -1,26 +1,25 @@
-"""One DDS domain: what the proxy does with each datagram of discovery, and with the time.
+"""One DDS domain: what the proxy does with each datagram of discovery, and as time passes.
 
 Participants inside announce themselves to a multicast group, or to the well-known port of a peer
-(SPDP). The proxy hears that, gives every locator of theirs a port of the range, and tells outside
-of the participant with these in place of its own. Where outside answers, at a port of the range
-that stands for a locator of metatraffic, its announcement goes on to the participant inside, led to
-a port of the proxy's that stands for outside's metatraffic (its *stand-in*): so that all of
-discovery passes the proxy, both ways, and can be rewritten. What users send passes without being
-read: to inside through the range, to outside without the proxy.
+(SPDP). The proxy gives each of their locators a port of the range, and announces them outside with
+these. The announcement that outside answers to a port for metatraffic goes on to the participant
+inside, with a port of the proxy's (a *stand-in*) in place of outside's metatraffic: so all of
+discovery passes the proxy, both ways, and can be rewritten. What users send passes unread: to
+inside through the range, to outside without the proxy.
 
 Nothing here does I/O: each method takes a datagram, where it came from and the time, and gives the
-datagrams to send. Which ports have to be open is told by `leases` and `stand_ins` after each.
+datagrams to send. After each, `leases` and `stand_ins` tell which ports have to be open.
 
 Every datagram may be forged. So
 
 - a participant inside is one whose address is inside, and only locators at that very address get a
   lease: no announcement makes the proxy a way to another host;
-- a prefix that somebody alive has, at another address or on the other side, is nobody else's;
+- the prefix of a participant that is there can't be taken at another address or on the other side;
 - a participant outside is one whose address is a peer's, or that the ear has heard from there, and
   only its locators at the address that it sent from are used;
-- until one outside has shown that it gets what it is sent (it names the prefix of whom it answers),
-  it is sent no more bytes than came from it: nobody can have the proxy flood somebody else;
-- each source may make so much discovery in a second, what it leads to included.
+- until one outside has shown that it gets what it is sent (it names the prefix that it answers), it
+  is sent no more bytes than came from it: nobody can make the proxy flood somebody else;
+- each source may make only so much discovery in a second, what it leads to included.
 """
 
 from collections import Counter
@@ -60,7 +59,7 @@ from rosproxy.ros2.registry.ports import LocatorPorts
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 
 ANNOUNCED_AGAIN = 0.5
-"""Seconds in which outside is told the same announcement once."""
+"""Seconds in which outside is told the same announcement only once."""
 
 _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams that go on, and what goes back to where they came from."""
@@ -70,8 +69,7 @@ _Passing = tuple[list[bytes], list[Outgoing]]
 class Domain:
     """The participants of one domain, and what is done with their datagrams.
 
-    ``own`` are the proxy's own participants. ``passed`` are the bytes that were passed on, to
-    inside or not.
+    ``own`` are the proxy's own participants; ``passed`` counts bytes, by kind and whether inwards.
     """
 
     settings: DomainSettings
@@ -100,17 +98,17 @@ class Domain:
         inside = InsideParticipants(settings, ports, refused)
         outside = OutsideParticipants(settings, refused)
         returning, fragments = Returning(settings, ports, keeper), FragmentStores()
-        own_ones = OwnParticipants(
+        participants = OwnParticipants(
             settings, Observer(own), keeper, inside, outside, returning, fragments
         )
         partings = Partings(settings, outside)
         return cls(
-            settings, ports, own_ones, inside, outside, returning, refused, fragments, partings
+            settings, ports, participants, inside, outside, returning, refused, fragments, partings
         )
 
-    def is_kept(self, one: InsideParticipant) -> bool:
+    def is_kept(self, participant: InsideParticipant) -> bool:
         """Whether a participant inside keeps all the ports that it has, for the next process."""
-        return self.own.keeper.keeps(one.prefix, one.ports)
+        return self.own.keeper.keeps(participant.prefix, participant.ports)
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What came to the group on an inside network, or to the well-known port, from inside."""
@@ -152,22 +150,22 @@ class Domain:
 
     def at_lease(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What outside sends to a port of the range."""
-        found = self.inside.leases.get(port)
+        leased = self.inside.leases.get(port)
         try:
-            if found is None:
+            if leased is None:
                 if self.ports.remembers(now) and not self._is_too_much(datagram, source, now):
                     self.ports.note_use(port, datagram, now)
                 return []
-            inside, lease = found
+            insider, lease = leased
             if lease.kind is LeaseKind.DATA:
                 return [self._passed(lease, datagram, True)]
             if self.outside.is_strange(source) or self._is_too_much(datagram, source, now):
                 return []
-            imported = partial(self._imported, port, source, inside, now)
-            passed, back = _each(datagram, imported)
+            imported = partial(self._imported, port, source, insider, now)
+            passed, back = _pass_on_each(datagram, imported)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
-        return [self._passed(lease, one, True) for one in passed] + back
+        return [self._passed(lease, d, True) for d in passed] + back
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What inside sends to a port that stands for locators outside."""
@@ -178,20 +176,20 @@ class Domain:
                 if self._is_too_much(datagram, source, now):
                     return []
                 exported = partial(self._exported, port, source, users[0][0].prefix, now)
-                passed, back = _each(datagram, exported)
+                passed, back = _pass_on_each(datagram, exported)
             elif source in self.inside.here:
                 passed = [datagram]
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
         return back + [
             sent
-            for there, lease in users
-            for one in passed
-            for sent in self._to_outside(there, lease, one)
+            for outsider, lease in users
+            for d in passed
+            for sent in self._to_outside(outsider, lease, d)
         ]
 
     def settle(self, now: float) -> list[Outgoing]:
-        """Take in who has waited, once it is known who had which port; and have others meet."""
+        """Admit those that waited until it was known who had which port; and have others meet."""
         sent = self.returning.asked_again(now)
         for source, message in self.returning.ready(now):
             if message.prefix not in self.outside.by_prefix:
@@ -200,10 +198,10 @@ class Domain:
 
     def expire(self, now: float) -> None:
         """Forget those that have not been heard for as long as they said."""
-        for inside in [one for one in self.inside.by_prefix.values() if one.until < now]:
-            self._forget_inside(inside)
-        for outside in [one for one in self.outside.by_prefix.values() if one.until < now]:
-            self._forget_outside(outside)
+        for insider in [p for p in self.inside.by_prefix.values() if p.until < now]:
+            self._forget_inside(insider)
+        for outsider in [p for p in self.outside.by_prefix.values() if p.until < now]:
+            self._forget_outside(outsider)
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:
         """End the participants at addresses inside where nobody is any more; what outside is told.
@@ -212,28 +210,28 @@ class Domain:
         """
         self.returning.forget(addresses)
         sent = list[Outgoing]()
-        for one in [one for one in self.inside.by_prefix.values() if one.address in addresses]:
-            self._forget_inside(one)
-            sent += self.settings.to_outside(farewell(one.prefix, one.vendor, LAST_SEQUENCE))
+        for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
+            self._forget_inside(leaver)
+            sent += self.settings.to_outside(farewell(leaver.prefix, leaver.vendor, LAST_SEQUENCE))
         return sent
 
     def apply_policy(self, now: float) -> list[Outgoing]:
-        """Have those meet anew of whom the policy says something else than before."""
+        """Have participants meet anew of which the policy says something else than before."""
         sent = list[Outgoing]()
-        self.fragments.clear()  # they were judged by the former one
-        for one in self.inside.by_prefix.values():
-            if has_changed(self.settings.judge, one):
-                one.verdicts.clear()
-                sent += self.partings.part(one, now)
+        self.fragments.clear()  # they were judged by the former policy
+        for insider in self.inside.by_prefix.values():
+            if has_changed(self.settings.judge, insider):
+                insider.verdicts.clear()
+                sent += self.partings.part(insider, now)
         return sent
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        prefix, told = message.prefix, message.of_participant
+        prefix, spdp = message.prefix, message.of_participant
         if prefix in self.outside.by_prefix or source_vendor(message.datagram) == NO_VENDOR:
-            return []  # a proxy's own participants are nobody's inside
-        if told is None:
+            return []  # a proxy's own participants are not passed on
+        if spdp is None:
             return self.own.told_inside(message, source, now)
-        if told.ended:
+        if spdp.ended:
             return self._end_inside(message, source, now)
         if prefix not in self.inside.by_prefix and self.ports.remembers(now):
             return self.returning.wait(message, source, now)
@@ -242,134 +240,134 @@ class Domain:
     def _heard_outside(
         self, message: DiscoveryMessage, source: str, heard_by_ear: bool, now: float
     ) -> list[Outgoing]:
-        prefix, told = message.prefix, message.of_participant
+        prefix, spdp = message.prefix, message.of_participant
         if prefix in self.inside.by_prefix or prefix == self.own.observer.prefix:
             return []
-        if told is None:
+        if spdp is None:
             return self.own.told_outside(message, source)
         if not heard_by_ear and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
             return self._drop("not_a_peer", source, "an announcement from no peer's address")
-        there = self.outside.meet(message, source, now)
-        if there is None:
+        outsider = self.outside.meet(message, source, now)
+        if outsider is None:
             return []
-        there.credit += len(message.datagram)
-        sent = self.outside.introduced([there], self.inside.by_prefix.values(), now)
-        if told.ended:
-            self._forget_outside(there)
+        outsider.credit += len(message.datagram)
+        sent = self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
+        if spdp.ended:
+            self._forget_outside(outsider)
         return sent
 
     def _announced_inside(
         self, message: DiscoveryMessage, source: str, now: float
     ) -> list[Outgoing]:
-        """Take in what a participant inside announces of itself, and tell outside."""
+        """Note what a participant inside announces of itself, and tell outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
-        one = self.inside.meet(message, source, now)
-        if one is None:
+        insider = self.inside.meet(message, source, now)
+        if insider is None:
             return []
-        leases = len(one.leases)
-        told = self.inside.exported(one, message, now, self.returning.had(prefix))
-        sent = self.inside.introduced(one, message)
+        lease_count = len(insider.leases)
+        exported = self.inside.exported(insider, message, now, self.returning.had(prefix))
+        sent = self.inside.introduced(insider, message)
         if is_new and prefix in self.returning.former:
-            sent += self.own.met_elsewhere(one)
-            one.parting_from = now
+            sent += self.own.met_elsewhere(insider)
+            insider.parting_from = now
         else:
-            sent += self._kept_more(one, leases)
-        sent += self._tell_outside(one, for_all(told), now)  # it may be an answer to the observer
+            sent += self._reminders(insider, lease_count)
+        sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
         if is_new:
-            sent += self.outside.introduced(self.outside.by_prefix.values(), [one], now)
-        return sent + self.own.asked_first(one)
+            sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
+        return sent + self.own.asked_first(insider)
 
     def _tell_outside(
-        self, one: InsideParticipant, announcement: bytes, now: float
+        self, insider: InsideParticipant, announcement: bytes, now: float
     ) -> list[Outgoing]:
         """What tells outside of a participant inside, unless that was told the same just now.
 
-        A crowd repeats itself while its members meet, and each time goes to all ports of peers.
+        Participants repeat themselves while many meet, and each time it goes to all ports of peers.
         """
-        if announcement == one.announcement and now - one.announced < ANNOUNCED_AGAIN:
+        if announcement == insider.announcement and now - insider.announced < ANNOUNCED_AGAIN:
             return []
-        one.announcement, one.announced = announcement, now
-        return [] if one.apart_until else self.settings.to_outside(announcement)
+        insider.announcement, insider.announced = announcement, now
+        return [] if insider.apart_until else self.settings.to_outside(announcement)
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        one = self.inside.at(message.prefix, source)
-        if one is None:
+        insider = self.inside.at(message.prefix, source)
+        if insider is None:
             return []
-        told = self.inside.exported(one, message, now)  # it may tell other things as well
-        self._forget_inside(one)
-        return self.settings.to_outside(told)
+        exported = self.inside.exported(insider, message, now)  # it may tell other things as well
+        self._forget_inside(insider)
+        return self.settings.to_outside(exported)
 
-    def _forget_inside(self, one: InsideParticipant) -> None:
-        self.inside.forget(one)
-        self.own.forget(one.prefix)
-        self.fragments.forget(one.prefix)
+    def _forget_inside(self, insider: InsideParticipant) -> None:
+        self.inside.forget(insider)
+        self.own.forget(insider.prefix)
+        self.fragments.forget(insider.prefix)
 
-    def _forget_outside(self, there: OutsideParticipant) -> None:
-        self.partings.forget(self.inside.by_prefix.values(), there.prefix)
-        self.outside.forget(there)
-        self.own.forget(there.prefix)
-        self.fragments.forget(there.prefix)
+    def _forget_outside(self, outsider: OutsideParticipant) -> None:
+        self.partings.forget(self.inside.by_prefix.values(), outsider.prefix)
+        self.outside.forget(outsider)
+        self.own.forget(outsider.prefix)
+        self.fragments.forget(outsider.prefix)
 
     def _exported(
         self, port: int, source: str, reader: bytes, now: float, message: DiscoveryMessage
     ) -> _Passing:
-        """Metatraffic of inside's as outside gets it. Raises RtpsError."""
-        one = self.inside.at(message.prefix, source)
-        if one is None:
+        """Metatraffic from inside as outside gets it. Raises RtpsError."""
+        insider = self.inside.at(message.prefix, source)
+        if insider is None:
             self._drop("unknown_participant", source, "it has not announced itself")
             return [], []
-        if one.is_apart:
+        if insider.is_apart:
             return [], []
-        self.partings.note_met(one, reader)
-        leases, exported = len(one.leases), partial(self.inside.exported, one, now=now)
-        passed, asked = self.fragments.rewritten(port, message, reader, exported)
-        return passed, sent_to(one.metatraffic, asked) + self._kept_more(one, leases)
+        self.partings.note_met(insider, reader)
+        count, exported = len(insider.leases), partial(self.inside.exported, insider, now=now)
+        passed, questions = self.fragments.rewritten(port, message, reader, exported)
+        return passed, sent_to(insider.metatraffic, questions) + self._reminders(insider, count)
 
-    def _kept_more(self, one: InsideParticipant, leases: int) -> list[Outgoing]:
-        """What has one keep the ports that it has got beside so many, at once.
+    def _reminders(self, insider: InsideParticipant, former_count: int) -> list[Outgoing]:
+        """What makes a participant keep new ports at once, if it has more than ``former_count``.
 
         The proxy may be killed before the next round; what is lost on its way comes again then.
         """
-        return self.returning.reminders(one) if len(one.leases) > leases else []
+        return self.returning.reminders(insider) if len(insider.leases) > former_count else []
 
     def _imported(
         self,
         port: int,
         source: str,
-        inside: InsideParticipant,
+        insider: InsideParticipant,
         now: float,
         message: DiscoveryMessage,
     ) -> _Passing:
-        """Metatraffic of outside's as a participant inside gets it. Raises RtpsError."""
-        prefix, told = message.prefix, message.of_participant
-        if prefix in self.inside.by_prefix or inside.is_apart:
+        """Metatraffic from outside as a participant inside gets it. Raises RtpsError."""
+        prefix, spdp = message.prefix, message.of_participant
+        if prefix in self.inside.by_prefix or insider.is_apart:
             return [], []
-        there = self.outside.at(prefix, source)
-        if told is not None:
-            if there is None and not self.settings.is_peer(source):
+        outsider = self.outside.at(prefix, source)
+        if spdp is not None:
+            if outsider is None and not self.settings.is_peer(source):
                 text = "a participant that is neither a peer's nor was heard"
                 self._drop("not_a_peer", source, text)
                 return [], []
-            there = self.outside.meet(message, source, now)
-        if there is None:
+            outsider = self.outside.meet(message, source, now)
+        if outsider is None:
             return [], []
-        there.note_sent(message.datagram, inside.prefix)
-        imported = partial(self.outside.imported, there, inside)
-        passed, asked = self.fragments.rewritten(port, message, inside.prefix, imported)
-        back = self.outside.asked(there, asked)
-        if told is not None and told.ended:
-            self._forget_outside(there)
+        outsider.note_sent(message.datagram, insider.prefix)
+        imported = partial(self.outside.imported, outsider, insider)
+        passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
+        back = self.outside.asked(outsider, questions)
+        if spdp is not None and spdp.ended:
+            self._forget_outside(outsider)
         return passed, back
 
     def _to_outside(
-        self, there: OutsideParticipant, lease: Lease, datagram: bytes
+        self, target: OutsideParticipant, lease: Lease, datagram: bytes
     ) -> list[Outgoing]:
-        if not there.may_be_sent(len(datagram)):
-            text = f"{there.guid_prefix} at {there.address} has not shown that it gets anything"
-            return self._drop("unproven", there.address, text)
+        if not target.may_be_sent(len(datagram)):
+            text = f"{target.guid_prefix} at {target.address} has not shown that it gets anything"
+            return self._drop("unproven", target.address, text)
         return [self._passed(lease, datagram, False)]
 
     def _passed(self, lease: Lease, datagram: bytes, inwards: bool) -> Outgoing:
@@ -390,11 +388,11 @@ class Domain:
         return []
 
 
-def _each(datagram: bytes, pass_on: Callable[[DiscoveryMessage], _Passing]) -> _Passing:
-    """What is passed on of a datagram, and what goes back, of each who speaks in it. RtpsError."""
+def _pass_on_each(datagram: bytes, pass_on: Callable[[DiscoveryMessage], _Passing]) -> _Passing:
+    """What is passed on of a datagram, and what goes back, of all who send in it. RtpsError."""
     passed, back = list[bytes](), list[Outgoing]()
     for message in map(read_discovery, by_source(datagram)):
-        on, asked = pass_on(message)
-        passed += on
-        back += asked
+        forwarded, replies = pass_on(message)
+        passed += forwarded
+        back += replies
     return passed, back

@@ -1,4 +1,4 @@
-"""What a domain is told, and which ports DDS gives it."""
+"""The settings of a domain, and which ports DDS gives it."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rosproxy.net.addresses import HostPort
 PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST = 250, 7400, 7410
 """DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
 PARTICIPANTS_TRIED = 32
-"""How many of a peer's well-known ports are told of participants inside: each program has one."""
+"""How many well-known ports of a peer are told of participants inside: each program has one."""
 
 MOST_INSIDE, MOST_OUTSIDE = 512, 1024
 """Participants of a domain on either side."""
@@ -22,9 +22,9 @@ MOST_LEASES = 16
 """Ports of the range for one participant; Fast DDS takes three for one address."""
 
 Judge = Callable[[RuleKind, str, str], bool]
-"""Whether something of a name is allowed to the participant inside at an address."""
+"""Whether a kind of rule allows a name to the participant inside at an address."""
 Note = Callable[[str, str, str], None]
-"""Told of each refusal: its reason in one word, the source, and a text."""
+"""Called with each refusal: its reason in one word, the source, and a text."""
 
 
 @dataclass(slots=True)
@@ -47,14 +47,14 @@ class Outgoing(msgspec.Struct, frozen=True):
     datagram: bytes
 
 
-def sent_to(to: HostPort | None, datagrams: Iterable[bytes]) -> list[Outgoing]:
-    """Datagrams for one place; none if nobody knows where that is."""
-    return [Outgoing(to, datagram) for datagram in datagrams] if to else []
+def sent_to(target: HostPort | None, datagrams: Iterable[bytes]) -> list[Outgoing]:
+    """Datagrams for one target; none if it is not known."""
+    return [Outgoing(target, datagram) for datagram in datagrams] if target else []
 
 
 @dataclass(slots=True)
 class DomainSettings:
-    """What a domain is told; ``peers`` may change.
+    """The settings of a domain; ``peers`` may change.
 
     ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
     each family; a participant is led to that of its own family, if there is one. ``peers`` are
@@ -81,8 +81,8 @@ class DomainSettings:
 
     def host_for(self, address: str) -> str:
         """The address of the proxy's by which outside reaches a participant at an address."""
-        same = (host for host in self.hosts if (":" in host) == (":" in address))
-        return next(same, self.host)
+        same_family = (host for host in self.hosts if (":" in host) == (":" in address))
+        return next(same_family, self.host)
 
     @property
     def multicast_port(self) -> int:
@@ -101,18 +101,18 @@ class DomainSettings:
 
     def told(self) -> list[HostPort]:
         """Where participants inside are announced."""
-        found = [self.ear] if self.ear else []
+        targets = [self.ear] if self.ear else []
         for peer in self.peers:
-            found += [peer] if peer.port else self.well_known(peer.host)
-        return found
+            targets += [peer] if peer.port else self.well_known(peer.host)
+        return targets
 
     def to_outside(self, datagram: bytes) -> list[Outgoing]:
-        """A datagram for all of them."""
-        return [Outgoing(to, datagram) for to in self.told()]
+        """A datagram for everybody to whom participants inside are announced."""
+        return [Outgoing(target, datagram) for target in self.told()]
 
-    def well_known(self, host: str, most: int = PARTICIPANTS_TRIED) -> list[HostPort]:
+    def well_known(self, host: str, count: int = PARTICIPANTS_TRIED) -> list[HostPort]:
         """Where the first participants of a host are told of others (9.6.2.3)."""
-        ports = range(self.unicast_port, self.unicast_port + 2 * most, 2)
+        ports = range(self.unicast_port, self.unicast_port + 2 * count, 2)
         return [HostPort(host, port) for port in ports]
 
     def is_peer(self, address: str) -> bool:

@@ -41,10 +41,10 @@ from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, rewritten
 
 @dataclass(slots=True)
 class InsideParticipants(ParticipantTable[InsideParticipant]):
-    """Those inside; ``leases`` by port of the range, each with whose it is.
+    """The participants inside; ``leases`` by port of the range, each with its participant.
 
-    ``lacking`` are the locators that got no port, by the prefix of whose they are. ``changes``
-    counts how often the leases have changed.
+    ``lacking`` tells why a locator got no port, by its participant's prefix. ``changes`` counts how
+    often the leases have changed.
     """
 
     settings: DomainSettings
@@ -55,28 +55,28 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
-        """The participant that announces itself from an address; None if it may not be.
+        """The participant that announces itself from an address; None if it is not accepted.
 
-        One that is on several networks of its own is served at the first.
+        One that is on several networks itself is served at the first.
         """
-        prefix, datagram, told = message.prefix, message.datagram, message.of_participant
-        known = self.at(prefix, source)
-        if told is None:
-            return known
-        if known is None:
+        prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
+        participant = self.at(prefix, source)
+        if spdp is None:
+            return participant
+        if participant is None:
             if prefix in self.by_prefix:
                 return None
             if self.here[source] >= MOST_PER_ADDRESS or len(self.by_prefix) >= MOST_INSIDE:
                 text = f"more than {MOST_PER_ADDRESS} participants there, or {MOST_INSIDE} in all"
                 self.refused("participants", source, text)
                 return None
-            known = InsideParticipant(prefix, source, source_vendor(datagram), now)
-            known.near = self.settings.near(source)
-            self.add(known)
-        known.until = now + lease_duration(told, datagram)
-        known.metatraffic = first_metatraffic(told, datagram, source)
-        known.traits = traits(told, datagram, source)
-        return known
+            participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
+            participant.near = self.settings.near(source)
+            self.add(participant)
+        participant.until = now + lease_duration(spdp, datagram)
+        participant.metatraffic = first_metatraffic(spdp, datagram, source)
+        participant.traits = traits(spdp, datagram, source)
+        return participant
 
     def exported(
         self,
@@ -95,7 +95,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return rewritten(
             message,
             partial(self._lead_out, participant, now, kept),
-            lambda told: is_hidden(judge, participant, told, datagram, is_own=True),
+            lambda announcement: is_hidden(judge, participant, announcement, datagram, is_own=True),
         )
 
     def observed(
@@ -105,34 +105,34 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         now: float,
         kept: Sequence[int] = (),
     ) -> bytes:
-        """Take in what one inside tells the proxy itself: what it has, and where. RtpsError."""
+        """Note what one inside tells the proxy itself: what it has, and where. RtpsError."""
         note_endpoints(self.notes, participant, message.datagram, message.announcements)
         lead = partial(self._lead_out, participant, now, kept)
         return rewritten(message, lead, lambda _: False)
 
     def note_in_group(self, datagram: bytes, source: str) -> None:
-        """Note whom the group has heard from an address."""
+        """Note the participants that were heard from an address by multicast."""
         with contextlib.suppress(RtpsError):
-            for part in by_source(datagram):
-                if one := self.at(source_prefix(part), source):
-                    one.is_in_group = True
+            for message in by_source(datagram):
+                if participant := self.at(source_prefix(message), source):
+                    participant.is_in_group = True
 
-    def introduced(self, one: InsideParticipant, message: DiscoveryMessage) -> list[Outgoing]:
-        """The announcement of one for the others on its network, if that passes on no multicast.
+    def introduced(self, newcomer: InsideParticipant, message: DiscoveryMessage) -> list[Outgoing]:
+        """A participant's announcement for others on its network, if that passes on no multicast.
 
         It goes on as it is: they reach each other without the proxy.
         """
-        if one.is_in_group:
+        if newcomer.is_in_group:
             return []
-        told = for_all(message.datagram)
+        announcement = for_all(message.datagram)
         return [
-            Outgoing(other.metatraffic, told)
-            for other in self.by_prefix.values()
-            if other.near == one.near and other.address != one.address and other.metatraffic
+            Outgoing(p.metatraffic, announcement)
+            for p in self.by_prefix.values()
+            if p.near == newcomer.near and p.address != newcomer.address and p.metatraffic
         ]
 
     def forget(self, participant: InsideParticipant) -> None:
-        """Forget one that has gone, and take its ports back."""
+        """Forget a participant that has gone, and take its ports back."""
         self.changes += 1
         for lease in participant.leases.values():
             del self.leases[lease.port]
@@ -146,45 +146,45 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         now: float,
         kept: Sequence[int],
         pid: int,
-        where: HostPort,
+        locator: HostPort,
     ) -> HostPort | None:
         """The address and port at which outside reaches a locator; None if it does not."""
-        if where.host != participant.address:
+        if locator.host != participant.address:
             return None
         is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
         kind = LeaseKind.METATRAFFIC if is_metatraffic else LeaseKind.DATA
-        lease = participant.leases.get(where)
+        lease = participant.leases.get(locator)
         if lease is None:
             index = len(participant.leases)
-            had = kept[index] if index < len(kept) else None
-            lease = self._lend(participant, where, kind, had, now)
+            former_port = kept[index] if index < len(kept) else None
+            lease = self._lend(participant, locator, kind, former_port, now)
         if lease is None:
             return None
         if is_metatraffic and lease.kind is not kind:
             lease.kind = kind  # Cyclone DDS has one locator for both
             self.changes += 1
-        host = self.settings.host_for(where.host)
+        host = self.settings.host_for(locator.host)
         return HostPort(host, self.settings.ports.advertised(lease.port))
 
     def _lend(
         self,
         participant: InsideParticipant,
-        where: HostPort,
+        locator: HostPort,
         kind: LeaseKind,
-        had: int | None,
+        former_port: int | None,
         now: float,
     ) -> Lease | None:
         if len(participant.leases) >= MOST_LEASES:
-            text = f"has more than {MOST_LEASES} locators; {where} got no port"
+            text = f"has more than {MOST_LEASES} locators; {locator} got no port"
             self.lacking[participant.prefix] = text
             return None
-        port = self.ports.take(participant.prefix, where, kind, now, had)
+        port = self.ports.take(participant.prefix, locator, kind, now, former_port)
         if port is None:
             ports = self.settings.ports.listen
-            text = f"no port of {ports} is free for {where}: give a longer --port-range"
+            text = f"no port of {ports} is free for {locator}: give a longer --port-range"
             self.lacking[participant.prefix] = text
             return None
-        lease = participant.leases[where] = Lease(port, where, kind)
+        lease = participant.leases[locator] = Lease(port, locator, kind)
         self.leases[port] = participant, lease
         self.changes += 1
         return lease

@@ -1,4 +1,4 @@
-"""Which ports a participant has, kept where it outlasts the proxy: in the participant itself.
+"""Which ports a participant has, kept where that outlasts the proxy: in the participant itself.
 
 A reliable reader remembers, of each writer, the number of the next sample that it expects, and says
 so when it is asked by a heartbeat (DDSI-RTPS 2.5, 8.3.8.6 and 8.4.9). So the proxy has a
@@ -6,10 +6,9 @@ participant, the *keeper*, with a writer of SEDP that never writes: it tells eac
 by a heartbeat that all samples before a number are gone, and the number holds its ports. The keeper
 has the same GUID prefix in each process of the proxy, so that the next one asks, and is told.
 
-The number is 1 for nothing; else, of the ports less the range's first, the first port's is in the
-lowest bits, and a port that is added makes it greater, as it has to be. A range that is made longer
-keeps its first port, and a port has as many bits in it, up to a length: so the keeper stays who it
-is.
+The number is 1 for no ports; else it holds each port less the range's first, that of the first port
+in the lowest bits, and a port that is added makes it greater, as it has to be. A range that is made
+longer keeps its first port, and a port its bits, up to a length: so the keeper stays the same.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,7 +28,7 @@ LEASE = 24 * 3600.0
 _BITS = 62
 """Bits of a number that are used."""
 _WIDTHS = (7, 10, 16)
-"""Bits that a port may have, by how long the range is: 8, 6 or 3 ports are kept."""
+"""Bits that a port may take, by how long the range is: 8, 6 or 3 ports are kept."""
 
 
 @dataclass(slots=True)
@@ -47,50 +46,50 @@ class Keeper:
 
     @classmethod
     def of(cls, host: str, ports: PortRange, domain: int, started: float) -> "Keeper":
-        """That of a proxy, known by its advertised host, its range's first port and its domain.
+        """The keeper of a proxy, from its advertised host, its range's first port and its domain.
 
         ``started`` is Unix time: heartbeats to a participant are counted up from there, since it
-        heeds only those that count more than the last, which another process may have sent. None
-        sends one participant more than `COUNTS_EACH_SECOND`.
+        heeds only those with a greater count than the last, which another process may have sent.
+        No process sends a participant more than `COUNTS_EACH_SECOND`.
         """
-        known = f"{host} {ports.first} {_width(ports)} {domain}"
-        own = blake2b(known.encode(), digest_size=PREFIX - 2).digest()
-        return cls(NO_VENDOR + own, ports, _first_count=int(started * COUNTS_EACH_SECOND))
+        identity = f"{host} {ports.first} {_width(ports)} {domain}"
+        digest = blake2b(identity.encode(), digest_size=PREFIX - 2).digest()
+        return cls(NO_VENDOR + digest, ports, _first_count=int(started * COUNTS_EACH_SECOND))
 
-    def questions(self, of: bytes, reached_at: HostPort) -> list[bytes]:
+    def questions(self, prefix: bytes, reached_at: HostPort) -> list[bytes]:
         """What asks a participant for its ports; ``reached_at`` is where it answers."""
-        told = announcement(self.prefix, [reached_at], LEASE, WRITES)
-        return [told, self._heartbeat(of, 1)]
+        spdp = announcement(self.prefix, [reached_at], LEASE, WRITES)
+        return [spdp, self._heartbeat(prefix, 1)]
 
-    def reminders(self, of: bytes, ports: Sequence[int], reached_at: HostPort) -> list[bytes]:
-        """What has a participant keep its ports; nothing if it does."""
-        if self.keeps(of, ports):
+    def reminders(self, prefix: bytes, ports: Sequence[int], reached_at: HostPort) -> list[bytes]:
+        """What makes a participant keep its ports; nothing if it does already."""
+        if self.keeps(prefix, ports):
             return []
-        told = announcement(self.prefix, [reached_at], LEASE, WRITES)
-        return [told, self._heartbeat(of, self.number(ports))]
+        spdp = announcement(self.prefix, [reached_at], LEASE, WRITES)
+        return [spdp, self._heartbeat(prefix, self.number(ports))]
 
-    def keeps(self, of: bytes, ports: Sequence[int]) -> bool:
-        """Whether a participant keeps all these ports, which it has."""
-        return self.kept.get(of, 0) >= self.number(ports)
+    def keeps(self, prefix: bytes, ports: Sequence[int]) -> bool:
+        """Whether a participant keeps all these ports."""
+        return self.kept.get(prefix, 0) >= self.number(ports)
 
-    def take(self, of: bytes, datagram: bytes) -> bool:
-        """Take in what a participant answers; whether it does. Raises RtpsError."""
+    def take(self, prefix: bytes, datagram: bytes) -> bool:
+        """Note what a participant answers; whether it is an answer. Raises RtpsError."""
         numbers = acknowledged(datagram, self.prefix, BuiltinWriter.PUBLICATIONS)
         for number in numbers:
-            self.kept[of] = number
+            self.kept[prefix] = number
         return bool(numbers)
 
-    def had(self, of: bytes) -> list[int]:
+    def had(self, prefix: bytes) -> list[int]:
         """The ports that a participant has kept, in the order of its locators."""
-        return list(self._ports(self.kept.get(of, 1)))
+        return list(self._ports(self.kept.get(prefix, 1)))
 
-    def forget(self, of: bytes) -> None:
+    def forget(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
-        self.kept.pop(of, None)
-        self._first_count = max(self._first_count, self._counts.pop(of, 0))  # it may come again
+        self.kept.pop(prefix, None)
+        self._first_count = max(self._first_count, self._counts.pop(prefix, 0))  # it may come again
 
     def number(self, ports: Iterable[int]) -> int:
-        """What holds these ports, as many of them as fit."""
+        """The number that holds these ports, as many of them as fit."""
         number, width = 0, _width(self.ports)
         for index, port in enumerate(ports):
             if (index + 1) * width <= _BITS:
@@ -99,17 +98,17 @@ class Keeper:
 
     def _ports(self, number: int) -> Iterator[int]:
         """The ports that a number holds; none if it can't be one of `number`."""
-        left, width = number - 1, _width(self.ports)
-        while left > 0:
-            port = self.ports.first + (left & (1 << width) - 1) - 1
+        bits, width = number - 1, _width(self.ports)
+        while bits > 0:
+            port = self.ports.first + (bits & (1 << width) - 1) - 1
             if port not in self.ports:
                 return
             yield port
-            left >>= width
+            bits >>= width
 
-    def _heartbeat(self, of: bytes, first: int) -> bytes:
-        count = self._counts[of] = self._counts.get(of, self._first_count) + 1
-        return heartbeat(self.prefix, of, BuiltinWriter.PUBLICATIONS, first, count & 0x7FFFFFFF)
+    def _heartbeat(self, prefix: bytes, first: int) -> bytes:
+        count = self._counts[prefix] = self._counts.get(prefix, self._first_count) + 1
+        return heartbeat(self.prefix, prefix, BuiltinWriter.PUBLICATIONS, first, count & 0x7FFFFFFF)
 
 
 def _width(ports: PortRange) -> int:

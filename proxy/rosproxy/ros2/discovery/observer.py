@@ -1,11 +1,11 @@
 """The proxy's own participant: it reads which readers and writers others have, on both sides.
 
-It announces itself, and has the readers of discovery alone. So whoever has announced itself
-before the proxy started does it again, at once; and what a participant has said of its readers and
-writers long ago, to others, the proxy learns as well: which locators they have, and which topics.
+It announces itself, and has the readers of discovery alone. So participants that announced
+themselves before the proxy started do it again, at once; and the proxy learns as well what they
+have told others long ago of their readers and writers: which locators they have, and which topics.
 
-It is a reliable reader in the plainest form: what a writer has by its heartbeat, and was not got,
-is asked for.
+It is a reliable reader in the plainest form: it asks for the samples that a writer has by its
+heartbeat, and that it has not got.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE = 12.0
-"""Seconds after which others forget it that do not hear it: a proxy that was killed."""
+"""Seconds after which others that do not hear it forget it: the proxy may have been killed."""
 ANNOUNCE_INTERVAL = 3.0
 OBSERVED = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
 MOST_SAMPLES = 1000
@@ -27,7 +27,7 @@ MOST_SAMPLES = 1000
 
 @dataclass(slots=True)
 class Observer:
-    """What the proxy's participant has got; ``prefix`` is its own, which is random."""
+    """The samples that the proxy's participant has got; ``prefix`` is its own, which is random."""
 
     prefix: bytes
     _got: dict[tuple[bytes, int], set[int]] = field(default_factory=dict)
@@ -41,46 +41,44 @@ class Observer:
         """The datagram by which it says that it has ended."""
         return farewell(self.prefix)
 
-    def first_question(self, of: bytes) -> list[bytes]:
+    def first_question(self, prefix: bytes) -> list[bytes]:
         """What asks a participant's writers what they have."""
-        return [
-            self._ask(of, writer, 1, ()) for writer in OBSERVED if (of, writer) not in self._got
-        ]
+        return [self._ask(prefix, w, 1, ()) for w in OBSERVED if (prefix, w) not in self._got]
 
-    def take(self, of: bytes, datagram: bytes) -> list[bytes]:
-        """Take in a participant's message; what to ask it for. Raises RtpsError.
+    def take(self, prefix: bytes, datagram: bytes) -> list[bytes]:
+        """Note a participant's message; what to ask it for. Raises RtpsError.
 
         Of samples in fragments the last comes when all are there (`FragmentStore`).
         """
         for sample in samples(datagram):
-            if sample.writer in OBSERVED and sample.prefix == of:
-                got = self._got.setdefault((of, sample.writer), set())
-                if len(got) < MOST_SAMPLES:
-                    got.add(sample.sequence)
+            if sample.writer in OBSERVED and sample.prefix == prefix:
+                received = self._got.setdefault((prefix, sample.writer), set())
+                if len(received) < MOST_SAMPLES:
+                    received.add(sample.sequence)
         answers = []
         for heartbeat in heartbeats(datagram):
             if heartbeat.writer in OBSERVED:
-                self._got.setdefault((of, heartbeat.writer), set())
-                if heartbeat.last > 0:  # who has nothing would take an answer for a question
-                    answers.append(self._answer(of, heartbeat))
+                self._got.setdefault((prefix, heartbeat.writer), set())
+                if heartbeat.last > 0:  # an empty writer would take an answer for a question
+                    answers.append(self._answer(prefix, heartbeat))
         return answers
 
-    def forget(self, of: bytes) -> None:
+    def forget(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
         for writer in OBSERVED:
-            self._got.pop((of, writer), None)
+            self._got.pop((prefix, writer), None)
 
-    def _answer(self, of: bytes, heartbeat: Heartbeat) -> bytes:
-        got = self._got[of, heartbeat.writer]
+    def _answer(self, prefix: bytes, heartbeat: Heartbeat) -> bytes:
+        received = self._got[prefix, heartbeat.writer]
         first = max(heartbeat.first, 1)
-        base = next((n for n in range(first, heartbeat.last + 1) if n not in got), None)
-        if base is None or len(got) >= MOST_SAMPLES:
-            return self._ask(of, heartbeat.writer, max(heartbeat.last, 0) + 1, ())
+        base = next((n for n in range(first, heartbeat.last + 1) if n not in received), None)
+        if base is None or len(received) >= MOST_SAMPLES:
+            return self._ask(prefix, heartbeat.writer, max(heartbeat.last, 0) + 1, ())
         last = min(heartbeat.last, base + MOST_ASKED - 1)
-        missing = [number for number in range(base, last + 1) if number not in got]
-        return self._ask(of, heartbeat.writer, base, missing)
+        missing = [number for number in range(base, last + 1) if number not in received]
+        return self._ask(prefix, heartbeat.writer, base, missing)
 
-    def _ask(self, of: bytes, writer: int, base: int, missing: Sequence[int]) -> bytes:
+    def _ask(self, prefix: bytes, writer: int, base: int, missing: Sequence[int]) -> bytes:
         self._count += 1
         question = base == 1 and not missing
-        return acknack(self.prefix, of, writer, base, missing, self._count, final=not question)
+        return acknack(self.prefix, prefix, writer, base, missing, self._count, final=not question)

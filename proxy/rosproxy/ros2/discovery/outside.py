@@ -46,12 +46,12 @@ from rosproxy.ros2.rewriting.discovery import (
 )
 
 PARTED_AGAIN = 2.0
-"""Seconds after which one inside that has not met one outside anew is told again to forget it."""
+"""Seconds after which a participant inside is told again to forget one outside, until they meet."""
 
 
 @dataclass(slots=True)
 class OutsideParticipants(ParticipantTable[OutsideParticipant]):
-    """Those outside; ``stand_ins`` by port, each with whom it leads to.
+    """The participants outside; ``stand_ins`` by port, each with those that it leads to.
 
     ``blocked`` are ports that other programs hold. ``changes`` counts those of ``stand_ins``.
     """
@@ -63,37 +63,37 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> OutsideParticipant | None:
-        """The participant that announces itself from an address, or its end; None if it is none."""
-        prefix, datagram, told = message.prefix, message.datagram, message.of_participant
-        known = self.at(prefix, source)
-        if told is None or told.ended or (known is None and prefix in self.by_prefix):
-            if known is not None:
-                known.announcement = for_all(datagram)
-            return known
-        reached = first_metatraffic(told, datagram, source)
-        if reached is None:
-            fault = traits(told, datagram, source).locator_fault
+        """The participant that announces itself or its end at an address; None if not accepted."""
+        prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
+        participant = self.at(prefix, source)
+        if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
+            if participant is not None:
+                participant.announcement = for_all(datagram)
+            return participant
+        metatraffic = first_metatraffic(spdp, datagram, source)
+        if metatraffic is None:
+            fault = traits(spdp, datagram, source).locator_fault
             text = f"it names no locator of metatraffic at {source} ({fault})"
             self.refused("no_locator", source, text)
             return None
-        known = known or self._add(prefix, datagram, source, now)
-        if known is not None:
-            known.until = now + lease_duration(told, datagram)
-            known.metatraffic, known.announcement = reached, for_all(datagram)
-            known.traits = traits(told, datagram, source)
-        return known
+        participant = participant or self._add(prefix, datagram, source, now)
+        if participant is not None:
+            participant.until = now + lease_duration(spdp, datagram)
+            participant.metatraffic, participant.announcement = metatraffic, for_all(datagram)
+            participant.traits = traits(spdp, datagram, source)
+        return participant
 
     def imported(
-        self, there: OutsideParticipant, inside: InsideParticipant, message: DiscoveryMessage
+        self, outsider: OutsideParticipant, insider: InsideParticipant, message: DiscoveryMessage
     ) -> bytes:
-        """A message of discovery as one inside gets it. Raises RtpsError."""
-        note_endpoints(self.notes, there, message.datagram, message.announcements)
-        return self._as_told(there, inside, message)
+        """A message of discovery as a participant inside gets it. Raises RtpsError."""
+        note_endpoints(self.notes, outsider, message.datagram, message.announcements)
+        return self._imported(outsider, insider, message)
 
-    def observed(self, there: OutsideParticipant, message: DiscoveryMessage) -> bytes:
-        """Take in what one outside tells the proxy itself: what it has, and where. RtpsError."""
-        note_endpoints(self.notes, there, message.datagram, message.announcements)
-        return rewritten(message, self._leading_in(there, there.address), lambda _: False)
+    def observed(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> bytes:
+        """Note what one outside tells the proxy itself: what it has, and where. RtpsError."""
+        note_endpoints(self.notes, outsider, message.datagram, message.announcements)
+        return rewritten(message, self._leading_in(outsider, outsider.address), lambda _: False)
 
     def introduced(
         self,
@@ -103,23 +103,25 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     ) -> list[Outgoing]:
         """The announcements of participants outside for some inside."""
         sent = list[Outgoing]()
-        for there in outside:
-            message = read_discovery(there.announcement)
-            for one in inside:
-                if one.metatraffic and not one.is_apart:
-                    sent += self.parting(there, one, now)
-                    sent.append(Outgoing(one.metatraffic, self._as_told(there, one, message)))
+        for outsider in outside:
+            message = read_discovery(outsider.announcement)
+            for insider in inside:
+                if insider.metatraffic and not insider.is_apart:
+                    sent += self.parting(outsider, insider, now)
+                    sent.append(
+                        Outgoing(insider.metatraffic, self._imported(outsider, insider, message))
+                    )
         return sent
 
     def parting(
-        self, there: OutsideParticipant, one: InsideParticipant, now: float
+        self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
     ) -> list[Outgoing]:
-        """What has one inside forget one outside, if it has to and was not told just now."""
-        if one.parted is None or now - one.parted.get(there.prefix, -inf) < PARTED_AGAIN:
+        """What makes one inside forget one outside, if it has to and was not told just now."""
+        if insider.parted is None or now - insider.parted.get(outsider.prefix, -inf) < PARTED_AGAIN:
             return []
-        one.parted[there.prefix] = now
-        told = farewell(there.prefix, there.vendor, next_number(there.announcement))
-        return sent_to(one.metatraffic, [told])
+        insider.parted[outsider.prefix] = now
+        datagram = farewell(outsider.prefix, outsider.vendor, next_number(outsider.announcement))
+        return sent_to(insider.metatraffic, [datagram])
 
     def is_strange(self, source: str) -> bool:
         """Whether nobody is known at an address, so that nothing from there is read."""
@@ -129,27 +131,27 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return True
 
     def may_announce(self, message: DiscoveryMessage, source: str, observer: bytes) -> bool:
-        """Whether one outside may announce itself to the proxy directly.
+        """Whether a participant outside may announce itself to the proxy directly.
 
-        Who names the ``observer`` has heard it, whose prefix is told to peers and by the ear alone.
+        One that names the ``observer`` has heard it: its prefix goes to peers and the ear alone.
         """
-        known = self.at(message.prefix, source) is not None
-        return known or destination(message.datagram) == observer or self.settings.is_peer(source)
+        is_met = self.at(message.prefix, source) is not None
+        return is_met or destination(message.datagram) == observer or self.settings.is_peer(source)
 
-    def asked(self, there: OutsideParticipant, questions: Iterable[bytes]) -> list[Outgoing]:
+    def asked(self, outsider: OutsideParticipant, questions: Iterable[bytes]) -> list[Outgoing]:
         """Questions to a participant about its discovery, as many as it may be sent."""
-        to = there.metatraffic
-        may = [one for one in questions if to and there.may_be_sent(len(one))]
-        return [Outgoing(to, one) for one in may] if to else []
+        target = outsider.metatraffic
+        allowed = [q for q in questions if target and outsider.may_be_sent(len(q))]
+        return [Outgoing(target, question) for question in allowed] if target else []
 
     def forget(self, participant: OutsideParticipant) -> None:
-        """Forget one that has gone."""
+        """Forget a participant that has gone."""
         self.remove(participant)
-        for where in list(participant.leases):
-            self._close(participant, where)
+        for locator in list(participant.leases):
+            self._close(participant, locator)
 
     def block(self, port: int, for_good: bool = True) -> None:
-        """Note that a port can't be had; who had it gets one by the next announcement.
+        """Note that a port can't be opened; its locators get one by the next announcement.
 
         It is another one if this is ``for_good``, not where the process has no more sockets.
         """
@@ -165,59 +167,61 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             text = f"more than {MOST_PER_HOST} participants there, or {MOST_OUTSIDE} outside in all"
             self.refused("participants", source, text)
             return None
-        there = OutsideParticipant(prefix, source, source_vendor(datagram), now)
-        there.proven = self.settings.is_peer(source)
-        self.add(there)
-        return there
+        outsider = OutsideParticipant(prefix, source, source_vendor(datagram), now)
+        outsider.proven = self.settings.is_peer(source)
+        self.add(outsider)
+        return outsider
 
-    def _as_told(
-        self, there: OutsideParticipant, inside: InsideParticipant, message: DiscoveryMessage
+    def _imported(
+        self, outsider: OutsideParticipant, insider: InsideParticipant, message: DiscoveryMessage
     ) -> bytes:
-        """A message as one inside gets it, without what the policy denies. Raises RtpsError."""
+        """A message as a participant inside gets it, without what the policy denies. RtpsError."""
         judge = self.settings.judge
         return rewritten(
             message,
-            self._leading_in(there, inside.address),
-            lambda told: is_hidden(judge, inside, told, message.datagram, is_own=False),
+            self._leading_in(outsider, insider.address),
+            lambda a: is_hidden(judge, insider, a, message.datagram, is_own=False),
         )
 
     def _leading_in(
-        self, there: OutsideParticipant, inside: str
+        self, outsider: OutsideParticipant, address: str
     ) -> Callable[[int, HostPort], HostPort | None]:
-        return partial(self._lead_in, there, self.settings.near(inside))
+        return partial(self._lead_in, outsider, self.settings.near(address))
 
     def _lead_in(
-        self, there: OutsideParticipant, near: str, pid: int, where: HostPort
+        self, outsider: OutsideParticipant, near: str, pid: int, locator: HostPort
     ) -> HostPort | None:
         """Where inside reaches a locator of a participant outside; None if it does not."""
         if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
-            lease = there.metatraffic and self._lease(
-                there, there.metatraffic, LeaseKind.METATRAFFIC
+            lease = outsider.metatraffic and self._lease(
+                outsider, outsider.metatraffic, LeaseKind.METATRAFFIC
             )
         elif not self.settings.both_ways:
-            all_here = is_loopback(near) and is_loopback(there.address)
-            elsewhere = is_loopback(where.host) or is_of_link(where.host)
-            return where if all_here or not elsewhere else None
+            is_same_host = is_loopback(near) and is_loopback(outsider.address)
+            is_local = is_loopback(locator.host) or is_of_link(locator.host)
+            return locator if is_same_host or not is_local else None
         else:
-            at_home = where.host == there.address
-            lease = self._lease(there, where, LeaseKind.DATA) if at_home else None
+            is_own = locator.host == outsider.address
+            lease = self._lease(outsider, locator, LeaseKind.DATA) if is_own else None
         return HostPort(near, lease.port) if lease else None
 
-    def _lease(self, there: OutsideParticipant, where: HostPort, kind: LeaseKind) -> Lease | None:
+    def _lease(
+        self, outsider: OutsideParticipant, locator: HostPort, kind: LeaseKind
+    ) -> Lease | None:
         """The stand-in for a locator, which is opened if there is none; None if there are too many.
 
-        Where Cyclone DDS has one locator for both, it is one of metatraffic, whoever comes first.
+        Where Cyclone DDS has one locator for both, it is of metatraffic, whichever comes first.
         """
-        lease = there.leases.get(where)
-        if lease is None and len(there.leases) < MOST_LEASES:
-            port = stand_in_port(f"{there.prefix.hex()} {where}", self._users, self._is_held)
+        lease = outsider.leases.get(locator)
+        if lease is None and len(outsider.leases) < MOST_LEASES:
+            port = stand_in_port(f"{outsider.prefix.hex()} {locator}", self._users, self._is_taken)
             if port is not None:
-                lease = there.leases[where] = Lease(port, where, kind)
-                self.stand_ins.setdefault(port, []).append((there, lease))
+                lease = outsider.leases[locator] = Lease(port, locator, kind)
+                self.stand_ins.setdefault(port, []).append((outsider, lease))
                 self.changes += 1
         if lease is None:
-            text = f"no port can stand in for {where} of {there.guid_prefix}"
-            self.refused("stand_ins", there.address, text)
+            text = f"no port can stand in for {locator} of {outsider.guid_prefix}"
+            self.refused("stand_ins", outsider.address, text)
         elif kind is LeaseKind.METATRAFFIC:
             lease.kind = kind
         return lease
@@ -225,12 +229,12 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def _users(self, port: int) -> int:
         return len(self.stand_ins.get(port, ()))
 
-    def _is_held(self, port: int) -> bool:
+    def _is_taken(self, port: int) -> bool:
         return port in self.blocked or port in self.settings.ports.listen
 
-    def _close(self, participant: OutsideParticipant, where: HostPort) -> None:
-        lease = participant.leases.pop(where)
-        left = [one for one in self.stand_ins.pop(lease.port) if one[1] is not lease]
-        if left:
-            self.stand_ins[lease.port] = left
+    def _close(self, participant: OutsideParticipant, locator: HostPort) -> None:
+        lease = participant.leases.pop(locator)
+        remaining = [pair for pair in self.stand_ins.pop(lease.port) if pair[1] is not lease]
+        if remaining:
+            self.stand_ins[lease.port] = remaining
         self.changes += 1

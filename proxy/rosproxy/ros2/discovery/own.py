@@ -1,4 +1,4 @@
-"""The proxy's own participants in a domain: what they say, and what they are told.
+"""The proxy's own participants in a domain: what they send, and what they are told.
 
 The *observer* reads which readers and writers others have, on both sides; the *keeper* has those
 inside keep their ports for the next process. Neither has any of its own, and neither is told to the
@@ -38,55 +38,55 @@ class OwnParticipants:
         return self.observer.announcement(HostPort(near, self.settings.unicast_port))
 
     def announced_outside(self) -> list[Outgoing]:
-        """The observer's announcement for outside, as far as that is known by name."""
+        """The observer's announcement for the ear and the peers."""
         port = self.settings.ports.advertised(self.settings.discovery_port)
         reached_at = (HostPort(host, port) for host in self.settings.hosts)
         return self.settings.to_outside(self.observer.announcement(*reached_at))
 
-    def asked_first(self, one: InsideParticipant) -> list[Outgoing]:
-        """What asks one inside that has announced itself for its readers and writers."""
-        return sent_to(one.metatraffic, self.observer.first_question(one.prefix))
+    def asked_first(self, participant: InsideParticipant) -> list[Outgoing]:
+        """What asks a participant inside that has announced itself for its readers and writers."""
+        return sent_to(participant.metatraffic, self.observer.first_question(participant.prefix))
 
-    def met_elsewhere(self, one: InsideParticipant) -> list[Outgoing]:
-        """What has one forget the keeper, which it knows where the proxy is no more."""
-        self.keeper.forget(one.prefix)  # it is to remember its ports again
-        return sent_to(one.metatraffic, [farewell(self.keeper.prefix)])
+    def met_elsewhere(self, participant: InsideParticipant) -> list[Outgoing]:
+        """What makes a participant forget the keeper, which it knows at a former address."""
+        self.keeper.forget(participant.prefix)  # it is to keep its ports anew
+        return sent_to(participant.metatraffic, [farewell(self.keeper.prefix)])
 
     def keeping(self) -> list[Outgoing]:
-        """What has participants inside keep the ports that they have now."""
-        everybody = self.inside.by_prefix.values()
-        return [sent for one in everybody for sent in self.returning.reminders(one)]
+        """What makes participants inside keep the ports that they have now."""
+        participants = self.inside.by_prefix.values()
+        return [sent for p in participants for sent in self.returning.reminders(p)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Take in what a participant inside tells the keeper, or the observer. Raises RtpsError."""
         prefix = message.prefix
-        one = self.inside.at(prefix, source)
-        waits = self.returning.has(prefix, source)
-        if (waits or one) and self.keeper.take(prefix, message.datagram):
+        insider = self.inside.at(prefix, source)
+        is_waiting = self.returning.has(prefix, source)
+        if (is_waiting or insider) and self.keeper.take(prefix, message.datagram):
             return []
-        if one is None:
+        if insider is None:
             return []
-        observed = partial(self.inside.observed, one, now=now, kept=self.returning.had(prefix))
-        return sent_to(one.metatraffic, self._taken(self.settings.unicast_port, message, observed))
+        rewrite = partial(self.inside.observed, insider, now=now, kept=self.returning.had(prefix))
+        return sent_to(insider.metatraffic, self._ask(self.settings.unicast_port, message, rewrite))
 
     def told_outside(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
         """Take in what a participant outside tells the observer. Raises RtpsError."""
-        there = self.outside.at(message.prefix, source)
-        if there is None:
+        outsider = self.outside.at(message.prefix, source)
+        if outsider is None:
             return []
-        there.note_sent(message.datagram, self.observer.prefix)
-        observed = partial(self.outside.observed, there)
-        asked = self._taken(self.settings.discovery_port, message, observed)
-        return self.outside.asked(there, asked)
+        outsider.note_sent(message.datagram, self.observer.prefix)
+        rewrite = partial(self.outside.observed, outsider)
+        questions = self._ask(self.settings.discovery_port, message, rewrite)
+        return self.outside.asked(outsider, questions)
 
     def forget(self, prefix: bytes) -> None:
-        """Forget what a participant has told that has gone."""
+        """Forget what a participant that has gone has told."""
         self.observer.forget(prefix)
         self.returning.forget_participant(prefix)
 
-    def _taken(self, port: int, message: DiscoveryMessage, observed: Rewrite) -> list[bytes]:
-        """What the observer asks for, after a message of discovery that came to it at a port."""
-        told, asked = self.fragments.rewritten(port, message, self.observer.prefix, observed)
-        for datagram in told:
-            asked += self.observer.take(message.prefix, datagram)
-        return asked
+    def _ask(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
+        """Give the observer a message of discovery that came at a port; what it asks for then."""
+        passed, questions = self.fragments.rewritten(port, message, self.observer.prefix, rewrite)
+        for datagram in passed:
+            questions += self.observer.take(message.prefix, datagram)
+        return questions

@@ -1,8 +1,8 @@
 """The policy over discovery: a reader or writer that it denies is not told to the other side.
 
-So the two ends never match, and whatever is sent to them nevertheless they don't take. A policy
-that changes is applied by having the participant and those of the other side lose sight of each
-other, and meet again: only for participants inside of which a verdict is another one now.
+So the two ends never match, and don't take what is sent to them nevertheless. When the policy
+changes, it is applied by having the participant and those of the other side lose sight of each
+other, and meet again: only for participants inside for which a verdict has changed.
 """
 
 from rosproxy.ros2.discovery.domain_settings import Judge
@@ -16,27 +16,31 @@ meets others anew with each change of the policy."""
 
 
 def is_hidden(
-    judge: Judge, inside: InsideParticipant, told: Announcement, datagram: bytes, is_own: bool
+    judge: Judge,
+    inside: InsideParticipant,
+    announcement: Announcement,
+    datagram: bytes,
+    is_own: bool,
 ) -> bool:
     """Whether an announcement is not to be passed on.
 
-    ``inside`` is whose it is, if it ``is_own``, or who is to get it.
+    ``inside`` is the participant that makes it, if it ``is_own``, else the one that is to get it.
     """
-    if told.kind is None or told.ended:
+    if announcement.kind is None or announcement.ended:
         return False
-    asked = rule_about(told.kind, told.topic(datagram), is_own)
-    if asked is None:
+    rule = rule_about(announcement.kind, announcement.topic(datagram), is_own)
+    if rule is None:
         return False
-    if asked not in inside.verdicts and len(inside.verdicts) < MOST_VERDICTS:
-        inside.verdicts[asked] = judge(*asked, inside.address)
-    found = inside.verdicts.get(asked)
-    return not (judge(*asked, inside.address) if found is None else found)
+    if rule not in inside.verdicts and len(inside.verdicts) < MOST_VERDICTS:
+        inside.verdicts[rule] = judge(*rule, inside.address)
+    verdict = inside.verdicts.get(rule)
+    return not (judge(*rule, inside.address) if verdict is None else verdict)
 
 
 def has_changed(judge: Judge, inside: InsideParticipant) -> bool:
-    """Whether the policy says something else of a participant than it did, or may do."""
+    """Whether the policy says something else of a participant than before, or may."""
     if len(inside.verdicts) >= MOST_VERDICTS:
         return True
     return any(
-        judge(*asked, inside.address) is not allowed for asked, allowed in inside.verdicts.items()
+        judge(*rule, inside.address) is not allowed for rule, allowed in inside.verdicts.items()
     )

@@ -3,8 +3,8 @@
 Reading discovery costs a hundred times what passing on a user's datagram does, and one announcement
 goes on to everybody on the other side. So each source has an allowance of datagrams, in and out,
 that fills up again with the time; a long one counts as several, since it takes as long to read.
-What is over it is lost, as datagrams may be anywhere: discovery is repeated, and its readers ask
-for what they lack.
+What is over it is dropped, as datagrams may be anywhere: discovery is repeated, and its readers
+ask for what they lack.
 """
 
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ MOST_SOURCES = 4096
 
 @dataclass(slots=True)
 class DiscoveryRates:
-    """What is left of the allowance of each source, and since when."""
+    """What is left of each source's allowance, and the time at which that was."""
 
     per_second: float = PER_SECOND
     burst: float = BURST
@@ -28,16 +28,16 @@ class DiscoveryRates:
 
     def take(self, source: str, size: int, now: float) -> bool:
         """Whether a datagram of a source, of so many bytes, may be read; it is charged then."""
-        left, since = self._left.get(source, (self.burst, now))
-        left = min(left + max(now - since, 0.0) * self.per_second, self.burst)
-        allowed = left >= 1.0
+        remaining, since = self._left.get(source, (self.burst, now))
+        remaining = min(remaining + max(now - since, 0.0) * self.per_second, self.burst)
+        allowed = remaining >= 1.0
         if source not in self._left and len(self._left) >= MOST_SOURCES:
             del self._left[next(iter(self._left))]
-        self._left[source] = (left - 1 - size // STEP if allowed else left), now
+        self._left[source] = (remaining - 1 - size // STEP if allowed else remaining), now
         return allowed
 
     def charge(self, source: str, count: int) -> None:
         """Charge a source with so many datagrams that its own have led to; it may go into debt."""
         if count and source in self._left:
-            left, since = self._left[source]
-            self._left[source] = left - count, since
+            remaining, since = self._left[source]
+            self._left[source] = remaining - count, since

@@ -28,13 +28,12 @@ ANSWER_TIME = 5.0
 
 @dataclass(slots=True)
 class Returning:
-    """Those who wait, by prefix: their announcement, where it came from, and since when.
+    """Participants that wait, by prefix: where their announcement came from, it, and since when.
 
-    At one address there may be as many of them as participants. ``former`` are the ports of those
+    At one address as many may wait as there may be participants. ``former`` are the ports of those
     that knew the proxy at another address, or with another range, by prefix, until they have gone.
-    Fast DDS heeds no other locators of whom it knows (PDPListener.cpp,
-    PDPSimple::updateInfoMatchesEDP), so these have to meet everybody anew; nor would they answer
-    the keeper.
+    Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp,
+    PDPSimple::updateInfoMatchesEDP): these must meet everybody anew, and don't answer the keeper.
     """
 
     settings: DomainSettings
@@ -42,24 +41,24 @@ class Returning:
     keeper: Keeper
     waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
     former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
-    _here: Counter[str] = field(default_factory=Counter)
+    _counts: Counter[str] = field(default_factory=Counter)
 
     def has(self, prefix: bytes, source: str) -> bool:
-        """Whether somebody at an address waits."""
+        """Whether a participant at an address waits."""
         return prefix in self.waiting and self.waiting[prefix][0] == source
 
     def wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Keep an announcement until ports are given; ask meanwhile which ones it had."""
+        """Keep an announcement until ports are given; meanwhile ask which ports it had."""
         if message.prefix in self.waiting:
             return []
-        if len(self.waiting) >= MOST_INSIDE or self._here[source] >= MOST_PER_ADDRESS:
+        if len(self.waiting) >= MOST_INSIDE or self._counts[source] >= MOST_PER_ADDRESS:
             return []
         self.waiting[message.prefix] = source, message, now
-        self._here[source] += 1
+        self._counts[source] += 1
         return self._questions(message, source)
 
     def asked_again(self, now: float) -> list[Outgoing]:
-        """What asks those again that have not answered."""
+        """Questions again to those that have not answered."""
         return [
             question
             for source, message, since in self.waiting.values()
@@ -68,58 +67,60 @@ class Returning:
         ]
 
     def ready(self, now: float) -> Iterator[tuple[str, DiscoveryMessage]]:
-        """Those that may get ports now, which wait no longer."""
+        """The announcements of those that may get ports now; they wait no longer."""
         if not self.ports.settled(now):
             return
         for prefix, (source, message, since) in list(self.waiting.items()):
             if self._has_answered(prefix, since, now):
                 del self.waiting[prefix]
-                self._here -= Counter((source,))
+                self._counts -= Counter((source,))
                 yield source, message
 
     def forget(self, addresses: Collection[str]) -> None:
-        """Forget those who wait at addresses where nobody is any more."""
-        for prefix in [one for one, (source, *_) in self.waiting.items() if source in addresses]:
-            self._here -= Counter((self.waiting.pop(prefix)[0],))
+        """Forget those that wait at addresses where nobody is any more."""
+        for prefix in [p for p, (source, *_) in self.waiting.items() if source in addresses]:
+            self._counts -= Counter((self.waiting.pop(prefix)[0],))
             self.keeper.forget(prefix)
 
-    def note_former(self, former: Mapping[bytes, Sequence[int]], known: Container[bytes]) -> None:
-        """Note which ports participants had at a proxy elsewhere; not of those known.
+    def note_former(self, former: Mapping[bytes, Sequence[int]], present: Container[bytes]) -> None:
+        """Note which ports participants had at a proxy elsewhere; not of those ``present``.
 
-        Who has not all of them in this range gets others.
+        A participant whose ports are not all in this range gets others.
         """
         for prefix, ports in former.items():
-            lawful = all(port in self.ports.pool.range for port in ports)
-            if ports and prefix not in known and len(self.former) < MOST_INSIDE:
-                self.former[prefix] = tuple(ports) if lawful else ()
+            in_range = all(port in self.ports.pool.range for port in ports)
+            if ports and prefix not in present and len(self.former) < MOST_INSIDE:
+                self.former[prefix] = tuple(ports) if in_range else ()
 
     def had(self, prefix: bytes) -> Sequence[int]:
         """The ports that a participant had before the start, in the order of its locators."""
         return self.former.get(prefix) or self.keeper.had(prefix)
 
     def forget_participant(self, prefix: bytes) -> None:
-        """Forget one that has gone."""
+        """Forget a participant that has gone."""
         self.former.pop(prefix, None)
         self.keeper.forget(prefix)
 
-    def reminders(self, one: InsideParticipant) -> list[Outgoing]:
-        """What has a participant keep the ports that it has now."""
-        if one.metatraffic is None:
+    def reminders(self, participant: InsideParticipant) -> list[Outgoing]:
+        """What makes a participant keep the ports that it has now."""
+        if participant.metatraffic is None:
             return []
-        told = self.keeper.reminders(one.prefix, one.ports, self._back(one.address))
-        return [Outgoing(one.metatraffic, datagram) for datagram in told]
+        datagrams = self.keeper.reminders(
+            participant.prefix, participant.ports, self._reply_target(participant.address)
+        )
+        return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
 
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
         return prefix in self.former or prefix in self.keeper.kept or now - since >= ANSWER_TIME
 
     def _questions(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
-        told = message.of_participant
-        to = first_metatraffic(told, message.datagram, source) if told else None
-        if to is None:
+        spdp = message.of_participant
+        target = first_metatraffic(spdp, message.datagram, source) if spdp else None
+        if target is None:
             return []
-        asked = self.keeper.questions(message.prefix, self._back(source))
-        return [Outgoing(to, datagram) for datagram in asked]
+        questions = self.keeper.questions(message.prefix, self._reply_target(source))
+        return [Outgoing(target, datagram) for datagram in questions]
 
-    def _back(self, address: str) -> HostPort:
-        """Where a participant inside reaches the proxy's own."""
+    def _reply_target(self, address: str) -> HostPort:
+        """Where a participant inside reaches the proxy's own participants."""
         return HostPort(self.settings.near(address), self.settings.unicast_port)

@@ -1,7 +1,7 @@
 """A participant's announcement made by hand: the proxy's own.
 
-Participants that hear of a new one tell it of themselves at once, instead of with their next
-announcement, which may be seconds away.
+Participants that hear of a new one announce themselves to it at once, instead of with their next
+regular announcement, which may be seconds away.
 """
 
 import struct
@@ -18,15 +18,15 @@ LAST_SEQUENCE = 2**31 - 1
 """A sequence number that no participant's announcements reach."""
 ANNOUNCES = 0x01 | 0x02
 READS, WRITES = ANNOUNCES | 0x08 | 0x20, ANNOUNCES | 0x04
-"""The built-in endpoints that it has (9.3.2.12): those of SPDP, and the readers of SEDP, or its
-writer of publications."""
+"""Built-in endpoints that a participant has (9.3.2.12): those of SPDP, and with them the readers of
+SEDP, or its writer of publications."""
 
 
 def announcement(
     prefix: bytes, reached_at: Iterable[HostPort], lease: float, endpoints: int
 ) -> bytes:
-    """The datagram by which a participant announces itself, for so many seconds."""
-    locators = [pack_locator(where, "<") for where in reached_at]
+    """The datagram by which a participant announces itself, for ``lease`` seconds."""
+    locators = [pack_locator(host_port, "<") for host_port in reached_at]
     return _message(
         prefix,
         0x05,  # little-endian, with a payload
@@ -35,8 +35,8 @@ def announcement(
             (Pid.PROTOCOL_VERSION, VERSION + bytes(2)),
             (Pid.VENDOR_ID, NO_VENDOR + bytes(2)),
             (Pid.PARTICIPANT_GUID, prefix + _PARTICIPANT),
-            *((Pid.METATRAFFIC_UNICAST_LOCATOR, one) for one in locators),
-            *((Pid.DEFAULT_UNICAST_LOCATOR, one) for one in locators),
+            *((Pid.METATRAFFIC_UNICAST_LOCATOR, locator) for locator in locators),
+            *((Pid.DEFAULT_UNICAST_LOCATOR, locator) for locator in locators),
             (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
             (Pid.BUILTIN_ENDPOINT_SET, struct.pack("<I", endpoints)),
         ],
@@ -46,8 +46,8 @@ def announcement(
 def farewell(prefix: bytes, vendor: bytes = NO_VENDOR, sequence: int = 2) -> bytes:
     """The datagram by which a participant says that it has ended: its key, with that status.
 
-    On behalf of another participant it has that one's vendor, and a sequence number beyond its own:
-    Fast DDS takes none from a writer of which it has a later one (StatelessReader.cpp).
+    Sent for another participant it has that one's vendor, and a sequence number beyond its own:
+    Fast DDS takes no sample older than the last of the same writer (StatelessReader.cpp).
     """
     guid = prefix + _PARTICIPANT
     status = _parameters([(Pid.KEY_HASH, guid), (Pid.STATUS_INFO, bytes([0, 0, 0, 3]))])
@@ -71,5 +71,5 @@ def _message(
 
 
 def _parameters(parameters: list[tuple[int, bytes]]) -> bytes:
-    held = b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
-    return held + struct.pack("<HH", SENTINEL, 0)
+    packed = b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
+    return packed + struct.pack("<HH", SENTINEL, 0)

@@ -1,7 +1,7 @@
-"""What the ear puts around an announcement that it has heard: where that came from.
+"""The envelope that the ear puts around an announcement: the address that it came from.
 
-16 bytes before the datagram: the address, IPv4 as IPv4-in-IPv6. A participant outside is used only
-at the address that it has sent from, and that ends where the ear hears it.
+16 bytes before the datagram: the address, IPv4 as IPv4-in-IPv6. The proxy uses a participant
+outside only at the address that it sends from, which is lost when the ear passes a datagram on.
 """
 
 from ipaddress import IPv6Address, ip_address
@@ -13,7 +13,7 @@ _SIZE = 16
 
 
 def wrapped(source: str, datagram: bytes) -> bytes:
-    """A datagram with the address that it came from. Raises ValueError if that is none."""
+    """A datagram with the address that it came from. Raises ValueError if ``source`` is none."""
     address = ip_address(source)
     packed = IPv6Address(f"::ffff:{address}").packed if address.version == 4 else address.packed
     return packed + datagram

@@ -1,7 +1,7 @@
 """Locators: where a participant, a reader or a writer is reached. The addresses of DDS.
 
 24 bytes: kind 4, port 4, address 16; of IPv4 the address is in the last four (DDSI-RTPS 2.5,
-9.3.2.4). Kinds of its own (Fast DDS: 16 is shared memory) a vendor may have as it likes.
+9.3.2.4). A vendor may have kinds of its own (Fast DDS: 16 is shared memory).
 """
 
 import struct
@@ -28,7 +28,7 @@ class LocatorKind(IntEnum):
 
 
 class Locator(msgspec.Struct, frozen=True):
-    """A locator as it stands in a parameter; ``address`` has 16 bytes, of any kind."""
+    """A locator as it stands in a parameter; ``address`` has 16 bytes, whatever the kind."""
 
     kind: int
     port: int
@@ -36,7 +36,7 @@ class Locator(msgspec.Struct, frozen=True):
 
     @property
     def where(self) -> HostPort | None:
-        """The address and port of one of UDP; None for other kinds, and where no port is given."""
+        """The address and port of a UDP locator; None for other kinds, or without a valid port."""
         if not 0 < self.port < 65536:
             return None
         if self.kind == LocatorKind.UDP_V4:
@@ -46,24 +46,26 @@ class Locator(msgspec.Struct, frozen=True):
         return None
 
 
-def read_locator(datagram: bytes, held: ParameterList, parameter: Parameter) -> Locator | None:
+def read_locator(
+    datagram: bytes, parameters: ParameterList, parameter: Parameter
+) -> Locator | None:
     """The locator in a parameter; None if that is too short to be one."""
     start = parameter.value.start
     if parameter.value.end - start < SIZE:
         return None
-    kind, port = struct.unpack_from(held.order + "iI", datagram, start)
+    kind, port = struct.unpack_from(parameters.order + "iI", datagram, start)
     return Locator(kind, port, datagram[start + 8 : start + SIZE])
 
 
-def replaced(held: ParameterList, parameter: Parameter, where: HostPort) -> Overwrite:
-    """The edit by which a locator leads elsewhere. Raises ValueError if that is no address."""
-    return Overwrite(parameter.value.start, pack_locator(where, held.order))
+def replaced(parameters: ParameterList, parameter: Parameter, target: HostPort) -> Overwrite:
+    """The edit that makes a locator lead to ``target``. Raises ValueError if its host is a name."""
+    return Overwrite(parameter.value.start, pack_locator(target, parameters.order))
 
 
-def pack_locator(where: HostPort, order: str) -> bytes:
+def pack_locator(host_port: HostPort, order: str) -> bytes:
     """A locator of UDP, in a byte order as `struct` has it. Raises ValueError for a name."""
-    kind, address = _packed(where.host)
-    return struct.pack(order + "iI", kind, where.port) + address
+    kind, address = _packed(host_port.host)
+    return struct.pack(order + "iI", kind, host_port.port) + address
 
 
 @lru_cache(256)

@@ -58,7 +58,7 @@ class Pid(IntEnum):
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """A parameter: its id, where that stands, and where its value is."""
+    """A parameter: its id, where that stands in the datagram, and where its value is."""
 
     pid: int
     at: int
@@ -72,31 +72,31 @@ class ParameterList(msgspec.Struct, frozen=True):
     parameters: tuple[Parameter, ...]
 
     def all(self, *pids: int) -> list[Parameter]:
-        """Those with one of these ids, in their order."""
-        return [one for one in self.parameters if one.pid in pids]
+        """The parameters with one of these ids, in their order."""
+        return [p for p in self.parameters if p.pid in pids]
 
     def number(self, datagram: bytes, pid: int) -> int | None:
         """The first 32-bit number with an id; None if there is none, or it is too short."""
-        for one in self.all(pid):
-            if one.value.end - one.value.start >= 4:
-                found: int = struct.unpack_from(self.order + "I", datagram, one.value.start)[0]
-                return found
+        for param in self.all(pid):
+            if param.value.end - param.value.start >= 4:
+                number: int = struct.unpack_from(self.order + "I", datagram, param.value.start)[0]
+                return number
         return None
 
     def seconds(self, datagram: bytes, pid: int) -> float | None:
         """The first duration with an id: whole seconds and 2**-32 of them; it may be infinite."""
-        for one in self.all(pid):
-            if one.value.end - one.value.start >= 8:
-                whole, part = struct.unpack_from(self.order + "iI", datagram, one.value.start)
-                return float("inf") if whole == 0x7FFFFFFF else whole + part / 2**32
+        for param in self.all(pid):
+            if param.value.end - param.value.start >= 8:
+                whole, fraction = struct.unpack_from(self.order + "iI", datagram, param.value.start)
+                return float("inf") if whole == 0x7FFFFFFF else whole + fraction / 2**32
         return None
 
     def text(self, datagram: bytes, pid: int) -> str | None:
-        """The first string with an id: a length, so many bytes, the last of them zero."""
+        """The first string with an id: its length, and so many bytes, the last of them zero."""
         size = self.number(datagram, pid)
-        for one in self.all(pid) if size else ():
-            start = one.value.start + 4
-            if size and start + size <= one.value.end:
+        for param in self.all(pid) if size else ():
+            start = param.value.start + 4
+            if size and start + size <= param.value.end:
                 return datagram[start : start + size].split(b"\0")[0].decode("utf-8", "replace")
         return None
 
@@ -113,8 +113,8 @@ class ParameterList(msgspec.Struct, frozen=True):
 def payload_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
     """The list that is a sample's payload; None if its payload is something else.
 
-    Raises RtpsError if the list has no end, or a length leads outside. Of a fragment only that of
-    a sample which is whole can be read.
+    Raises RtpsError if the list has no end, or a length leads outside. A DATA_FRAG can be read only
+    if it carries the whole sample.
     """
     span = sample.payload
     if span is None or span.end - span.start < 4:
@@ -130,10 +130,10 @@ def inline_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:
     return _read(datagram, sample.inline_qos, sample.little) if sample.inline_qos else None
 
 
-def _read(datagram: bytes, within: Span, little: bool) -> ParameterList:
-    found = tuple(
-        Parameter(pid, at, Span(at + 4, end))
-        for pid, at, end in walk_parameters(datagram, within, little)
+def _read(datagram: bytes, span: Span, little: bool) -> ParameterList:
+    parameters = tuple(
+        Parameter(pid, offset, Span(offset + 4, end))
+        for pid, offset, end in walk_parameters(datagram, span, little)
         if pid != SENTINEL
     )
-    return ParameterList(little, found)
+    return ParameterList(little, parameters)

@@ -1,8 +1,8 @@
 """The QoS of a reader or writer, as far as it decides who matches whom.
 
-SEDP tells it, a parameter for each policy; what is left out has its default (DDSI-RTPS 2.5,
-9.6.3.2; Fast DDS tells all policies, Cyclone DDS only what differs). A policy that can't be read
-counts as left out: nothing follows from it but what the user is told.
+SEDP carries it, a parameter for each policy; one that is left out has its default (DDSI-RTPS 2.5,
+9.6.3.2; Fast DDS sends all policies, Cyclone DDS only what differs). A policy that can't be read
+counts as left out: QoS decides nothing but what the user is told.
 
     reliability          kind 4 (1 best effort, 2 reliable), the longest blocking 8
     durability           kind 4 (0 volatile, 1 transient local, 2 transient, 3 persistent)
@@ -22,13 +22,13 @@ import msgspec
 from rosproxy.ros2.protocol.parameters import Parameter, ParameterList, Pid
 
 MOST_PARTITIONS, LONGEST_PARTITION = 4, 64
-"""Partitions that are read, and their characters; ROS 2 has none of its own."""
+"""Partitions that are read, and the bytes of each; ROS 2 itself uses none."""
 MOST_REPRESENTATIONS = 3
 _RELIABLE, _EXCLUSIVE = 2, 1
 
 
 class Durability(IntEnum):
-    """Who gets what was written before he came; each more than the one before."""
+    """Whether a reader gets what was written before it came; each kind offers more."""
 
     VOLATILE = 0
     TRANSIENT_LOCAL = 1
@@ -37,7 +37,7 @@ class Durability(IntEnum):
 
 
 class Liveliness(IntEnum):
-    """Who says that a writer lives; each more exact than the one before."""
+    """Who asserts that a writer is alive; each kind is more exact than the one before."""
 
     AUTOMATIC = 0
     MANUAL_BY_PARTICIPANT = 1
@@ -61,76 +61,76 @@ class EndpointQos(msgspec.Struct, frozen=True):
     representations: tuple[int, ...] = ()
 
 
-def read_qos(datagram: bytes, held: ParameterList, of_writer: bool) -> EndpointQos:
+def read_qos(datagram: bytes, parameters: ParameterList, is_writer: bool) -> EndpointQos:
     """The QoS in what a reader or writer announces; never raises.
 
     A writer is reliable, and a reader is not, unless it says otherwise (DDS 1.4, 2.2.3.14).
     """
-    told = {one.pid: one for one in reversed(held.parameters)}  # the first of each
+    by_pid = {p.pid: p for p in reversed(parameters.parameters)}  # the first of each id
 
     def kind(pid: Pid, default: int) -> int:
-        numbers = _unpacked(datagram, held, told.get(pid), "I")
+        numbers = _unpacked(datagram, parameters, by_pid.get(pid), "I")
         return numbers[0] if numbers else default
 
-    def seconds(pid: Pid, after: str = "") -> float:
-        numbers = _unpacked(datagram, held, told.get(pid), f"{after}iI")
+    def seconds(pid: Pid, leading: str = "") -> float:
+        numbers = _unpacked(datagram, parameters, by_pid.get(pid), f"{leading}iI")
         if not numbers or numbers[-2] == 0x7FFFFFFF:
             return float("inf")
         return numbers[-2] + numbers[-1] / 2**32
 
     return EndpointQos(
-        reliable=kind(Pid.RELIABILITY, _RELIABLE if of_writer else 0) >= _RELIABLE,
+        reliable=kind(Pid.RELIABILITY, _RELIABLE if is_writer else 0) >= _RELIABLE,
         durability=Durability(min(kind(Pid.DURABILITY, 0), max(Durability))),
         deadline=seconds(Pid.DEADLINE),
         liveliness=Liveliness(min(kind(Pid.LIVELINESS, 0), max(Liveliness))),
         liveliness_lease=seconds(Pid.LIVELINESS, "I"),
         exclusive=kind(Pid.OWNERSHIP, 0) == _EXCLUSIVE,
-        partitions=_partitions(datagram, held, told.get(Pid.PARTITION)),
-        representations=_representations(datagram, held, told.get(Pid.DATA_REPRESENTATION)),
+        partitions=_partitions(datagram, parameters, by_pid.get(Pid.PARTITION)),
+        representations=_representations(datagram, parameters, by_pid.get(Pid.DATA_REPRESENTATION)),
     )
 
 
 def _unpacked(
-    datagram: bytes, held: ParameterList, parameter: Parameter | None, form: str
+    datagram: bytes, parameters: ParameterList, parameter: Parameter | None, layout: str
 ) -> tuple[int, ...]:
     """Numbers at the start of a parameter; none if it is too short, or not there."""
     if parameter is None:
         return ()
-    start, size = parameter.value.start, struct.calcsize(f"={form}")
+    start, size = parameter.value.start, struct.calcsize(f"={layout}")
     if parameter.value.end - start < size:
         return ()
-    return struct.unpack_from(held.order + form, datagram, start)
+    return struct.unpack_from(parameters.order + layout, datagram, start)
 
 
 def _partitions(
-    datagram: bytes, held: ParameterList, parameter: Parameter | None
+    datagram: bytes, parameters: ParameterList, parameter: Parameter | None
 ) -> tuple[str, ...] | None:
-    (count,) = _unpacked(datagram, held, parameter, "I") or (0,)
+    (count,) = _unpacked(datagram, parameters, parameter, "I") or (0,)
     if parameter is None or not count:
         return ()
     if count > MOST_PARTITIONS:
         return None
-    found = list(_strings(datagram, held, parameter, count))
-    return tuple(found) if len(found) == count else None
+    partitions = list(_strings(datagram, parameters, parameter, count))
+    return tuple(partitions) if len(partitions) == count else None
 
 
 def _strings(
-    datagram: bytes, held: ParameterList, parameter: Parameter, count: int
+    datagram: bytes, parameters: ParameterList, parameter: Parameter, count: int
 ) -> Iterator[str]:
-    """The strings of a row, up to a bad one: a length and so many bytes, at a multiple of four."""
-    at, end = parameter.value.start + 4, parameter.value.end
+    """The strings of a sequence, up to a bad one: a length, so many bytes, padded to four."""
+    offset, end = parameter.value.start + 4, parameter.value.end
     for _ in range(count):
-        if at + 4 > end:
+        if offset + 4 > end:
             return
-        (size,) = struct.unpack_from(held.order + "I", datagram, at)
-        if size > LONGEST_PARTITION or at + 4 + size > end:
+        (size,) = struct.unpack_from(parameters.order + "I", datagram, offset)
+        if size > LONGEST_PARTITION or offset + 4 + size > end:
             return
-        yield datagram[at + 4 : at + 4 + size].split(b"\0")[0].decode("utf-8", "replace")
-        at += 4 + size + -size % 4
+        yield datagram[offset + 4 : offset + 4 + size].split(b"\0")[0].decode("utf-8", "replace")
+        offset += 4 + size + -size % 4
 
 
 def _representations(
-    datagram: bytes, held: ParameterList, parameter: Parameter | None
+    datagram: bytes, parameters: ParameterList, parameter: Parameter | None
 ) -> tuple[int, ...]:
-    (count,) = _unpacked(datagram, held, parameter, "I") or (0,)
-    return _unpacked(datagram, held, parameter, f"I{min(count, MOST_REPRESENTATIONS)}h")[1:]
+    (count,) = _unpacked(datagram, parameters, parameter, "I") or (0,)
+    return _unpacked(datagram, parameters, parameter, f"I{min(count, MOST_REPRESENTATIONS)}h")[1:]

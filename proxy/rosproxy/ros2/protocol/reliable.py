@@ -5,9 +5,9 @@
     GAP        reader 4, writer 4, first number 8, a set of numbers
     NACK_FRAG  reader 4, writer 4, number 8, a set of fragments (base 4, bits 4, words), count 4
 
-A writer says by a heartbeat which samples it has; a reader answers with the ones that it lacks, and
-has thereby got all those before (DDSI-RTPS 2.5, 8.3.8.1 and 8.3.8.6). By a GAP the writer says that
-samples are none of the reader's business, which then goes on without them (8.3.8.4).
+A writer says by a heartbeat which samples it has; a reader answers with those that it lacks, and so
+confirms all before them (DDSI-RTPS 2.5, 8.3.8.1 and 8.3.8.6). By a GAP the writer says that samples
+are not for the reader, which then goes on without them (8.3.8.4).
 """
 
 import struct
@@ -32,7 +32,7 @@ _LITTLE, _FINAL = 0x01, 0x02
 _GAP_SIZE = 28
 """Bytes of a GAP with one number."""
 _TO_READER = 5
-"""From a built-in writer's entity id (…c2) to that of its reader (…c7)."""
+"""What makes a built-in writer's entity id (…c2) that of its reader (…c7)."""
 
 
 class Heartbeat(msgspec.Struct, frozen=True):
@@ -47,8 +47,8 @@ def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
     """All heartbeats in a message. Raises RtpsError if a length or a number can't be."""
     for kind, flags, body in submessages(datagram):
         if kind == SubmessageId.HEARTBEAT and body.end - body.start >= 28:
-            mark = "<" if flags & _LITTLE else ">"
-            numbers = struct.unpack_from(mark + "iIiI", datagram, body.start + 8)
+            order = "<" if flags & _LITTLE else ">"
+            numbers = struct.unpack_from(order + "iIiI", datagram, body.start + 8)
             writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
             first, last = _number(*numbers[:2]), _number(*numbers[2:])
             if last > LAST_NUMBER:
@@ -67,21 +67,21 @@ def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> byt
     return _directed(own, to, SubmessageId.HEARTBEAT, _LITTLE, body + struct.pack("<i", count))
 
 
-def acknowledged(datagram: bytes, meant: bytes, writer: int) -> list[int]:
-    """The numbers that readers expect next of a participant's writer, as a message says.
+def acknowledged(datagram: bytes, prefix: bytes, writer: int) -> list[int]:
+    """The numbers that a message's readers expect next of a writer of the participant ``prefix``.
 
     Raises RtpsError if a length leads outside.
     """
-    if destination(datagram) != meant:
+    if destination(datagram) != prefix:
         return []
-    found = []
+    numbers = []
     for kind, flags, body in submessages(datagram):
         if kind == SubmessageId.ACKNACK and body.end - body.start >= 16:
-            of = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
-            mark = "<" if flags & _LITTLE else ">"
-            base = _number(*struct.unpack_from(mark + "iI", datagram, body.start + 8))
-            found += [base] if of == writer else []
-    return found
+            acked_writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
+            order = "<" if flags & _LITTLE else ">"
+            base = _number(*struct.unpack_from(order + "iI", datagram, body.start + 8))
+            numbers += [base] if acked_writer == writer else []
+    return numbers
 
 
 def acknack(
@@ -115,36 +115,36 @@ def nack_frag(
 def withheld(sample: Sample) -> Overwrite:
     """The edit that makes a DATA or DATA_FRAG a GAP: the sample is not for this reader.
 
-    What is left of the submessage's bytes becomes a PAD, and zero. Raises RtpsError if they are too
-    few, which no sample of a reader's or writer's description is.
+    The rest of the submessage's bytes becomes a PAD, and zero. Raises RtpsError if it is too short
+    for that, which no announcement of a reader or writer is.
     """
-    mark, flag = ("<", _LITTLE) if sample.little else (">", 0)
-    size, after = sample.body.end - sample.body.start, sample.sequence + 1
+    order, flag = ("<", _LITTLE) if sample.little else (">", 0)
+    size, next_sequence = sample.body.end - sample.body.start, sample.sequence + 1
     if size < _GAP_SIZE + 4:
         raise RtpsError(f"a sample of discovery in {size} bytes")
     pad = size - _GAP_SIZE - 4
-    gap = struct.pack(mark + "BBH", SubmessageId.GAP, flag, _GAP_SIZE)
+    gap = struct.pack(order + "BBH", SubmessageId.GAP, flag, _GAP_SIZE)
     gap += struct.pack(">II", sample.reader, sample.writer)
-    for number in (sample.sequence, after):
-        gap += struct.pack(mark + "iI", number >> 32, number & 0xFFFFFFFF)
-    gap += struct.pack(mark + "IBBH", 0, SubmessageId.PAD, flag, pad)
+    for number in (sample.sequence, next_sequence):
+        gap += struct.pack(order + "iI", number >> 32, number & 0xFFFFFFFF)
+    gap += struct.pack(order + "IBBH", 0, SubmessageId.PAD, flag, pad)
     return Overwrite(sample.body.start - 4, gap + bytes(pad))
 
 
 def _directed(own: bytes, to: bytes, kind: int, flags: int, body: bytes) -> bytes:
     """A message of the proxy's own with one submessage for one participant."""
-    meant = struct.pack("<BBH", SubmessageId.INFO_DST, _LITTLE, len(to)) + to
-    return message_header(own) + meant + struct.pack("<BBH", kind, flags, len(body)) + body
+    info_dst = struct.pack("<BBH", SubmessageId.INFO_DST, _LITTLE, len(to)) + to
+    return message_header(own) + info_dst + struct.pack("<BBH", kind, flags, len(body)) + body
 
 
 def _bits(numbers: Collection[int]) -> bytes:
-    """A set of numbers from 0 on: how many bits, and these in words (9.4.2.6, 9.4.2.8)."""
-    asked = [number for number in numbers if 0 <= number < MOST_ASKED]
-    bits = max(asked, default=-1) + 1
-    words = [0] * -(-bits // 32)
-    for one in asked:
-        words[one // 32] |= 1 << (31 - one % 32)
-    return struct.pack(f"<I{len(words)}I", bits, *words)
+    """A set of numbers from 0 on: how many bits, and these in 32-bit words (9.4.2.6, 9.4.2.8)."""
+    requested = [n for n in numbers if 0 <= n < MOST_ASKED]
+    bit_count = max(requested, default=-1) + 1
+    bitmap = [0] * -(-bit_count // 32)
+    for number in requested:
+        bitmap[number // 32] |= 1 << (31 - number % 32)
+    return struct.pack(f"<I{len(bitmap)}I", bit_count, *bitmap)
 
 
 def _number(high: int, low: int) -> int:

@@ -29,12 +29,12 @@ HEADER = 20
 PREFIX = 12
 """Bytes of a GUID prefix."""
 VERSION_TO_PREFIX = HEADER - len(MAGIC)
-"""Bytes of what a header and INFO_SRC tell alike: version, vendor, GUID prefix."""
+"""Bytes of what a header and an INFO_SRC both have: version, vendor, GUID prefix."""
 MOST_SUBMESSAGES = 256
 """Submessages of a datagram that are read; real ones have a dozen."""
 
 LAST_NUMBER = 2**63 - 2
-"""The greatest sequence number that is taken, which has a next one; they begin with 1."""
+"""The greatest sequence number that is accepted: it has a next one. They begin with 1."""
 
 SENTINEL = 1
 """The id that ends a parameter list; its length means nothing."""
@@ -126,7 +126,7 @@ class Sample(msgspec.Struct, frozen=True):
 
 
 class Overwrite(msgspec.Struct, frozen=True):
-    """Other bytes at a position of a datagram, as many as were there."""
+    """Bytes at a position of a datagram that replace as many others."""
 
     at: int
     after: bytes
@@ -155,7 +155,7 @@ def source_vendor(datagram: bytes) -> bytes:
 def destination(datagram: bytes) -> bytes | None:
     """The GUID prefix of whom a message is for; None if it is for all. Raises RtpsError.
 
-    That of the first INFO_DST: what follows may be for others, who are then at the same locator.
+    The first INFO_DST counts: what follows may be for others, who are then at the same locator.
     """
     for kind, _, body in submessages(datagram):
         if kind == _INFO_DST:
@@ -165,58 +165,58 @@ def destination(datagram: bytes) -> bytes | None:
 
 
 def for_all(datagram: bytes) -> bytes:
-    """The message without the names of whom it is for: everybody takes it. Raises RtpsError."""
-    named = [body for kind, _, body in submessages(datagram) if kind == _INFO_DST]
-    return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in named])
+    """The message without its destinations, so that everybody takes it. Raises RtpsError."""
+    destinations = [body for kind, _, body in submessages(datagram) if kind == _INFO_DST]
+    return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in destinations])
 
 
 def of_built_in_writer(datagram: bytes) -> bool | None:
     """Whether a message is from or to a built-in writer, as discovery is; None if to no writer.
 
-    That of the first submessage that names one. Raises RtpsError.
+    The first submessage that names a writer counts. Raises RtpsError.
     """
     for kind, _, body in submessages(datagram):
-        at = _WRITER_AT.get(kind)
-        if at is not None:
-            _need(body, at + 4)
-            return bool(datagram[body.start + at + 3] & _BUILT_IN == _BUILT_IN)
+        offset = _WRITER_AT.get(kind)
+        if offset is not None:
+            _require_size(body, offset + 4)
+            return bool(datagram[body.start + offset + 3] & _BUILT_IN == _BUILT_IN)
     return None
 
 
 def samples(datagram: bytes) -> list[Sample]:
     """All samples in a message, in their order. Raises RtpsError if a length leads outside."""
-    found, prefix = list[Sample](), source_prefix(datagram)
+    all_samples, prefix = list[Sample](), source_prefix(datagram)
     for kind, flags, body in submessages(datagram):
         if kind == _INFO_SRC:
-            _need(body, 20)
+            _require_size(body, 20)
             prefix = datagram[body.start + 8 : body.start + 20]
         elif kind in _WITH_SAMPLE:
-            found.append(_sample(datagram, prefix, flags, body, kind == _DATA_FRAG))
-    return found
+            all_samples.append(_sample(datagram, prefix, flags, body, kind == _DATA_FRAG))
+    return all_samples
 
 
 def by_source(datagram: bytes) -> list[bytes]:
-    """The message as one for each participant that speaks in it, in their order.
+    """The message split into one for each participant that sends in it, in their order.
 
-    Cyclone DDS has the participants of a program share a message (INFO_SRC, 8.3.8.9). Whom it is
-    meant for stays so until another is named. Raises RtpsError if a length leads outside.
+    Cyclone DDS has the participants of a program share a message (INFO_SRC, 8.3.8.9). A destination
+    holds until another one is named. Raises RtpsError if a length leads outside.
     """
     source_prefix(datagram)
-    head, at, meant = datagram[:HEADER], HEADER, b""
-    found = list[bytes]()
+    header, start, info_dst = datagram[:HEADER], HEADER, b""
+    messages = list[bytes]()
     for kind, _, body in submessages(datagram):
         if kind == _INFO_SRC:
-            _need(body, 4 + VERSION_TO_PREFIX)
-            if body.start - 4 > at:
-                found.append(head + datagram[at : body.start - 4])
-            source = body.start + 4
-            head = MAGIC + datagram[source : source + VERSION_TO_PREFIX] + meant
-            at = body.end
+            _require_size(body, 4 + VERSION_TO_PREFIX)
+            if body.start - 4 > start:
+                messages.append(header + datagram[start : body.start - 4])
+            source_offset = body.start + 4
+            header = MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX] + info_dst
+            start = body.end
         elif kind == _INFO_DST:
-            meant = datagram[body.start - 4 : body.end]
-    if not found and at == HEADER:
+            info_dst = datagram[body.start - 4 : body.end]
+    if not messages and start == HEADER:
         return [datagram]
-    return [*found, head + datagram[at:]] if at < len(datagram) else found
+    return [*messages, header + datagram[start:]] if start < len(datagram) else messages
 
 
 def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
@@ -233,67 +233,67 @@ def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
 def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
     """Each submessage's id, flags and body.
 
-    Raises RtpsError if a length leads outside, or one that says for whom the next are is too short:
-    what is kept of a message can be read again later.
+    Raises RtpsError if a length leads outside, or an INFO_DST is too short: so what is kept of a
+    message can be read again later.
     """
-    at, count, size = HEADER, 0, len(datagram)
-    while at < size:
-        body = at + 4
+    offset, count, size = HEADER, 0, len(datagram)
+    while offset < size:
+        body = offset + 4
         if body > size:
             raise RtpsError("the message ends inside a submessage's header")
         if (count := count + 1) > MOST_SUBMESSAGES:
             raise RtpsError(f"more than {MOST_SUBMESSAGES} submessages")
-        kind, flags, first, second = datagram[at:body]
+        kind, flags, first, second = datagram[offset:body]
         length = first + (second << 8) if flags & _LITTLE else (first << 8) + second
-        at = body + length
+        offset = body + length
         if length == 0 and kind not in _MAY_BE_EMPTY:
-            at = size  # the last one may say so (9.4.5.1.3)
-        if at > size:
+            offset = size  # the last one may say so (9.4.5.1.3)
+        if offset > size:
             raise RtpsError(f"submessage {kind:#x} is longer than the message")
-        if kind == _INFO_DST and at - body < PREFIX:
-            raise RtpsError(f"a destination of {at - body} bytes needs {PREFIX}")
-        yield kind, flags, Span(body, at)
+        if kind == _INFO_DST and offset - body < PREFIX:
+            raise RtpsError(f"a destination of {offset - body} bytes needs {PREFIX}")
+        yield kind, flags, Span(body, offset)
 
 
-def walk_parameters(datagram: bytes, within: Span, little: bool) -> Iterator[tuple[int, int, int]]:
+def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple[int, int, int]]:
     """Each parameter of a list: its id, where that stands, and where its value ends.
 
     The last is the sentinel, which ends with its header. Raises RtpsError if there is none, a
     length leads outside, or there are too many.
     """
     unpack = (_LITTLE_HEADER if little else _BIG_HEADER).unpack_from
-    at, last = within.start, within.end - 4
+    offset, last = span.start, span.end - 4
     for _ in range(MOST_PARAMETERS):
-        if at > last:
+        if offset > last:
             raise RtpsError("a parameter list without an end")
-        pid, length = unpack(datagram, at)
+        pid, length = unpack(datagram, offset)
         if pid == SENTINEL:
-            yield pid, at, at + 4
+            yield pid, offset, offset + 4
             return
-        end = at + 4 + length
-        if end > within.end:
+        end = offset + 4 + length
+        if end > span.end:
             raise RtpsError(f"parameter {pid:#x} is longer than its list")
-        yield pid, at, end
-        at = end
+        yield pid, offset, end
+        offset = end
     raise RtpsError(f"a list of more than {MOST_PARAMETERS} parameters")
 
 
 def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment: bool) -> Sample:
-    fixed = 32 if is_fragment else 20
-    _need(body, fixed)
+    fixed_size = 32 if is_fragment else 20
+    _require_size(body, fixed_size)
     start, little = body.start, bool(flags & _LITTLE)
     to_qos = _unpack("H", datagram, start + 2, flags)
     high, low = _unpack("i", datagram, start + 12, flags), _unpack("I", datagram, start + 16, flags)
     sequence = (high << 32) + low
     if not 0 < sequence <= LAST_NUMBER:
         raise RtpsError(f"a sample with the number {sequence}")
-    at = start + 4 + to_qos
-    if not start + fixed <= at <= body.end:
+    offset = start + 4 + to_qos
+    if not start + fixed_size <= offset <= body.end:
         raise RtpsError(f"inline QoS {to_qos} octets on, which is outside of the submessage")
     qos = None
     if flags & _QOS:
-        *_, (_, _, end) = walk_parameters(datagram, Span(at, body.end), little)
-        qos, at = Span(at, end), end
+        *_, (_, _, end) = walk_parameters(datagram, Span(offset, body.end), little)
+        qos, offset = Span(offset, end), end
     key = bool(flags & (_FRAGMENT_KEY if is_fragment else _KEY))
     has_payload = is_fragment or bool(flags & (_DATA | _KEY))
     return Sample(
@@ -304,26 +304,26 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
         little=little,
         body=body,
         inline_qos=qos,
-        payload=Span(at, body.end) if has_payload and at < body.end else None,
+        payload=Span(offset, body.end) if has_payload and offset < body.end else None,
         key=key,
         fragments=_fragments(datagram, start + 20, flags) if is_fragment else None,
     )
 
 
-def _fragments(datagram: bytes, at: int, flags: int) -> Fragments:
+def _fragments(datagram: bytes, offset: int, flags: int) -> Fragments:
     return Fragments(
-        _unpack("I", datagram, at, flags),
-        _unpack("H", datagram, at + 4, flags),
-        _unpack("H", datagram, at + 6, flags),
-        _unpack("I", datagram, at + 8, flags),
+        _unpack("I", datagram, offset, flags),
+        _unpack("H", datagram, offset + 4, flags),
+        _unpack("H", datagram, offset + 6, flags),
+        _unpack("I", datagram, offset + 8, flags),
     )
 
 
-def _need(body: Span, size: int) -> None:
+def _require_size(body: Span, size: int) -> None:
     if body.end - body.start < size:
         raise RtpsError(f"a submessage of {body.end - body.start} bytes needs {size}")
 
 
-def _unpack(form: str, datagram: bytes, at: int, flags: int) -> int:
-    found: int = struct.unpack_from(("<" if flags & _LITTLE else ">") + form, datagram, at)[0]
-    return found
+def _unpack(form: str, datagram: bytes, offset: int, flags: int) -> int:
+    number: int = struct.unpack_from(("<" if flags & _LITTLE else ">") + form, datagram, offset)[0]
+    return number

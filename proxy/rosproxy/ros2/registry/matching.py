@@ -1,12 +1,11 @@
-"""Who matches whom: the rule of DDS by which a writer and a reader of a topic find together.
+"""Which writer and reader of a topic match, by the rule of DDS.
 
 A writer *offers* and a reader *requests* (DDS 1.4, 2.2.3): they match where the topic and the type
 are the same, both have a partition in common, and of each policy no less is offered than requested.
-Both sides decide it by themselves, and none is told by the other, so that a mismatch looks like
-silence. What is looked at here are pairs of one inside and one outside: all others don't pass the
-proxy.
+Both sides decide it by themselves, and neither tells the other, so that a mismatch looks like
+silence. Only pairs of one inside and one outside are looked at: no others pass the proxy.
 
-Types are compared by their names, as ROS 2 has them: one of another definition has the same name.
+Types are compared by their names, as ROS 2 has them: another definition has the same name.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -47,42 +46,44 @@ class MismatchedPair(msgspec.Struct, frozen=True):
 
 def mismatch(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
     """The first reason for which a writer and a reader of a topic don't match; None if they do."""
-    return next((found for rule in _RULES if (found := rule(writer, reader))), None)
+    return next((reason for rule in _RULES if (reason := rule(writer, reader))), None)
 
 
 def mismatched_pairs(
     inside: Iterable[Participant], outside: Iterable[Participant]
 ) -> list[MismatchedPair]:
-    """All that have a topic in common across the boundary, and don't match.
+    """The pairs of a topic that don't match, one of them inside and one outside.
 
-    The same reason between the same two is there once for each topic or service.
+    Each mismatch of the same two participants is there once for each topic or service.
     """
-    there: dict[str, list[tuple[Participant, DdsEndpoint]]] = {}
-    for participant, end in _endpoints(outside):
-        there.setdefault(end.topic, []).append((participant, end))
+    outside_by_topic: dict[str, list[tuple[Participant, DdsEndpoint]]] = {}
+    for participant, endpoint in _endpoints(outside):
+        outside_by_topic.setdefault(endpoint.topic, []).append((participant, endpoint))
     pairs = (
-        (here, end, other, far)
-        for here, end in _endpoints(inside)
-        for other, far in there.get(end.topic, ())
+        (insider, endpoint, outsider, outer_endpoint)
+        for insider, endpoint in _endpoints(inside)
+        for outsider, outer_endpoint in outside_by_topic.get(endpoint.topic, ())
     )
-    found: dict[tuple[str, bytes, bytes, str], MismatchedPair] = {}
-    for here, end, other, far in islice(pairs, MOST_COMPARED):
-        if end.kind is far.kind:
+    mismatched: dict[tuple[str, bytes, bytes, str], MismatchedPair] = {}
+    for insider, endpoint, outsider, outer_endpoint in islice(pairs, MOST_COMPARED):
+        if endpoint.kind is outer_endpoint.kind:
             continue
-        sides = (here, end), (other, far)
-        (source, writer), (sink, reader) = sides if end.kind is EndpointKind.WRITER else sides[::-1]
-        why = mismatch(writer, reader)
-        if why:
-            name = ros_name(end.topic)
-            key = name, here.prefix, other.prefix, why.policy
-            found.setdefault(key, MismatchedPair(why, end.topic, source, sink))
-    return list(found.values())
+        pair = (insider, endpoint), (outsider, outer_endpoint)
+        (source, writer), (sink, reader) = (
+            pair if endpoint.kind is EndpointKind.WRITER else pair[::-1]
+        )
+        reason = mismatch(writer, reader)
+        if reason:
+            name = ros_name(endpoint.topic)
+            key = name, insider.prefix, outsider.prefix, reason.policy
+            mismatched.setdefault(key, MismatchedPair(reason, endpoint.topic, source, sink))
+    return list(mismatched.values())
 
 
 def _endpoints(side: Iterable[Participant]) -> Iterator[tuple[Participant, DdsEndpoint]]:
-    """The readers and writers of a side, those of a kind once."""
-    found = ((one, end) for one in side for end in dict.fromkeys(one.endpoints.values()))
-    return islice(found, MOST_LOOKED_AT)
+    """The readers and writers of a side; equal ones of a participant count as one."""
+    endpoints = ((p, e) for p in side for e in dict.fromkeys(p.endpoints.values()))
+    return islice(endpoints, MOST_LOOKED_AT)
 
 
 def _type(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
@@ -92,24 +93,24 @@ def _type(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _partition(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    """Whether they have no partition in common; without any they are in the one without a name."""
-    mine, theirs = writer.qos.partitions, reader.qos.partitions
-    if mine is None or theirs is None:
+    """Whether they have no partition in common; the default is the partition with an empty name."""
+    offered, requested = writer.qos.partitions, reader.qos.partitions
+    if offered is None or requested is None:
         return None
-    if any(_same_partition(*pair) for pair in product(mine or ("",), theirs or ("",))):
+    if any(_same_partition(*pair) for pair in product(offered or ("",), requested or ("",))):
         return None
-    return Mismatch("partition", " ".join(mine) or "none", " ".join(theirs) or "none")
+    return Mismatch("partition", " ".join(offered) or "none", " ".join(requested) or "none")
 
 
-def _same_partition(one: str, other: str) -> bool:
-    """Whether two names of partitions mean the same; either may have wildcards, as file names have.
+def _same_partition(offered: str, requested: str) -> bool:
+    """Whether two names of partitions match; either may have wildcards, as file names have.
 
-    Two that both have match only if they are the same (2.2.3.13).
+    If both have some, they match only if they are the same (2.2.3.13).
     """
-    wild = [bool(_WILDCARDS & {*name}) for name in (one, other)]
+    wild = [bool(_WILDCARDS & {*name}) for name in (offered, requested)]
     if wild[0] == wild[1]:
-        return one == other
-    name, pattern = (other, one) if wild[0] else (one, other)
+        return offered == requested
+    name, pattern = (requested, offered) if wild[0] else (offered, requested)
     return fnmatchcase(name, pattern)
 
 
@@ -120,8 +121,8 @@ def _reliability(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _durability(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    mine, theirs = writer.qos.durability, reader.qos.durability
-    return Mismatch("durability", mine.name, theirs.name) if mine < theirs else None
+    offered, requested = writer.qos.durability, reader.qos.durability
+    return Mismatch("durability", offered.name, requested.name) if offered < requested else None
 
 
 def _deadline(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
@@ -129,9 +130,9 @@ def _deadline(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _liveliness(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    mine: Liveliness = writer.qos.liveliness
-    theirs: Liveliness = reader.qos.liveliness
-    return Mismatch("liveliness", mine.name, theirs.name) if mine < theirs else None
+    offered: Liveliness = writer.qos.liveliness
+    requested: Liveliness = reader.qos.liveliness
+    return Mismatch("liveliness", offered.name, requested.name) if offered < requested else None
 
 
 def _liveliness_lease(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
@@ -142,27 +143,30 @@ def _liveliness_lease(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | No
 def _ownership(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
     if writer.qos.exclusive == reader.qos.exclusive:
         return None
-    words = "SHARED", "EXCLUSIVE"
-    return Mismatch("ownership", words[writer.qos.exclusive], words[reader.qos.exclusive])
+    names = "SHARED", "EXCLUSIVE"
+    return Mismatch("ownership", names[writer.qos.exclusive], names[reader.qos.exclusive])
 
 
 def _representation(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    """Whether a reader does not take what a writer writes: the first that it tells (XTypes 1.3)."""
-    mine, theirs = writer.qos.representations or (_XCDR,), reader.qos.representations or (_XCDR,)
-    if mine[0] in theirs:
+    """Whether a reader does not take what a writer writes: its first kind (XTypes 1.3)."""
+    offered, requested = (
+        writer.qos.representations or (_XCDR,),
+        reader.qos.representations or (_XCDR,),
+    )
+    if offered[0] in requested:
         return None
-    shown = [_REPRESENTATIONS.get(one, str(one)) for one in (mine[0], *theirs)]
-    return Mismatch("data representation", shown[0], " ".join(shown[1:]))
+    names = [_REPRESENTATIONS.get(kind, str(kind)) for kind in (offered[0], *requested)]
+    return Mismatch("data representation", names[0], " ".join(names[1:]))
 
 
 def _longer(policy: str, offered: float, requested: float) -> Mismatch | None:
-    """Whether a writer promises something less often than a reader wants it."""
+    """Whether the period that a writer offers is longer than the one that a reader requests."""
     if offered <= requested:
         return None
-    return Mismatch(policy, *(_shown(one) for one in (offered, requested)))
+    return Mismatch(policy, *(_seconds_text(seconds) for seconds in (offered, requested)))
 
 
-def _shown(seconds: float) -> str:
+def _seconds_text(seconds: float) -> str:
     return "infinite" if seconds == float("inf") else f"{seconds:g} s"
 
 

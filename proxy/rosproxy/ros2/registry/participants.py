@@ -27,7 +27,7 @@ VENDORS = {
     b"\x01\x14": "Dust DDS",
 }
 """Names of implementations, by the vendor id in each message's header (OMG's list). Zero stands for
-none; the participants that proxies have themselves say so."""
+none; a proxy's own participants have it."""
 MOST_ENDPOINTS, MOST_ENDPOINTS_HERE, MOST_ENDPOINTS_IN_ALL = 2048, 8192, 65_536
 """Readers and writers that are remembered, which is for the status alone: of a participant, at an
 address, on a side."""
@@ -112,10 +112,10 @@ class Lease:
 
     def sample(self, now: float) -> None:
         """Compute the rate since the last sample; ``now`` is in seconds."""
-        before, passed = self._sampled
+        last_time, last_bytes = self._sampled
         self._sampled = now, self.bytes
-        if before and now > before:
-            self.rate = round((self.bytes - passed) / (now - before), 1)
+        if last_time and now > last_time:
+            self.rate = round((self.bytes - last_bytes) / (now - last_time), 1)
 
     def note_passed(self, size: int) -> None:
         """Count a datagram of so many bytes that is passed on."""
@@ -145,7 +145,7 @@ class Participant:
     @property
     def guid_prefix(self) -> str:
         """The GUID prefix as tools of DDS print it."""
-        return ".".join(f"{one:02x}" for one in self.prefix)
+        return ".".join(f"{byte:02x}" for byte in self.prefix)
 
     @property
     def vendor_name(self) -> str:
@@ -160,29 +160,29 @@ class EndpointNotes:
     here: Counter[str] = field(default_factory=Counter)
     total: int = 0
 
-    def note(self, of: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
+    def note(self, participant: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
         """Remember a reader or writer; with None, that it has ended."""
-        if of.endpoints.pop(entity, None) is not None:
-            self._count(of.address, -1)
-        if endpoint is not None and self._has_room(of):
-            of.endpoints[entity] = endpoint
-            self._count(of.address, 1)
+        if participant.endpoints.pop(entity, None) is not None:
+            self._count(participant.address, -1)
+        if endpoint is not None and self._has_room(participant):
+            participant.endpoints[entity] = endpoint
+            self._count(participant.address, 1)
 
-    def forget(self, of: Participant) -> None:
+    def forget(self, participant: Participant) -> None:
         """Forget those of a participant that has gone."""
-        self._count(of.address, -len(of.endpoints))
-        of.endpoints.clear()
+        self._count(participant.address, -len(participant.endpoints))
+        participant.endpoints.clear()
 
-    def _has_room(self, of: Participant) -> bool:
+    def _has_room(self, participant: Participant) -> bool:
         return (
-            len(of.endpoints) < MOST_ENDPOINTS
-            and self.here[of.address] < MOST_ENDPOINTS_HERE
+            len(participant.endpoints) < MOST_ENDPOINTS
+            and self.here[participant.address] < MOST_ENDPOINTS_HERE
             and self.total < MOST_ENDPOINTS_IN_ALL
         )
 
-    def _count(self, address: str, more: int) -> None:
-        self.total += more
-        self.here[address] += more
+    def _count(self, address: str, change: int) -> None:
+        self.total += change
+        self.here[address] += change
         if not self.here[address]:
             del self.here[address]
 
@@ -191,11 +191,11 @@ class EndpointNotes:
 class InsideParticipant(Participant):
     """A participant inside, with a port of the range for each of its locators.
 
-    ``verdicts`` are what the policy has said, of topics and services of its own and of others' that
-    it was to be told of: whether they are allowed. ``near`` is the proxy's address on its network;
-    ``is_in_group``: it was heard there by multicast. ``announced`` is when outside was told of it
-    last. `Partings` has the rest: since when it is to be parted from all outside, or None; until
-    when it is, or None; and when it was last told to forget whom outside, None if it never was.
+    ``verdicts``: whether the policy allows a topic or service, by rule; of its own endpoints and of
+    those outside that it was to be told of. ``near`` is the proxy's address on its network;
+    ``is_in_group``: it was heard there by multicast. ``announced`` is when outside was last told of
+    it. `Partings` sets the rest, None if it does not apply: since when it waits to be parted from
+    outside; until when it is apart; when it was last told to forget each one outside, by prefix.
     """
 
     verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
@@ -222,16 +222,16 @@ class OutsideParticipant(Participant):
     """A participant outside, with a stand-in for each locator that inside does not reach by itself.
 
     Until it is ``proven`` that it gets what is sent to it, it is sent no more bytes than came from
-    it: ``credit`` are those that are left.
+    it; ``credit`` is how many are left.
     """
 
     proven: bool = False
     credit: int = 0
 
-    def note_sent(self, datagram: bytes, meant: bytes) -> None:
-        """Note that it has sent something; by naming whom it means it proves itself. RtpsError."""
+    def note_sent(self, datagram: bytes, addressee: bytes) -> None:
+        """Note what it has sent; a message to ``addressee`` proves that it gets ours. RtpsError."""
         self.credit += len(datagram)
-        if not self.proven and destination(datagram) == meant:
+        if not self.proven and destination(datagram) == addressee:
             self.proven = True
 
     def may_be_sent(self, size: int) -> bool:
@@ -260,16 +260,16 @@ class ParticipantTable(Generic[Someone]):
 
     def at(self, prefix: bytes, source: str) -> Someone | None:
         """The participant with a prefix, if it is at the address that a datagram came from."""
-        known = self.by_prefix.get(prefix)
-        return known if known is not None and known.address == source else None
+        participant = self.by_prefix.get(prefix)
+        return participant if participant is not None and participant.address == source else None
 
     def add(self, participant: Someone) -> None:
-        """Take in one that has come."""
+        """Add a participant that has come."""
         self.by_prefix[participant.prefix] = participant
         self.here[participant.address] += 1
 
     def remove(self, participant: Someone) -> None:
-        """Forget one that has gone."""
+        """Forget a participant that has gone."""
         del self.by_prefix[participant.prefix]
         self.notes.forget(participant)
         self.here[participant.address] -= 1

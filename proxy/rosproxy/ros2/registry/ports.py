@@ -2,10 +2,10 @@
 
 The order in which ports are tried follows from the participant's GUID prefix and from the locator.
 So a proxy that has lost all memory gives the same ports again, unless two participants want the
-same one first: then it counts who came first, which a new process can't know. But outside goes on
-sending to the ports that it was told, and names whom it means (INFO_DST). So no port is given in
-the first second, and then first to those who are meant there; next to who says himself that he had
-it (`rosproxy.ros2.discovery.keeper`), which is anybody's word.
+same one first: then who came first has it, which a new process can't know. But outside goes on
+sending to the ports that it was told, and names the participant that it means (INFO_DST). So no
+port is given in the first second. Then a port goes first to the participant that was named there,
+next to one that says itself that it had it (`rosproxy.ros2.discovery.keeper`), as anybody may.
 What the kernel forwards does not come here; but its table is what a former process has left there,
 and tells which port led to which locator.
 """
@@ -26,9 +26,9 @@ TRIES = 32
 MOST_SHARING = 4
 """Locators outside that one port may stand for."""
 SETTLING = 1.0
-"""Seconds from the start in which no port is given, to hear first who is meant where."""
+"""Seconds from the start in which no port is given, to hear first whom outside means by each."""
 REMEMBERED = 30.0
-"""Seconds from the start in which a port is rather given to who had it before."""
+"""Seconds from the start in which a port is rather given to the participant that had it before."""
 
 
 def order_for(key: str, ports: PortRange) -> Iterator[int]:
@@ -43,7 +43,7 @@ class LocatorPorts:
 
     def __init__(self, pool: PortPool, started: float) -> None:
         self.pool, self._started = pool, started
-        self._meant: dict[int, tuple[bytes, LeaseKind]] = {}
+        self._former_users: dict[int, tuple[bytes, LeaseKind]] = {}
         self._forwarded: dict[int, HostPort] = {}
 
     def settled(self, now: float) -> bool:
@@ -51,55 +51,50 @@ class LocatorPorts:
         return now - self._started >= SETTLING
 
     def remembers(self, now: float) -> bool:
-        """Whether somebody may be there who had ports before the start."""
+        """Whether there may still be participants that had ports before the start."""
         return now - self._started < REMEMBERED
 
     def note_use(self, port: int, datagram: bytes, now: float) -> None:
-        """Note whom outside means by what it sends to a port that nobody has. Raises RtpsError."""
-        meant, built_in = destination(datagram), of_built_in_writer(datagram)
-        if meant is not None and built_in is not None:
-            kind = LeaseKind.METATRAFFIC if built_in else LeaseKind.DATA
-            self.note_meant(port, meant, kind, now)
+        """Note whom a datagram from outside is for, at a port that nobody has. Raises RtpsError."""
+        prefix, is_built_in = destination(datagram), of_built_in_writer(datagram)
+        if prefix is not None and is_built_in is not None:
+            kind = LeaseKind.METATRAFFIC if is_built_in else LeaseKind.DATA
+            self.note_meant(port, prefix, kind, now)
 
     def note_meant(self, port: int, prefix: bytes, kind: LeaseKind, now: float) -> None:
         """Note that a participant had a port."""
         if self.remembers(now) and port in self.pool.range:
-            self._meant[port] = prefix, kind
+            self._former_users[port] = prefix, kind
 
     def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
         """Note what the kernel was told to forward before the start, by port."""
-        self._forwarded = {p: where for p, where in forwards.items() if p in self.pool.range}
+        self._forwarded = {p: locator for p, locator in forwards.items() if p in self.pool.range}
 
     def take(
-        self,
-        prefix: bytes,
-        where: HostPort,
-        kind: LeaseKind,
-        now: float,
-        had: int | None = None,
+        self, prefix: bytes, locator: HostPort, kind: LeaseKind, now: float, had: int | None = None
     ) -> int | None:
         """A port for a locator of a participant; None if all are taken.
 
-        ``had`` is the one that the participant itself says that it had.
+        ``had`` is the port that the participant itself says that it had.
         """
         if not self.remembers(now):
-            self._meant.clear()
+            self._former_users.clear()
             self._forwarded.clear()
         if not self.pool.free:
             return None
-        mine = prefix, kind
+        user = prefix, kind
 
-        def merit(port: int) -> int:
-            if (former := self._forwarded.get(port)) is not None:
-                return 0 if former == where and kind is LeaseKind.DATA else 3
-            meant = self._meant.get(port)
-            if meant is None:
+        def rank(port: int) -> int:
+            if (former_locator := self._forwarded.get(port)) is not None:
+                return 0 if former_locator == locator and kind is LeaseKind.DATA else 3
+            former_user = self._former_users.get(port)
+            if former_user is None:
                 return 1 if port == had else 2
-            return 0 if meant == mine else 3
+            return 0 if former_user == user else 3
 
-        order = sorted(order_for(f"{prefix.hex()} {where}", self.pool.range), key=merit)
+        order = sorted(order_for(f"{prefix.hex()} {locator}", self.pool.range), key=rank)
         port = next(filter(self.pool.claim, order), None)
-        self._meant.pop(port or 0, None)
+        self._former_users.pop(port or 0, None)
         self._forwarded.pop(port or 0, None)
         return port
 
@@ -108,13 +103,13 @@ class LocatorPorts:
         self.pool.give_back(port)
 
 
-def stand_in_port(key: str, users: Callable[[int], int], held: Callable[[int], bool]) -> int | None:
+def stand_in_port(key: str, users: Callable[[int], int], busy: Callable[[int], bool]) -> int | None:
     """A port for a locator outside; None if there are too many of them.
 
-    ``users`` tells how many a port stands for already. It may be several: so the port follows from
-    the locator alone, whoever else there is, and a proxy that starts again has the same for it.
-    Each of them gets what is meant for the others as well, and skips it, as with multicast.
-    ``held`` tells which ports can't be had; they are no tries, as a range of them may be long.
+    ``users`` tells how many locators a port stands for already. It may be several: so the port
+    follows from the locator alone, and a proxy that starts again chooses the same. Each of these
+    gets what is meant for the others as well, and skips it, as with multicast.
+    ``busy`` tells which ports can't be had; they don't count as tries, as there may be many.
     """
-    order = (port for port in order_for(key, STAND_INS) if not held(port))
+    order = (port for port in order_for(key, STAND_INS) if not busy(port))
     return next((port for port in islice(order, TRIES) if users(port) < MOST_SHARING), None)

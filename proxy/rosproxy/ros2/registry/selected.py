@@ -1,9 +1,9 @@
 """Which addresses inside are let in, where an operator says so.
 
-Whoever is on an inside network is heard, also who did not ask for a proxy. An operator tells which
-addresses are those of containers that did. Until it has, all are let in; but where one is to be
-expected, what they announce is held back for some seconds. What one announces that is not selected
-(yet) is held too, since its container may be known in a moment.
+Participants of all containers on an inside network are heard, also of those that did not ask for a
+proxy. An operator tells the addresses of those that did. Until it has, all are let in; but where an
+operator is expected, announcements are first held back for some seconds. Those of an address that
+is not selected (yet) are held too, since the operator may select it in a moment.
 """
 
 from collections.abc import Iterable
@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 from rosproxy.ros2.protocol.rtps import source_prefix
 
 NEWS_TIMEOUT = 3.0
-"""Seconds from the start that an operator has for its first word."""
+"""Seconds from the start that an operator has to tell the first time."""
 MOST_HELD, MOST_HELD_EACH, LONGEST_HELD = 256, 8, 8192
 """Addresses of which announcements are held, participants at each, and bytes of each."""
 
 
 @dataclass(slots=True)
 class SelectedAddresses:
-    """Lets addresses in. ``until``: when all are let in if no operator has told any till then.
+    """Which addresses are let in: ``told``, or from ``until`` on all, if no operator has told any.
 
     ``held`` are the last announcements of each address that is not let in, by GUID prefix.
     """
@@ -37,17 +37,17 @@ class SelectedAddresses:
         return now >= self.until if self.told is None else address in self.told
 
     def hold(self, address: str, datagram: bytes) -> None:
-        """Keep what an address announces that is not let in. Raises RtpsError."""
+        """Keep an announcement from an address that is not let in. Raises RtpsError."""
         prefix = source_prefix(datagram)
         if len(datagram) > LONGEST_HELD:
             return
         if address not in self.held and len(self.held) >= MOST_HELD:
             del self.held[next(iter(self.held))]
-        mine = self.held.setdefault(address, {})
-        if prefix in mine or len(mine) < MOST_HELD_EACH:
-            mine[prefix] = datagram
+        by_prefix = self.held.setdefault(address, {})
+        if prefix in by_prefix or len(by_prefix) < MOST_HELD_EACH:
+            by_prefix[prefix] = datagram
 
     def released(self, now: float) -> list[tuple[str, bytes]]:
-        """What was held of addresses that are let in now; it is held no more."""
-        free = [address for address in self.held if self.admits(address, now)]
-        return [(one, datagram) for one in free for datagram in self.held.pop(one).values()]
+        """Announcements held of addresses that are let in now, each with its address."""
+        admitted = [address for address in self.held if self.admits(address, now)]
+        return [(a, datagram) for a in admitted for datagram in self.held.pop(a).values()]

@@ -1,12 +1,12 @@
-"""DDS discovery: who says what of itself, and its locators led elsewhere.
+"""DDS discovery: what participants say of themselves, with their locators led elsewhere.
 
 Participants find each other by SPDP and tell each other of their readers and writers by SEDP. Both
 are samples of built-in writers, known by their entity ids (DDSI-RTPS 2.5, 8.5 and 9.3.1.2), whose
-payload is a parameter list. What an *announcement* says goes on as it is but for its locators:
-each that a participant can be reached at is led elsewhere, and all others are taken out. These are
-multicast ones, which end at the next router, and those of transports that can't be passed on
-(shared memory). One that is to be hidden goes on as a GAP, so that its reader does not ask for it
-again and again.
+payload is a parameter list. An *announcement* goes on as it is but for its locators: each that a
+participant can be reached at is led elsewhere, and all others are taken out. These are multicast
+ones, which end at the next router, and those of transports that can't be passed on (shared memory).
+An announcement that is to be hidden goes on as a GAP, so that its reader does not ask for it again
+and again.
 """
 
 from collections.abc import Callable, Iterator
@@ -47,7 +47,7 @@ MULTICAST = (
 )
 _DISPOSED_OR_UNREGISTERED = 0x03
 LONGEST_OF_PARTICIPANT = 8192
-"""Bytes of a datagram in which a participant announces itself, which is kept; some have 1,500."""
+"""Bytes of a datagram in which a participant announces itself; it is kept. Some have 1,500."""
 LONGEST_TOPIC = 1024
 """Bytes of a topic's name; those of ROS 2 have 255."""
 
@@ -68,14 +68,14 @@ _KINDS = {
 }
 
 Lead = Callable[[int, HostPort], HostPort | None]
-"""Where a locator is to lead, given its parameter's id and where it leads; None: take it out."""
+"""Where a locator is to lead, by its parameter's id and where it leads; None: take it out."""
 
 
 class Announcement(msgspec.Struct, frozen=True):
     """What a participant says of itself, or of one of its readers or writers.
 
-    ``held`` are the parameters; none if it only tells an end. ``in_front`` are those of the inline
-    QoS. ``ended``: it is disposed of, or unregistered.
+    ``held`` are the payload's parameters; none if it only tells an end. ``in_front`` are those of
+    the inline QoS. ``ended``: what it is about is disposed of, or unregistered.
     """
 
     writer: BuiltinWriter
@@ -96,27 +96,27 @@ class Announcement(msgspec.Struct, frozen=True):
     def endpoint(self, datagram: bytes) -> bytes | None:
         """The entity id of the reader or writer that it is about; None if it does not say.
 
-        What has ended is told by its key, in the payload or in front of it (9.6.3.8).
+        One that has ended is named by its key, in the payload or in the inline QoS (9.6.3.8).
         """
-        for held in (self.held, self.in_front):
-            for one in held.all(Pid.ENDPOINT_GUID, Pid.KEY_HASH) if held else ():
-                if one.value.end - one.value.start >= 16:
-                    return datagram[one.value.start + 12 : one.value.start + 16]
+        for parameters in (self.held, self.in_front):
+            for parameter in parameters.all(Pid.ENDPOINT_GUID, Pid.KEY_HASH) if parameters else ():
+                if parameter.value.end - parameter.value.start >= 16:
+                    return datagram[parameter.value.start + 12 : parameter.value.start + 16]
         return None
 
     def reached_at(self, datagram: bytes) -> Iterator[tuple[int, HostPort]]:
         """The unicast locators of UDP, each with its parameter's id."""
         for parameter in self.held.all(*UNICAST):
             locator = read_locator(datagram, self.held, parameter)
-            where = locator.where if locator else None
-            if where:
-                yield parameter.pid, where
+            host_port = locator.where if locator else None
+            if host_port:
+                yield parameter.pid, host_port
 
 
 class DiscoveryMessage(msgspec.Struct, frozen=True):
     """A message of a participant's, and what it announces of itself there.
 
-    ``fragments`` are parts of announcements, which are read once these are whole.
+    ``fragments`` are parts of announcements, which are read once they are whole.
     """
 
     datagram: bytes
@@ -127,27 +127,25 @@ class DiscoveryMessage(msgspec.Struct, frozen=True):
     @property
     def of_participant(self) -> Announcement | None:
         """What the participant says of itself, the last of it; None if nothing (SPDP)."""
-        told = (
-            one for one in reversed(self.announcements) if one.writer is BuiltinWriter.PARTICIPANTS
-        )
-        return next(told, None)
+        spdp = (a for a in reversed(self.announcements) if a.writer is BuiltinWriter.PARTICIPANTS)
+        return next(spdp, None)
 
 
 def read_discovery(datagram: bytes) -> DiscoveryMessage:
     """What a datagram announces.
 
-    Raises RtpsError if it or an announcement is malformed, or is another participant's than the one
-    that sends it.
+    Raises RtpsError if it or an announcement is malformed, or is of another participant than the
+    sender.
     """
     prefix = source_prefix(datagram)
-    found = [sample for sample in samples(datagram) if sample.writer in _BUILTIN_WRITERS]
-    if any(sample.prefix != prefix for sample in found):
+    builtin_samples = [sample for sample in samples(datagram) if sample.writer in _BUILTIN_WRITERS]
+    if any(sample.prefix != prefix for sample in builtin_samples):
         raise RtpsError("it announces another participant than the one that sends it")
     message = DiscoveryMessage(
         datagram,
         prefix,
-        tuple(_announcement(datagram, sample) for sample in found if sample.fragments is None),
-        tuple((sample, sample.fragments) for sample in found if sample.fragments is not None),
+        tuple(_announcement(datagram, s) for s in builtin_samples if s.fragments is None),
+        tuple((s, s.fragments) for s in builtin_samples if s.fragments is not None),
     )
     if len(datagram) > LONGEST_OF_PARTICIPANT and message.of_participant is not None:
         raise RtpsError(f"a participant's announcement in {len(datagram)} bytes")
@@ -162,48 +160,48 @@ def rewritten(
     Raises ValueError if ``lead`` gives a host that is no address.
     """
     edits = list[Overwrite]()
-    for one in message.announcements:
-        if is_hidden(one):
-            edits.append(withheld(one.sample))
+    for announcement in message.announcements:
+        if is_hidden(announcement):
+            edits.append(withheld(announcement.sample))
         else:
-            edits += _edits(message.datagram, one.held, lead)
+            edits += _edits(message.datagram, announcement.held, lead)
     return apply(message.datagram, edits)
 
 
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:
-    held, in_front = payload_parameters(datagram, sample), inline_parameters(datagram, sample)
-    ended = sample.key or _tells_an_end(datagram, in_front)
-    if held is None and not ended:
+    parameters, inline = payload_parameters(datagram, sample), inline_parameters(datagram, sample)
+    ended = sample.key or _tells_an_end(datagram, inline)
+    if parameters is None and not ended:
         raise RtpsError("an announcement that is no parameter list")
-    held = held or ParameterList(sample.little, ())
-    topics = held.all(Pid.TOPIC_NAME)
+    parameters = parameters or ParameterList(sample.little, ())
+    topics = parameters.all(Pid.TOPIC_NAME)
     if len(topics) > 1:  # who reads which of them?
         raise RtpsError("an announcement that names more than one topic")
     if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC:
         raise RtpsError(f"a topic with a name of more than {LONGEST_TOPIC} bytes")
-    return Announcement(BuiltinWriter(sample.writer), sample, held, in_front, ended)
+    return Announcement(BuiltinWriter(sample.writer), sample, parameters, inline, ended)
 
 
-def _tells_an_end(datagram: bytes, found: ParameterList | None) -> bool:
-    """Whether the status in front of a sample says that what it is about has ended (9.6.3.9)."""
-    for one in found.all(Pid.STATUS_INFO) if found else ():
-        if one.value.end - one.value.start >= 4:
-            status = int.from_bytes(datagram[one.value.start : one.value.start + 4], "big")
+def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
+    """Whether the status in the inline QoS says that what a sample is about has ended (9.6.3.9)."""
+    for param in inline_qos.all(Pid.STATUS_INFO) if inline_qos else ():
+        if param.value.end - param.value.start >= 4:
+            status = int.from_bytes(datagram[param.value.start : param.value.start + 4], "big")
             return bool(status & _DISPOSED_OR_UNREGISTERED)
     return False
 
 
-def _edits(datagram: bytes, held: ParameterList, lead: Lead) -> Iterator[Overwrite]:
-    for parameter in held.all(*UNICAST, *MULTICAST):
-        after = _after(datagram, held, parameter, lead)
-        yield replaced(held, parameter, after) if after else held.removed(parameter)
+def _edits(datagram: bytes, parameters: ParameterList, lead: Lead) -> Iterator[Overwrite]:
+    for parameter in parameters.all(*UNICAST, *MULTICAST):
+        target = _target(datagram, parameters, parameter, lead)
+        yield replaced(parameters, parameter, target) if target else parameters.removed(parameter)
 
 
-def _after(
-    datagram: bytes, held: ParameterList, parameter: Parameter, lead: Lead
+def _target(
+    datagram: bytes, parameters: ParameterList, parameter: Parameter, lead: Lead
 ) -> HostPort | None:
-    """Where a locator leads afterwards; None if it is taken out."""
-    locator = read_locator(datagram, held, parameter)
+    """Where a locator is to lead; None if it is taken out."""
+    locator = read_locator(datagram, parameters, parameter)
     if locator is None or locator.where is None or parameter.pid in MULTICAST:
         return None
     return lead(parameter.pid, locator.where)

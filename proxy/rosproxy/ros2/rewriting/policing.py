@@ -1,4 +1,4 @@
-"""Which rule of the policy a reader or writer of DDS is a case of (`rosproxy.access.rules`).
+"""Which rule of the policy applies to a reader or writer of DDS (`rosproxy.access.rules`).
 
 The rules speak of topics and services as seen from inside. In DDS a service has two topics, and
 either end of each is a reader or a writer: so it follows from the topic's name, and from whether
@@ -10,11 +10,11 @@ from rosproxy.ros2.protocol.names import is_of_requests, is_of_service, ros_name
 from rosproxy.ros2.registry.participants import EndpointKind
 
 GRAPH_TOPIC = "ros_discovery_info"
-"""By it participants tell which nodes they have; without it `ros2 node list` is empty."""
+"""The topic on which participants tell their nodes; without it `ros2 node list` is empty."""
 
 
 def rule_about(kind: EndpointKind, dds_topic: str, is_inside: bool) -> tuple[RuleKind, str] | None:
-    """What kind of rule a reader or writer is a case of, and by which name; None: of none.
+    """The kind of rule that applies to a reader or writer, and the name it is for; None: no rule.
 
     ``is_inside`` tells the side of its participant.
     """

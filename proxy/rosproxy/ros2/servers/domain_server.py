@@ -1,8 +1,8 @@
-"""The sockets of one domain: what they hear goes to `Domain`, what that says is sent.
+"""The sockets of one domain: what they receive goes to `Domain`, what that returns is sent.
 
     the groups       at the domain's multicast port, on every inside network
     well-known port  where those inside announce themselves that know the proxy as a peer
-    the range        all its ports, from the start: also one that nobody has tells something
+    the range        all its ports, from the start: what comes to one not lent tells who had it
     stand-ins        for the locators of participants outside, opened when they are first heard
 
 Everything is sent from one socket: RTPS answers to locators, not to where a datagram came from.
@@ -46,7 +46,7 @@ class DomainServer:
     """Serves one domain. ``now`` is the clock; ``is_inside`` tells an address's side.
 
     ``changed`` is called when a lease was given or has ended.
-    For ``awaited`` seconds nobody is let in unless an operator has told who is.
+    For ``awaited`` seconds nobody is let in unless an operator has told who may.
     """
 
     def __init__(
@@ -59,17 +59,17 @@ class DomainServer:
         awaited: float = 0.0,
     ) -> None:
         self._bind, self._now, self._is_inside = bind, now, is_inside
-        self._changed, self._told = changed, 0
+        self._changed, self._told_changes = changed, 0
         pool = PortPool(settings.ports.listen)
         self.domain = Domain.starting(settings, pool, os.urandom(PREFIX), now(), time.time())
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
         self._sockets: list[socket.socket] = []
         self._stand_ins: dict[int, socket.socket] = {}
-        self._synced = 0
+        self._synced_changes = 0
         self._groups = GroupEars(settings.multicast_port, self._read_group, self._stop_reading)
         self._secret, self._heard = b"", asyncio.Event()
-        self._out = {family: _sending(family) for family in (socket.AF_INET, socket.AF_INET6)}
+        self._out = {f: _sending_socket(f) for f in (socket.AF_INET, socket.AF_INET6)}
         self.lost = 0
         """Datagrams that the kernel did not take."""
 
@@ -80,23 +80,23 @@ class DomainServer:
         """
         settings, domain = self.domain.settings, self.domain
         self._groups.open(_families(self._bind))
-        known = datagrams.bind(self._bind, settings.unicast_port)
-        self._read(known, self._from_inside(domain.heard_inside))
-        taken = []
+        well_known = datagrams.bind(self._bind, settings.unicast_port)
+        self._read(well_known, self._from_inside(domain.heard_inside))
+        taken_ports = []
         for port in settings.ports.listen.ports():
             try:
                 sock = datagrams.bind(self._bind, port)
             except OSError as error:
                 log.debug("port %d: %s", port, error)
                 self.domain.ports.pool.block(port)
-                taken.append(port)
+                taken_ports.append(port)
                 continue
             is_discovery = port == settings.discovery_port
             self._read(sock, self._at_discovery if is_discovery else self._at_lease(port))
-        return taken
+        return taken_ports
 
     async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
-        """What a trial finds out; it is told when a secret comes in where the domain is found."""
+        """What a trial finds out; its event is set when a secret comes in at the discovery port."""
         self._secret, self._heard = secret, asyncio.Event()
         return await trial(self._heard)
 
@@ -115,7 +115,7 @@ class DomainServer:
             self._send(self.domain.own.announced_outside())
 
     def apply_policy(self) -> None:
-        """Have those meet anew of whom the policy says something else than before."""
+        """Have participants meet anew of which the policy says something else than before."""
         self._send(self.domain.apply_policy(self._now()))
 
     def select(self, addresses: Iterable[str]) -> None:
@@ -130,13 +130,13 @@ class DomainServer:
         self.domain.returning.note_former(former, self.domain.inside.by_prefix)
 
     def end(self, addresses: Collection[str]) -> int:
-        """End the participants at addresses where nobody is any more; how many there were."""
+        """End the participants at addresses where nobody is any more; returns how many."""
         before = len(self.domain.inside.by_prefix)
         self._send(self.domain.gone(addresses))
         return before - len(self.domain.inside.by_prefix)
 
     async def expire(self) -> None:
-        """Take in who has waited, and forget whoever has gone."""
+        """Let in participants that have waited, and forget those that have gone."""
         self._release()
         self._send(self.domain.settle(self._now()))
         self.domain.expire(self._now())
@@ -144,14 +144,14 @@ class DomainServer:
         self._tell_changes()
 
     async def observe(self) -> None:
-        """Announce the observer, by multicast and to those who may not hear that; keep ports."""
+        """Announce the observer, by multicast and to those that may not get that; keep ports."""
         for address in self._groups.joined:
             self._observe(address)
         settings, inside = self.domain.settings, list(self.domain.inside.by_prefix.values())
         self._send(
-            Outgoing(one.metatraffic, self.domain.own.announced_inside(settings.near(one.address)))
-            for one in inside
-            if one.metatraffic
+            Outgoing(p.metatraffic, self.domain.own.announced_inside(settings.near(p.address)))
+            for p in inside
+            if p.metatraffic
         )
         self._ask(self._selected.told or ())
         self._send(self.domain.own.announced_outside())
@@ -159,10 +159,10 @@ class DomainServer:
 
     def close(self) -> None:
         """Close all sockets."""
-        end = self.domain.own.observer.farewell()
+        farewell = self.domain.own.observer.farewell()
         for address in self._groups.joined:
-            self._multicast(address, end)
-        self._send(self.domain.settings.to_outside(end))
+            self._multicast(address, farewell)
+        self._send(self.domain.settings.to_outside(farewell))
         self._groups.close()
         for sock in [*self._sockets, *self._stand_ins.values()]:
             self._stop_reading(sock)
@@ -170,7 +170,7 @@ class DomainServer:
             sock.close()
 
     def _release(self) -> None:
-        """Take in what those have announced who are let in now."""
+        """Take in what participants have announced that are let in now."""
         now = self._now()
         for source, datagram in self._selected.released(now):
             self._send(self.domain.heard_inside(datagram, source, now))
@@ -180,12 +180,12 @@ class DomainServer:
 
         Docker's internal networks do not, where bridged packets are filtered (br_netfilter).
         """
-        settings, here = self.domain.settings, self.domain.inside.here
+        settings, counts = self.domain.settings, self.domain.inside.here
         for address in addresses:
-            told = self.domain.own.announced_inside(settings.near(address))
-            known = here.get(address, 0)
-            ports = settings.well_known(address, known + 2 if known else PARTICIPANTS_TRIED)
-            self._send(Outgoing(to, told) for to in ports)
+            announcement = self.domain.own.announced_inside(settings.near(address))
+            count = counts.get(address, 0)
+            targets = settings.well_known(address, count + 2 if count else PARTICIPANTS_TRIED)
+            self._send(Outgoing(target, announcement) for target in targets)
 
     def _observe(self, near: str) -> None:
         self._multicast(near, self.domain.own.announced_inside(near))
@@ -213,7 +213,7 @@ class DomainServer:
         self._loop.add_reader(sock, self._take_in, sock, take)
 
     def _from_inside(self, take: Take) -> Take:
-        def taking(datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        def take_selected(datagram: bytes, source: str, now: float) -> list[Outgoing]:
             if not self._is_inside(source):
                 return []
             if self._selected.admits(source, now):
@@ -224,7 +224,7 @@ class DomainServer:
                         self._selected.hold(source, message.datagram)
             return []
 
-        return taking
+        return take_selected
 
     def _heard_in_group(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         sent = self.domain.heard_inside(datagram, source, now)
@@ -246,43 +246,43 @@ class DomainServer:
     def _take_in(self, sock: socket.socket, take: Take) -> None:
         """Take in what waits at a socket, and send what follows from it.
 
-        Before others have their turn it is so many datagrams, or one of the longest.
+        At most `PER_TURN` datagrams, or one of the longest, before others have their turn.
         """
-        taken = count = 0
+        byte_count = count = 0
         with contextlib.suppress(BlockingIOError):
-            while count < PER_TURN and taken < LARGEST // 2:
+            while count < PER_TURN and byte_count < LARGEST // 2:
                 count += 1
                 try:
                     datagram, sender = sock.recvfrom(LARGEST)
                 except ConnectionRefusedError:
                     continue
-                taken += len(datagram)
+                byte_count += len(datagram)
                 outgoing = take(datagram, plain_address(sender[0]), self._now())
                 self._sync_stand_ins()
                 self._tell_changes()
                 self._send(outgoing)
 
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
-        for one in outgoing:
+        for out in outgoing:
             try:
-                self._out[family_of(one.to.host)].sendto(one.datagram, (one.to.host, one.to.port))
+                self._out[family_of(out.to.host)].sendto(out.datagram, (out.to.host, out.to.port))
             except OSError as error:
                 self.lost += 1
-                log.debug("a datagram to %s: %s", one.to, error)
+                log.debug("a datagram to %s: %s", out.to, error)
 
     def _tell_changes(self) -> None:
         """Tell that leases have changed, if they have."""
         changes = self.domain.inside.changes
-        if changes != self._told:
-            self._told = changes
+        if changes != self._told_changes:
+            self._told_changes = changes
             self._changed()
 
     def _sync_stand_ins(self) -> None:
         """Open and close the ports for participants outside."""
         outside = self.domain.outside
-        if outside.changes == self._synced:
+        if outside.changes == self._synced_changes:
             return
-        self._synced, wanted = outside.changes, outside.stand_ins
+        self._synced_changes, wanted = outside.changes, outside.stand_ins
         for port in self._stand_ins.keys() - wanted.keys():
             self._stop_reading(self._stand_ins.pop(port))
         for port in wanted.keys() - self._stand_ins.keys():
@@ -301,7 +301,7 @@ def _families(bind: str) -> list[socket.AddressFamily]:
     return [socket.AF_INET, socket.AF_INET6] if bind == "::" else [family_of(bind)]
 
 
-def _sending(family: socket.AddressFamily) -> socket.socket:
+def _sending_socket(family: socket.AddressFamily) -> socket.socket:
     sock = socket.socket(family, socket.SOCK_DGRAM)
     sock.setblocking(False)
     with contextlib.suppress(OSError):

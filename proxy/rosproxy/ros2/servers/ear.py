@@ -3,8 +3,8 @@
 Multicast ends at the bridge of a container network. This program runs in the host's network, hears
 there what participants announce to the group (SPDP), and tells the proxy, with the address that it
 came from; what the proxy announces it tells the LAN. It carries nothing else: no discovery of
-readers and writers, no user's data. It needs no right but to be in that network, and knows nothing
-by itself, so that it may be killed and started at any time.
+readers and writers, no user's data. It needs no right but to be in that network, and keeps no
+state, so that it may be killed and started at any time.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ makes one in three seconds, the proxy those of all inside."""
 
 @dataclass(frozen=True, slots=True)
 class EarSettings:
-    """What an ear is told.
+    """The settings of an ear.
 
     ``lan`` is this host's address on the LAN, ``bind`` where the proxy's announcements come in,
     ``proxy`` the address and port of the proxy that hears the LAN's.
@@ -92,9 +92,9 @@ class Ear:
             for _ in range(DATAGRAMS_PER_TURN):
                 datagram, sender = lan.recvfrom(LARGEST)
                 source = plain_address(sender[0])
-                for one in self._announcements(datagram, source):
+                for announcement in self._announcements(datagram, source):
                     self.heard += 1
-                    self._send(self._own, wrapped(source, one), self._settings.proxy)
+                    self._send(self._own, wrapped(source, announcement), self._settings.proxy)
 
     def _tell(self) -> None:
         """Tell the LAN what the proxy announces."""
@@ -108,26 +108,26 @@ class Ear:
                 if source != self._settings.proxy.host:
                     self.dropped += 1
                     continue
-                for one in self._announcements(datagram, source):
+                for announcement in self._announcements(datagram, source):
                     self.told += 1
                     for group in groups_of(self._settings.lan):
-                        self._send(self._lan, one, HostPort(group, self._port))
+                        self._send(self._lan, announcement, HostPort(group, self._port))
 
     def _announcements(self, datagram: bytes, source: str) -> list[bytes]:
-        """The announcements of participants in a datagram, if it is not one too many of its source.
+        """The announcements of participants in a datagram; none if its source sends too many.
 
-        Several participants of a program may share it.
+        Several participants of a program may share a datagram.
         """
-        found = list[bytes]()
+        announcements = list[bytes]()
         if self._rates.take(source, len(datagram), self._loop.time()):
             with contextlib.suppress(RtpsError):
                 messages = map(read_discovery, by_source(datagram))
-                found = [one.datagram for one in messages if one.of_participant is not None]
-        self.dropped += not found
-        return found
+                announcements = [m.datagram for m in messages if m.of_participant is not None]
+        self.dropped += not announcements
+        return announcements
 
-    def _send(self, sock: socket.socket, data: bytes, to: HostPort) -> None:
+    def _send(self, sock: socket.socket, data: bytes, target: HostPort) -> None:
         try:
-            sock.sendto(data, (to.host, to.port))
+            sock.sendto(data, (target.host, target.port))
         except OSError as error:
-            log.debug("an announcement to %s: %s", to, error)
+            log.debug("an announcement to %s: %s", target, error)

@@ -1,9 +1,9 @@
 """Multicast groups: sockets that hear them, and that send to them through some network.
 
 Participants announce themselves to one group with IPv4, and to one of two with IPv6, which has no
-standard there: Fast DDS has one of global scope (UDPv6Transport.cpp), Cyclone DDS one of the link
-(ddsi_udp.c). With IPv4 a membership goes by an own address, with IPv6 by the interface's index, and
-a group of the link has a socket for each link.
+standard there: Fast DDS has one of global scope (UDPv6Transport.cpp), Cyclone DDS one of link scope
+(ddsi_udp.c). A membership is by an own address with IPv4, by the interface's index with IPv6, and
+a group of link scope has a socket for each link.
 """
 
 import errno
@@ -50,13 +50,13 @@ class GroupEars:
         return list(self._of_link)
 
     def open(self, families: Iterable[socket.AddressFamily]) -> None:
-        """Hear those that have one socket for all networks. Raises OSError."""
+        """Hear the groups that have one socket for all networks. Raises OSError."""
         for family in families:
             self._shared[family] = [self._opened(group) for group in _SHARED[family]]
 
     def join(self, addresses: Iterable[str]) -> list[str]:
-        """Hear them on the networks of these own addresses and no others; which ones are new."""
-        present = {one for one in addresses if family_of(one) in self._shared}
+        """Hear them on the networks of these own addresses alone; the addresses that are new."""
+        present = {a for a in addresses if family_of(a) in self._shared}
         for address in self._of_link.keys() - present:
             for sock in self._of_link.pop(address):
                 self._end(sock)
@@ -74,16 +74,16 @@ class GroupEars:
     def _join(self, address: str) -> bool:
         """Hear them on one network, if it is still there."""
         family = family_of(address)
-        own = list[socket.socket]()
+        link_sockets = list[socket.socket]()
         try:
-            own += (self._opened(one, address) for one in _OF_LINK[family])
-            for sock in self._shared[family] + own:
+            link_sockets += (self._opened(group, address) for group in _OF_LINK[family])
+            for sock in self._shared[family] + link_sockets:
                 join(sock, address)
         except OSError:
-            for sock in own:
+            for sock in link_sockets:
                 self._end(sock)
             return False
-        self._of_link[address] = own
+        self._of_link[address] = link_sockets
         return True
 
     def _opened(self, group: str, link_of: str = "") -> socket.socket:
@@ -95,7 +95,7 @@ class GroupEars:
 def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
     """A non-blocking socket that is bound to a group, and so gets nothing else. Raises OSError.
 
-    Others on this machine may have the same. A group of a link is that of an own address's.
+    Others on this machine may have the same. ``link_of`` is an own address on a group's link.
     """
     sock = socket.socket(family_of(group.host), socket.SOCK_DGRAM)
     try:
@@ -133,5 +133,5 @@ def join(sock: socket.socket, address: str) -> None:
             member = packed + socket.inet_aton(address)
             sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
     except OSError as error:
-        if error.errno != errno.EADDRINUSE:  # it is one, by another address of that network
+        if error.errno != errno.EADDRINUSE:  # joined already, by another address of that network
             raise

@@ -49,17 +49,17 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
     A container that can't have what it wants is left out and has a problem, and no other is
     touched by it. Containers that do not run have no problems.
     """
-    proxies = frozenset(one.container.name for one in observed.own)
+    proxies = frozenset(own.container.name for own in observed.own)
     requests: list[Member] = []
     problems: list[Problem] = []
-    for container in sorted(observed.containers, key=lambda one: (one.name, one.id)):
+    for container in sorted(observed.containers, key=lambda c: (c.name, c.id)):
         if container.state not in _COUNTED:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
             if values.enabled(container.labels, _exposed(container, settings)):
-                asked, texts = _requests(container, observed, settings, proxies)
-                requests += asked
+                granted, texts = _requests(container, observed, settings, proxies)
+                requests += granted
                 wrong += [_problem(container, text, False) for text in texts]
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
@@ -69,7 +69,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
 
 def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
     """The hosts of all masters that a proxy is wanted for or there for, in lower case, sorted."""
-    wanted = {each.key for each in reading.requests if each.container.alive}
+    wanted = {r.key for r in reading.requests if r.container.alive}
     keys = (key for key in observed.keys | wanted if not key.is_ros2)
     return tuple(sorted({master(key).host.lower() for key in keys}))
 
@@ -77,7 +77,7 @@ def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
 def find_members(
     reading: LabelReading, observed: HostState, settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
-    """The containers that belong to a proxy, and those of which it is not known to which."""
+    """The containers that belong to a proxy, and problems of those whose proxy is not known."""
     members: list[Member] = []
     problems: list[Problem] = []
     for request in reading.requests:
@@ -85,38 +85,38 @@ def find_members(
         host = request.key.advertise_host or _advertised(request, observed)
         key = replace(request.key, advertise_host=host)
         if host:
-            found, text = _placed(replace(request, key=key), observed, settings)
+            member, text = _placed(replace(request, key=key), observed, settings)
             wrong = [_problem(container, text, False)] if text else []
-            members.append(found)
+            members.append(member)
         else:
-            text = _no_way(key, observed)
+            text = _why_no_host(key, observed)
             wrong = [_unusable(container, text)]
         problems += wrong if container.alive else []
     return tuple(members), tuple(problems)
 
 
 def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tuple[Member, str]:
-    """A container whose proxy is known, with how it finds that, and what is wrong with it."""
+    """A container whose key is known, with how its nodes find the proxy, and a warning."""
     container, key = request.container, request.key
     if key.is_ros2:
         return request, ""
     needs, text = values.looks_for(container, key)
-    given = values.master_by_address(container, key, observed.masters)
-    if given is None:
+    by_address = values.master_by_address(container, key, observed.masters)
+    if by_address is None:
         return replace(request, needs=needs), text
-    inner = {network.name for network in observed.networks if network.internal}
+    internal = {network.name for network in observed.networks if network.internal}
     if not settings.redirect:
         text += "; the operator's --no-redirect keeps it from being led to the proxy"
     elif request.redirect is False:
         text += f"; without {values.named(REDIRECT, container.labels)} it is led to the proxy"
-    elif (joined := values.owner(container, observed).networks) and joined <= inner:
+    elif (joined := values.owner(container, observed).networks) and joined <= internal:
         text += "; it is not led to the proxy, since its networks have no way outwards"
     else:
-        return replace(request, by_address=given), ""
+        return replace(request, by_address=by_address), ""
     return request, text
 
 
-def _no_way(key: Key, observed: HostState) -> str:
+def _why_no_host(key: Key, observed: HostState) -> str:
     """Why it is not known how outside reaches this host, the first cause first.
 
     It follows from the master's address, which often is what is not known.
@@ -133,15 +133,15 @@ def _no_way(key: Key, observed: HostState) -> str:
 def _requests(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> tuple[list[Member], list[str]]:
-    """What a container gets of what it asks for, for each version of ROS, and what it is told."""
-    found = ros2.versions(container)
-    asked = [_request(container, observed, settings, proxies)] if "1" in found else []
-    if "2" in found:
-        asked.append(_ros2_request(container, observed, settings))
-    narrow = [bounds.narrowed(each, settings) for each in asked]
-    told = [*ros2.warnings(container, found)]
-    told += dict.fromkeys(text for _, texts in narrow for text in texts)
-    return [request for request, _ in narrow], told
+    """What a container gets of what it asks for, by version of ROS, and the warnings for it."""
+    ros_versions = ros2.versions(container)
+    requests = [_request(container, observed, settings, proxies)] if "1" in ros_versions else []
+    if "2" in ros_versions:
+        requests.append(_ros2_request(container, observed, settings))
+    granted = [bounds.narrowed(r, settings) for r in requests]
+    warnings = [*ros2.warnings(container, ros_versions)]
+    warnings += dict.fromkeys(text for _, texts in granted for text in texts)
+    return [request for request, _ in granted], warnings
 
 
 def _ros2_request(container: Container, observed: HostState, settings: PlanSettings) -> Member:
@@ -226,8 +226,8 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
             near = _near(name, 0.75)
             fix = f"did you mean {near}?" if near else f"there are {', '.join(LABELS)}"
             yield f"label {name} is unknown and ignored; {fix}"
-    meant = any(_near(name, 0.75) == ENABLE for name in own)  # that has been told
-    if own and not meant and ENABLE not in container.labels and not settings.expose_by_default:
+    misspelt = any(_near(name, 0.75) == ENABLE for name in own)  # warned of above
+    if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
         yield f"{listed(f'label {name}' for name in own)} ignored: add the label {ENABLE}=true"
 
 
@@ -238,7 +238,7 @@ def _near(name: str, cutoff: float) -> str:
 
 @lru_cache(maxsize=1024)
 def _nearest(name: str, cutoff: float) -> str:
-    """The same, kept: hundreds of containers have the same few names."""
+    """The same, cached: hundreds of containers have the same few names."""
     return next(iter(difflib.get_close_matches(name, LABELS, n=1, cutoff=cutoff)), "")
 
 
@@ -249,12 +249,12 @@ def _advertised(request: Member, observed: HostState) -> str:
     """
     key, networks = request.key, request.container.networks
     towards = observed.far if key.is_ros2 else observed.advertise.get(master(key).host, "")
-    there = [
-        box
-        for box in observed.sandboxes
-        if (box.key.master_uri, box.key.domain) == (key.master_uri, key.domain)
+    sandboxes = [
+        s
+        for s in observed.sandboxes
+        if (s.key.master_uri, s.key.domain) == (key.master_uri, key.domain)
     ]
-    if towards or not there:
+    if towards or not sandboxes:
         return towards
-    near = {box.key for box in there if box.container.networks & networks}
-    return min(near or {box.key for box in there}).advertise_host
+    near = {s.key for s in sandboxes if s.container.networks & networks}
+    return min(near or {s.key for s in sandboxes}).advertise_host

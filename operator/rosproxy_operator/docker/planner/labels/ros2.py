@@ -37,11 +37,11 @@ _OF_ROS2 = (DOMAIN, PEERS)
 def versions(container: Container) -> frozenset[str]:
     """The versions of ROS that a container is of: 1, 2 or both. Raises UnusableLabel."""
     if ROS in container.labels:
-        words = frozenset(re.split(r"[,\s]+", container.labels[ROS].strip()))
-        if not words <= {"1", "2"}:
+        tokens = frozenset(re.split(r"[,\s]+", container.labels[ROS].strip()))
+        if not tokens <= {"1", "2"}:
             text = f"{named(ROS, container.labels)} is none of 1, 2 and 1,2: write {ROS}=2"
             raise UnusableLabel(text)
-        return words
+        return tokens
     version, distro = (container.variables.get(name, "") for name in ("ROS_VERSION", "ROS_DISTRO"))
     if version in ("1", "2"):
         return frozenset({version})
@@ -55,20 +55,20 @@ def domain(container: Container) -> int:
     else:
         text = container.variables.get("ROS_DOMAIN_ID", "") or "0"
         source = f"its variable ROS_DOMAIN_ID={quoted(text)}"
-    word = text.strip()
-    if not re.fullmatch(r"[0-9]{1,3}", word, re.ASCII) or int(word) > LAST_DOMAIN:
+    digits = text.strip()
+    if not re.fullmatch(r"[0-9]{1,3}", digits, re.ASCII) or int(digits) > LAST_DOMAIN:
         fix = f"write {DOMAIN}=0 or whatever the domain is"
         raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}: {fix}")
-    return int(word)
+    return int(digits)
 
 
 def peers(labels: Labels) -> frozenset[str]:
     """The hosts outside that are told of a container's participants; none without the label."""
-    words = [word for word in re.split(r"[,\s]+", labels.get(PEERS, "")) if word]
-    if len(words) > MOST_PEERS:
+    names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
+    if len(names) > MOST_PEERS:
         raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts: name fewer")
     try:
-        return frozenset(map(read_peer_name, words))
+        return frozenset(map(read_peer_name, names))
     except ValueError as error:
         raise UnusableLabel(f"label {PEERS}: {error}") from None
 
@@ -84,20 +84,20 @@ def refuse_unserved(container: Container, host: str) -> None:
         raise UnusableLabel(f"{text}: give an IPv4 address")
 
 
-def warnings(container: Container, found: Collection[str]) -> Iterator[str]:
-    """What a container of these versions is told that has a proxy nevertheless."""
+def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
+    """Warnings for a container of these versions, which has a proxy nevertheless."""
     labels, variables = container.labels, container.variables
-    told = {ROS, MASTER_URI} & labels.keys() or container.master_uri
-    if not told and not {"ROS_VERSION", "ROS_DISTRO"} & variables.keys():
+    explicit = {ROS, MASTER_URI} & labels.keys() or container.master_uri
+    if not explicit and not {"ROS_VERSION", "ROS_DISTRO"} & variables.keys():
         yield f"nothing says which ROS it is, so it is taken for ROS 1: add the label {ROS}=1 or 2"
-    for version, mine in (("1", _OF_ROS1), ("2", _OF_ROS2)):
-        if version not in found:
+    for version, labels_of_version in (("1", _OF_ROS1), ("2", _OF_ROS2)):
+        if version not in ros_versions:
             yield from (
                 f"label {label} is for ROS {version}, which this is not: ignored"
-                for label in mine
+                for label in labels_of_version
                 if label in labels
             )
-    for name, values in ALONE.items() if "2" in found else ():
+    for name, values in ALONE.items() if "2" in ros_versions else ():
         if variables.get(name, "").upper() in values:
             text = f"its variable {name}={variables[name]} keeps its participants to themselves"
             yield f"{text}: take it off"

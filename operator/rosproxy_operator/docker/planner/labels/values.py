@@ -63,19 +63,19 @@ class UnusableLabel(Exception):
 
 
 def quoted(value: str) -> str:
-    """A value as it may be shown: not too long, and harmless."""
+    """A value as messages may show it: shortened and escaped."""
     return repr(bounded(value, 80))
 
 
 def named(label: str, labels: Labels) -> str:
-    """A label that is there, and what it says, as users are told of it."""
+    """A label and its value, as messages show it."""
     return f"label {label}={quoted(labels[label])}"
 
 
 def enabled(labels: Labels, otherwise: bool) -> bool:
     """Whether a container wants a proxy; ``otherwise`` if it does not say."""
-    found = _flag(ENABLE, labels)
-    return otherwise if found is None else found
+    flag = _flag(ENABLE, labels)
+    return otherwise if flag is None else flag
 
 
 def redirect(labels: Labels) -> bool | None:
@@ -87,43 +87,43 @@ def ports(labels: Labels) -> int:
     """How many ports the proxy is to have at least, or 0."""
     if PORTS not in labels:
         return 0
-    word = labels[PORTS].strip()
-    if not re.fullmatch(r"[0-9]{1,6}", word) or not 1 <= int(word) <= MOST_PORTS:
+    digits = labels[PORTS].strip()
+    if not re.fullmatch(r"[0-9]{1,6}", digits) or not 1 <= int(digits) <= MOST_PORTS:
         raise UnusableLabel(
             f"{named(PORTS, labels)} is not a number from 1 to {MOST_PORTS}: give how many "
             f"ports the whole proxy is to have, one for each node, e.g. {PORTS}=32"
         )
-    return int(word)
+    return int(digits)
 
 
 def data_plane(labels: Labels) -> DataPlane | None:
     """One of the proxy's data planes, or None."""
     fix = "kernel for a proxy that lets the kernel forward, or leave it out"
-    return _word(DATA_PLANE, labels, get_args(DataPlane), fix)
+    return _choice(DATA_PLANE, labels, get_args(DataPlane), fix)
 
 
 def direction(
     labels: Labels, joined: Collection[str], networks: Iterable[Network]
 ) -> Direction | None:
-    """Who has no route to the other side, or None if the option says.
+    """Which side has no route to the other, or None if the option decides.
 
     Without a label: a container on an internal network has none, of those that it ``joined``.
     """
     if DIRECTION not in labels:
-        return "both" if any(one.internal and one.name in joined for one in networks) else None
+        return "both" if any(n.internal and n.name in joined for n in networks) else None
     fix = "both where its nodes have no way outwards but the proxy, or leave it out"
-    return _word(DIRECTION, labels, get_args(Direction), fix)
+    return _choice(DIRECTION, labels, get_args(Direction), fix)
 
 
 def udp(labels: Labels) -> bool | None:
-    """Whether the ports are to be published for UDP, too, or None if the option says."""
+    """Whether the ports are to be published for UDP, too, or None if the option decides."""
     return _flag(UDP, labels)
 
 
 def slave_control(labels: Labels) -> SlaveControl | None:
     """Who may call what controls a node, or None."""
     fix = "master to keep shutdown, publisherUpdate and paramUpdate to the master, or leave it out"
-    return _word(SLAVE_CONTROL, labels, get_args(SlaveControl), fix)
+    return _choice(SLAVE_CONTROL, labels, get_args(SlaveControl), fix)
 
 
 def policy(labels: Labels) -> tuple[Rule, ...]:
@@ -133,15 +133,15 @@ def policy(labels: Labels) -> tuple[Rule, ...]:
     """
     text = labels.get(POLICY, "")
     if len(text) > LONGEST_POLICY:
-        many = f"label {POLICY} has more than {LONGEST_POLICY} characters: join rules by globs"
-        raise UnusableLabel(many)
+        cause = f"label {POLICY} has more than {LONGEST_POLICY} characters: join rules by globs"
+        raise UnusableLabel(cause)
     try:
         rules = parse_rules(text)
     except ValueError as error:
         raise UnusableLabel(f"label {POLICY}: {error}") from None
     if len(rules) > MOST_LABEL_RULES:
-        many = f"label {POLICY} has {len(rules)} rules, more than {MOST_LABEL_RULES}: join some by"
-        raise UnusableLabel(f"{many} globs")
+        cause = f"label {POLICY} has {len(rules)} rules, more than {MOST_LABEL_RULES}: join some by"
+        raise UnusableLabel(f"{cause} globs")
     return rules
 
 
@@ -155,33 +155,33 @@ def advertise_host(labels: Labels, settings: PlanSettings) -> str:
 
 def networks(container: Container, observed: HostState, uplink: str) -> frozenset[str]:
     """The container's user-defined networks but the uplink, or the one that its label names."""
-    place = owner(container, observed)
-    own = (place.networks or _soon(place, observed)) - BUILT_IN - {uplink}
+    net_owner = owner(container, observed)
+    own = (net_owner.networks or _future_network(net_owner, observed)) - BUILT_IN - {uplink}
     if NETWORK in container.labels:
         return frozenset({_named_network(container.labels, own)})
     if not own:
-        raise UnusableLabel(_why_none(place))
+        raise UnusableLabel(_why_no_network(net_owner))
     return own
 
 
 def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
     """Whether a label says true or false, None without it; ``usual`` is what most would want."""
-    word = labels.get(label, "").strip().lower()
-    if label in labels and word not in ("true", "false"):
+    value = labels.get(label, "").strip().lower()
+    if label in labels and value not in ("true", "false"):
         text = f"{named(label, labels)} is neither true nor false: write {label}={usual}"
         raise UnusableLabel(text)
-    return word == "true" if word else None
+    return value == "true" if value else None
 
 
-def _word(label: str, labels: Labels, words: tuple[_Word, ...], fix: str) -> _Word | None:
-    """The one of some words that a label says, None without the label; ``fix`` begins with one."""
+def _choice(label: str, labels: Labels, choices: tuple[_Word, ...], fix: str) -> _Word | None:
+    """The choice that a label names, None without the label; ``fix`` begins with a choice."""
     if label not in labels:
         return None
-    for word in words:
-        if labels[label].strip().lower() == word:
-            return word
+    for choice in choices:
+        if labels[label].strip().lower() == choice:
+            return choice
     raise UnusableLabel(
-        f"{named(label, labels)} is none of {', '.join(words)}: write {label}={fix}"
+        f"{named(label, labels)} is none of {', '.join(choices)}: write {label}={fix}"
     )
 
 
@@ -200,12 +200,12 @@ def _host(source: str, value: str) -> str:
     return bare
 
 
-def _soon(container: Container, observed: HostState) -> frozenset[str]:
-    """The network of a container that the engine is just creating, and lists without any."""
+def _future_network(container: Container, observed: HostState) -> frozenset[str]:
+    """The network of a container that the engine is just creating, and lists without networks."""
     if container.state != "created":
         return frozenset()
     mode = container.network_mode
-    return frozenset(one.name for one in observed.networks if mode in (one.name, one.id))
+    return frozenset(n.name for n in observed.networks if mode in (n.name, n.id))
 
 
 def _named_network(labels: Labels, own: frozenset[str]) -> str:
@@ -214,28 +214,28 @@ def _named_network(labels: Labels, own: frozenset[str]) -> str:
     for name in (label, f"{labels.get('com.docker.compose.project')}_{label}"):
         if name in own:
             return name
-    there = ", ".join(sorted(own)) or "none that is user-defined"
+    names = ", ".join(sorted(own)) or "none that is user-defined"
     raise UnusableLabel(
-        f"{named(NETWORK, labels)} names no network of the container; it has: {there}"
+        f"{named(NETWORK, labels)} names no network of the container; it has: {names}"
     )
 
 
 def owner(container: Container, observed: HostState) -> Container:
     """The container whose networks it has: itself, or the one that it shares them with."""
-    met = {container.id}
-    while (wanted := container.shares) is not None:
-        found = next((one for one in observed.containers if wanted in (one.id, one.name)), None)
-        if found is None or found.id in met:
+    visited = {container.id}
+    while (target := container.shares) is not None:
+        sharer = next((c for c in observed.containers if target in (c.id, c.name)), None)
+        if sharer is None or sharer.id in visited:
             raise UnusableLabel(
-                f"shares the network of a container ({quoted(wanted)}) that is not there: start "
+                f"shares the network of a container ({quoted(target)}) that is not there: start "
                 "that one, then create this one anew"
             )
-        met.add(found.id)
-        container = found
+        visited.add(sharer.id)
+        container = sharer
     return container
 
 
-def _why_none(owner: Container) -> str:
+def _why_no_network(owner: Container) -> str:
     fix = "attach it to a user-defined network: docker network create ros; docker run --network ros"
     if "host" in (*owner.networks, owner.network_mode):
         return (
@@ -256,8 +256,8 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
     if MASTER_URI in container.labels:
         source = named(MASTER_URI, container.labels)
         return _allowed_master(source, container.labels[MASTER_URI], settings, proxies)
-    where = parse_slave_uri(container.master_uri)
-    if container.master_uri and not (where and _names_proxy(where.host.lower(), proxies)):
+    host_port = parse_slave_uri(container.master_uri)
+    if container.master_uri and not (host_port and _names_proxy(host_port.host.lower(), proxies)):
         source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
         return _allowed_master(source, container.master_uri, settings, proxies)
     if settings.master_uri:
@@ -276,17 +276,17 @@ def looks_for(container: Container, key: Key) -> tuple[str, str]:
     """
     if not container.master_uri:
         return ALIAS, ""
-    where = parse_slave_uri(container.master_uri)
+    target = parse_slave_uri(container.master_uri)
     variable = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
-    right = master(key)
-    fix = f"set ROS_MASTER_URI=http://{ALIAS}:{right.port}"
-    if where is None:
+    real = master(key)
+    fix = f"set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
+    if target is None:
         return "", f"{variable} is not of the form http://HOST:11311: {fix}"
-    host = where.host.lower()
-    if not is_address(host) and host in (ALIAS, right.host, proxy_name(key)):
-        if where.port == right.port:
+    host = target.host.lower()
+    if not is_address(host) and host in (ALIAS, real.host, proxy_name(key)):
+        if target.port == real.port:
             return host, ""
-        return host, f"{variable}: the proxy stands at its master's port {right.port}: {fix}"
+        return host, f"{variable}: the proxy stands at its master's port {real.port}: {fix}"
     return "", f"{variable} {_wrong_master(host, key, fix)}"
 
 
@@ -297,12 +297,12 @@ def master_by_address(
 
     ``addresses`` are those of masters' hosts, where names are known. None for a name, and for IPv6.
     """
-    where, right = parse_slave_uri(container.master_uri), master(key)
-    if where is None or where.port != right.port or ":" in where.host:
+    target, real = parse_slave_uri(container.master_uri), master(key)
+    if target is None or target.port != real.port or ":" in target.host:
         return None
-    if not is_address(where.host) or where.host not in (right.host, addresses.get(right.host)):
+    if not is_address(target.host) or target.host not in (real.host, addresses.get(real.host)):
         return None
-    return HostPort(where.host, where.port)
+    return HostPort(target.host, target.port)
 
 
 def _wrong_master(host: str, key: Key, fix: str) -> str:
@@ -324,27 +324,27 @@ def _names_proxy(host: str, proxies: Collection[str]) -> bool:
 
 def _allowed_master(source: str, uri: str, settings: PlanSettings, proxies: Collection[str]) -> str:
     """A master that a container names: an image may carry both the label and the variable."""
-    found = _parse_master(source, uri, proxies)
-    if refusal := bounds.refused_master(found, settings):
+    parsed = _parse_master(source, uri, proxies)
+    if refusal := bounds.refused_master(parsed, settings):
         raise UnusableLabel(f"{source} {refusal}")
-    return found
+    return parsed
 
 
 def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
     """A master's URI in its one form: host in lower case, no slash at the end."""
-    where = parse_slave_uri(uri.strip())
-    path = urlsplit(uri.strip()).path.rstrip("/") if where else ""
-    if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
+    host_port = parse_slave_uri(uri.strip())
+    path = urlsplit(uri.strip()).path.rstrip("/") if host_port else ""
+    if host_port is None or not host_port.host.isascii() or not _PATH.fullmatch(path):
         raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
-    host = where.host.lower()
+    host = host_port.host.lower()
     if is_loopback(host):
         raise UnusableLabel(
             f"{source} is the container itself, where no master runs: give the name of the "
-            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{where.port} and the label "
+            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{host_port.port} and the label "
             f"{MASTER_URI}"
         )
     if _names_proxy(host, proxies):
         raise UnusableLabel(
             f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
         )
-    return slave_uri(HostPort(host, where.port), path)
+    return slave_uri(HostPort(host, host_port.port), path)

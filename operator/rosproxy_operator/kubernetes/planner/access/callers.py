@@ -2,7 +2,7 @@
 
 Those of all pods on the proxy's node that its RosProxy selects. A pod that is being deleted still
 counts, since its ROS nodes unregister while they end; so does one that another RosProxy selects as
-well, since it may have been wired before that was there.
+well, since it may have been wired before that one was created.
 """
 
 from collections.abc import Mapping
@@ -17,15 +17,17 @@ def callers(observed: ClusterSnapshot) -> Mapping[str, tuple[str, ...]]:
 
     A proxy whose RosProxy is gone or can't be read is left out: it goes on with what it knows.
     """
-    rosproxies = {one.uid: one for one in observed.rosproxies if not one.deleting}
-    there = (pod for pod in observed.pods if not (pod.ended or pod.host_network))
-    pods = grouped(((pod.id.namespace, pod.node), pod) for pod in there)
-    found: dict[str, tuple[str, ...]] = {}
+    rosproxies = {r.uid: r for r in observed.rosproxies if not r.deleting}
+    live_pods = (pod for pod in observed.pods if not (pod.ended or pod.host_network))
+    pods = grouped(((pod.id.namespace, pod.node), pod) for pod in live_pods)
+    addresses: dict[str, tuple[str, ...]] = {}
     for proxy in observed.proxies:
-        of = rosproxies.get(proxy.owner)
-        if of is not None:
-            own = (pod for pod in pods.get((of.id.namespace, proxy.on), ()) if selects(of, pod))
-            found[proxy.pod.uid] = tuple(
-                sorted({ip for pod in own for ip in (pod.ip, *pod.ips) if ip})
+        rosproxy = rosproxies.get(proxy.owner)
+        if rosproxy is not None:
+            selected = (
+                p for p in pods.get((rosproxy.id.namespace, proxy.on), ()) if selects(rosproxy, p)
             )
-    return found
+            addresses[proxy.pod.uid] = tuple(
+                sorted({ip for pod in selected for ip in (pod.ip, *pod.ips) if ip})
+            )
+    return addresses

@@ -13,7 +13,7 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 
 def policy_of(rosproxy: RosProxy, settings: ClusterSettings) -> tuple[PolicyLayer, ...]:
-    """The layers of a RosProxy's proxies; each further one can only narrow."""
+    """The layers of a RosProxy's proxies; each further layer can only narrow."""
     return (*settings.policy, *rosproxy.spec.policy)
 
 
@@ -21,7 +21,7 @@ def policies(
     observed: ClusterSnapshot, settings: ClusterSettings
 ) -> Mapping[str, tuple[PolicyLayer, ...]]:
     """The policy of each proxy, by the uid of its pod."""
-    rosproxies = {one.uid: one for one in observed.rosproxies if not one.deleting}
+    rosproxies = {r.uid: r for r in observed.rosproxies if not r.deleting}
     return {
         proxy.pod.uid: policy_of(rosproxies[proxy.owner], settings)
         for proxy in observed.proxies

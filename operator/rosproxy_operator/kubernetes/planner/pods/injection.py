@@ -47,24 +47,24 @@ class Wiring(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """What a pod is to be told: the master's URI, peers and domain; what is empty, it is not."""
+    """What a pod is to be told: the master's URI, peers and domain, unless they are empty."""
 
     uri: str = ""
     static_peers: str = ""
     domain: int | None = None
 
 
-def target_of(of: RosProxy, cluster_ip: str) -> Target:
+def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
     """What the pods of a RosProxy are told, by the address of its Service."""
-    ros2 = of.spec.ros2
+    ros2 = rosproxy.spec.ros2
     return Target(
-        master_uri(cluster_ip) if of.spec.ros1 else "",
+        master_uri(cluster_ip) if rosproxy.spec.ros1 else "",
         cluster_ip if ros2 else "",
         ros2.domain if ros2 else None,
     )
 
 
-def wire(pod: Json, to: Target, host_aliases: Iterable[Json] = ()) -> Wiring:
+def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring:
     """Wire a pod, as it is at admission, to its proxy.
 
     Every container and init container that does not set them gets ROS_MASTER_URI, and ROS_IP where
@@ -73,19 +73,19 @@ def wire(pod: Json, to: Target, host_aliases: Iterable[Json] = ()) -> Wiring:
     names a domain. An address that this webhook has set before, as in a copy of a wired pod, is set
     anew. Wiring a wired pod changes nothing.
 
-    A pod in its node's own network must not be given here: see `selection.chosen`.
+    A pod in its node's own network must not be passed here: see `selection.chosen`.
     """
-    notes = words(pod, "metadata", "annotations")
-    if MIRROR in notes:
-        static = (
+    annotations = words(pod, "metadata", "annotations")
+    if MIRROR in annotations:
+        warning = (
             "is a static pod, made from a file on its node, which can't be wired: set "
-            f"{'ROS_MASTER_URI and ROS_IP' if to.uri else 'ROS_STATIC_PEERS'} in that file, or run "
-            "it as an ordinary pod"
+            f"{'ROS_MASTER_URI and ROS_IP' if target.uri else 'ROS_STATIC_PEERS'} in that file, or "
+            "run it as an ordinary pod"
         )
-        return Wiring(warnings=(static,))
+        return Wiring(warnings=(warning,))
     spec = part(pod, "spec")
     wired: dict[str, Any] = {
-        kind: [_wired(one, to, notes) for one in parts(spec, kind)]
+        kind: [_wired(container, target, annotations) for container in parts(spec, kind)]
         for kind in _KINDS
         if spec.get(kind)
     }
@@ -93,12 +93,12 @@ def wire(pod: Json, to: Target, host_aliases: Iterable[Json] = ()) -> Wiring:
     if aliases:
         wired["hostAliases"] = aliases
     changed = any(spec.get(key) != value for key, value in wired.items())
-    told = {
-        note: value
-        for note, name, value in _addresses(to)
-        if any(_value(one, name) == value for kind in _KINDS for one in wired.get(kind, ()))
+    new_annotations = {
+        annotation: value
+        for annotation, variable, value in _addresses(target)
+        if any(_value(c, variable) == value for kind in _KINDS for c in wired.get(kind, ()))
     }
-    return Wiring({**spec, **wired} if changed else None, told)
+    return Wiring({**spec, **wired} if changed else None, new_annotations)
 
 
 def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | None:
@@ -113,16 +113,16 @@ def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | N
 def has_come_unwired(pod: Pod, cluster_ip: str) -> bool:
     """Whether a pod is not wired, or to another address, and would be wired if it were made anew.
 
-    One whose template sets ROS_MASTER_URI itself would not, nor one without the label.
+    A pod whose template sets ROS_MASTER_URI itself would not, nor would a pod without the label.
     """
     return INJECT in pod.labels and not pod.own_masters and pod.wired != master_uri(cluster_ip)
 
 
-def _wrong_master(pod: Pod, of: Name, cluster_ip: str) -> str:
-    others = [uri for uri in pod.own_masters if not _is_proxys(uri, of, cluster_ip)]
-    if others:
+def _wrong_master(pod: Pod, rosproxy_id: Name, cluster_ip: str) -> str:
+    foreign = [uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy_id, cluster_ip)]
+    if foreign:
         return (
-            f"sets ROS_MASTER_URI={clean(others[0])[:200]} itself, which is not its proxy: take "
+            f"sets ROS_MASTER_URI={clean(foreign[0])[:200]} itself, which is not its proxy: take "
             "the variable out of its template, then create the pod anew"
         )
     if pod.wired and pod.wired != master_uri(cluster_ip):
@@ -132,72 +132,75 @@ def _wrong_master(pod: Pod, of: Name, cluster_ip: str) -> str:
         )
     if pod.wired or pod.own_masters:
         return ""
-    return never_told("ROS_MASTER_URI", pod, of)
+    return never_told("ROS_MASTER_URI", pod, rosproxy_id)
 
 
-def never_told(variable: str, pod: Pod, of: Name) -> str:
+def never_told(variable: str, pod: Pod, rosproxy_id: Name) -> str:
     """Why a pod has not got a variable of its proxy, and what to do about it."""
     text = f"has no {variable} of its proxy"
     if INJECT not in pod.labels:
-        label = f"{INJECT}={of.name}"
+        label = f"{INJECT}={rosproxy_id.name}"
         return f"{text}: add the label {label} to its template, then create the pod anew"
-    why = "since it was created while the webhook was not there or there was no RosProxy"
-    return f"{text}, {why}: create the pod anew"
+    reason = "since it was created while the webhook was not there or there was no RosProxy"
+    return f"{text}, {reason}: create the pod anew"
 
 
-def _is_proxys(uri: str, of: Name, cluster_ip: str) -> bool:
+def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name."""
     if uri == ELSEWHERE:
         return True
-    where, service = parse_slave_uri(uri.strip()), service_id(of)
-    if where is None or where.port != MASTER_PORT:
+    master, service = parse_slave_uri(uri.strip()), service_id(rosproxy_id)
+    if master is None or master.port != MASTER_PORT:
         return False
-    host, name = where.host.lower().rstrip("."), f"{service.name}.{service.namespace}"
+    host, name = master.host.lower().rstrip("."), f"{service.name}.{service.namespace}"
     return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
-def _addresses(to: Target) -> list[tuple[str, str, str]]:
+def _addresses(target: Target) -> list[tuple[str, str, str]]:
     """The annotation, the variable and the value of each address that a pod is to be told."""
-    every = ((MASTER_URI, VARIABLE, to.uri), (STATIC_PEERS, "ROS_STATIC_PEERS", to.static_peers))
-    return [one for one in every if one[2]]
+    variables = (
+        (MASTER_URI, VARIABLE, target.uri),
+        (STATIC_PEERS, "ROS_STATIC_PEERS", target.static_peers),
+    )
+    return [v for v in variables if v[2]]
 
 
-def _wired(container: Json, to: Target, notes: Mapping[str, str]) -> Json:
+def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> Json:
     variables = list(parts(container, "env"))
-    there = {word(one, "name") for one in variables}
-    first: list[Json] = []
-    for note, name, value in _addresses(to):
-        former = notes.get(note)
-        for place, one in enumerate(variables):
-            if one.get("name") == name and former and one.get("value") == former:
-                variables[place] = {**one, "value": value}
-        if name not in there:
-            first.append({"name": name, "value": value})
-    if to.uri and not there & {"ROS_IP", "ROS_HOSTNAME"}:
+    names = {word(v, "name") for v in variables}
+    added: list[Json] = []
+    for annotation, name, value in _addresses(target):
+        former = annotations.get(annotation)
+        for index, variable in enumerate(variables):
+            if variable.get("name") == name and former and variable.get("value") == former:
+                variables[index] = {**variable, "value": value}
+        if name not in names:
+            added.append({"name": name, "value": value})
+    if target.uri and not names & {"ROS_IP", "ROS_HOSTNAME"}:
         source = {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.podIP"}}
-        first.append({"name": "ROS_IP", "valueFrom": source})
-    if to.domain is not None and "ROS_DOMAIN_ID" not in there:
-        first.append({"name": "ROS_DOMAIN_ID", "value": str(to.domain)})
-    env = [*first, *variables]
+        added.append({"name": "ROS_IP", "valueFrom": source})
+    if target.domain is not None and "ROS_DOMAIN_ID" not in names:
+        added.append({"name": "ROS_DOMAIN_ID", "value": str(target.domain)})
+    env = [*added, *variables]
     return {**container, "env": env} if env else container
 
 
 def _value(container: Json, name: str) -> str:
     """A variable of a container; of several that count it is the last."""
     env = parts(container, "env")
-    return next((word(one, "value") for one in reversed(env) if one.get("name") == name), "")
+    return next((word(v, "value") for v in reversed(env) if v.get("name") == name), "")
 
 
-def _merged(own: Iterable[Json], more: Iterable[Json]) -> list[Json]:
+def _merged(own: Iterable[Json], added: Iterable[Json]) -> list[Json]:
     """Host aliases with others added: one entry per address, as the API server merges them."""
     merged = list(own)
-    for alias in more:
-        place = next((n for n, one in enumerate(merged) if one.get("ip") == alias.get("ip")), None)
-        if place is None:
+    for alias in added:
+        index = next((i for i, a in enumerate(merged) if a.get("ip") == alias.get("ip")), None)
+        if index is None:
             merged.append(alias)
             continue
-        there = list(merged[place].get("hostnames") or ())
-        new = [name for name in alias.get("hostnames") or () if name not in there]
-        if new:
-            merged[place] = {**merged[place], "hostnames": [*there, *new]}
+        hostnames = list(merged[index].get("hostnames") or ())
+        missing = [name for name in alias.get("hostnames") or () if name not in hostnames]
+        if missing:
+            merged[index] = {**merged[index], "hostnames": [*hostnames, *missing]}
     return merged

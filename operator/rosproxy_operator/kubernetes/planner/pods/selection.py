@@ -25,7 +25,7 @@ def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
     """
     if any(labels.get(key) != value for key, value in selector.labels.items()):
         return False
-    return all(_fits(*one, labels) for one in selector.expressions)
+    return all(_fits(*e, labels) for e in selector.expressions)
 
 
 def own_values(name: str) -> tuple[str, str]:
@@ -37,27 +37,27 @@ def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFindin
     """The RosProxy of a pod, of those of any namespace that are not being deleted.
 
     Of several it is the one that the pod's label names. A finding (reason Ambiguous or HostNetwork)
-    says why it has none though it was selected; None: it was not.
+    says why it has none though it was selected; None: no RosProxy selects it.
     """
-    taking = sorted((one for one in rosproxies if selects(one, pod)), key=lambda one: one.id)
-    named = [one for one in taking if one.id.name == pod.labels.get(INJECT)]
+    taking = sorted((r for r in rosproxies if selects(r, pod)), key=lambda r: r.id)
+    named = [r for r in taking if r.id.name == pod.labels.get(INJECT)]
     if not taking:
         return None
     if not named and len(taking) > 1:
-        names = [one.id.name for one in taking]
+        names = [r.id.name for r in taking]
         text = (
             f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to "
             f"one of them, as {INJECT}={names[0]}"
         )
         return pod_finding(pod, taking[0], "Ambiguous", text)
-    of = (named or taking)[0]
+    rosproxy = (named or taking)[0]
     if pod.host_network:
         text = (
             "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get "
             f"none: take hostNetwork off, or the label {INJECT}"
         )
-        return pod_finding(pod, of, "HostNetwork", text)
-    return of
+        return pod_finding(pod, rosproxy, "HostNetwork", text)
+    return rosproxy
 
 
 def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
@@ -66,22 +66,22 @@ def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     Empty if the pod is not labelled, or its label says that it is to be left alone.
     """
     label = pod.labels.get(INJECT, "")
-    there = sorted(one.id.name for one in rosproxies if one.id.namespace == pod.id.namespace)
+    names = sorted(r.id.name for r in rosproxies if r.id.namespace == pod.id.namespace)
     if label in OFF:
         return ""
     lost = "its ROS nodes are not reachable from outside"
-    if not there:
+    if not names:
         return (
             f"no RosProxy in namespace {pod.id.namespace}, so {lost}: create one there, then "
             "create the pod anew"
         )
-    if label not in (_ANY, *there):
+    if label not in (_ANY, *names):
         return (
             f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}: "
-            f"set it to {' or '.join(there)}, then create the pod anew"
+            f"set it to {' or '.join(names)}, then create the pod anew"
         )
     return (
-        f"spec.podSelector of RosProxy {' and '.join(there)} does not fit its labels, so {lost}: "
+        f"spec.podSelector of RosProxy {' and '.join(names)} does not fit its labels, so {lost}: "
         "change either, then create the pod anew"
     )
 
@@ -92,10 +92,10 @@ def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
 
 
 def selects(rosproxy: RosProxy, pod: Pod) -> bool:
-    """Whether a RosProxy that is not being deleted selects a pod, be it with others."""
+    """Whether a RosProxy that is not being deleted selects a pod, perhaps along with others."""
     label, selector = pod.labels.get(INJECT), rosproxy.spec.pod_selector
-    here = rosproxy.id.namespace == pod.id.namespace
-    if not here or rosproxy.deleting or label in OFF or _is_ours(pod.labels):
+    same_namespace = rosproxy.id.namespace == pod.id.namespace
+    if not same_namespace or rosproxy.deleting or label in OFF or _is_ours(pod.labels):
         return False
     if selector is None:
         return label in own_values(rosproxy.id.name)
@@ -104,8 +104,8 @@ def selects(rosproxy: RosProxy, pod: Pod) -> bool:
 
 def _is_ours(labels: Mapping[str, str]) -> bool:
     """Whether labels are those of a proxy, or of the operator as its chart labels it."""
-    whole = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
-    return is_own(labels) or (labels.get(COMPONENT_LABEL) == "operator" and "rosproxy" in whole)
+    names = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
+    return is_own(labels) or (labels.get(COMPONENT_LABEL) == "operator" and "rosproxy" in names)
 
 
 def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, str]) -> bool:

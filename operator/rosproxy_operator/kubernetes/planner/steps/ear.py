@@ -2,7 +2,7 @@
 
 An ear is a pod in its node's own network: it hears the LAN's multicast there, and the proxy at the
 last port of the proxy's range, which the ear holds. It has to know the proxy's address, so it is
-made once the proxy's pod has one, and anew when that is another. It has no right but that network.
+made once the proxy's pod has one, and anew when that changes. It has no right but that network.
 """
 
 from collections.abc import Iterable, Iterator
@@ -33,17 +33,17 @@ _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"me
 """An ear has 30 MiB and one thread."""
 
 
-def ear_pod(site: Site, ear: HostPort, proxy: str, settings: ClusterSettings) -> Json:
-    """The pod of an ear that listens at ``ear``, for the proxy whose pod has an address."""
-    of, ros2 = site.rosproxy, site.rosproxy.spec.ros2
-    notes = {NODE: site.node.name}
-    meta = metadata(of, ear_id(of.id, site.node.name), notes, EAR)
-    to = HostPort(proxy, site.ports.first)
-    variables = ear_variables(ros2.number if ros2 else 0, ear.host, ear, to)
-    policy = of.spec.image_pull_policy or settings.image_pull_policy
+def ear_pod(site: Site, ear: HostPort, proxy_address: str, settings: ClusterSettings) -> Json:
+    """The pod of an ear that listens at ``ear``, for the proxy at ``proxy_address``."""
+    rosproxy, ros2 = site.rosproxy, site.rosproxy.spec.ros2
+    annotations = {NODE: site.node.name}
+    meta = metadata(rosproxy, ear_id(rosproxy.id, site.node.name), annotations, EAR)
+    target = HostPort(proxy_address, site.ports.first)
+    variables = ear_variables(ros2.number if ros2 else 0, ear.host, ear, target)
+    policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
     container: dict[str, Any] = {
         "name": EAR,
-        "image": image_of(of, settings),
+        "image": image_of(rosproxy, settings),
         **({"imagePullPolicy": policy} if policy else {}),
         "command": [*EAR_COMMAND],
         "env": [{"name": name, "value": value} for name, value in variables.items()],
@@ -58,7 +58,7 @@ def ear_pod(site: Site, ear: HostPort, proxy: str, settings: ClusterSettings) ->
         },
     }
     spec = {
-        **bound_to(site.node.name, of.spec),
+        **bound_to(site.node.name, rosproxy.spec),
         "hostNetwork": True,
         "terminationGracePeriodSeconds": 1,
         "securityContext": dict(NOBODY),
@@ -67,38 +67,38 @@ def ear_pod(site: Site, ear: HostPort, proxy: str, settings: ClusterSettings) ->
     return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
 
 
-def reconcile_ears(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
+def reconcile_ears(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """The next actions for the ears of a RosProxy.
 
-    That of a proxy which is just being made anew stays, until the proxy has another address.
+    The ear of a proxy that is just being made anew stays until the proxy has another address.
     """
-    places = {*context.view.places.get(of.id, ())}
-    there = grouped((one.on, one) for one in context.observed.ears if one.owner == of.uid)
-    for on in sorted({*there, *(place.node for place in places)}):
-        place = ProxyPlace(of.id, on)
-        found, node = there.get(on, ()), context.observed.nodes.get(on)
+    places = {*context.view.places.get(rosproxy.id, ())}
+    ears_by_node = grouped((e.on, e) for e in context.observed.ears if e.owner == rosproxy.uid)
+    for node_name in sorted({*ears_by_node, *(place.node for place in places)}):
+        place = ProxyPlace(rosproxy.id, node_name)
+        ears, node = ears_by_node.get(node_name, ()), context.observed.nodes.get(node_name)
         if node is None or not node.ready:
             continue  # the garbage collector takes the pods of nodes that are gone
-        if place not in places or not of.spec.multicast:
-            yield from _deleted(context, found, "no proxy needs it")
+        if place not in places or not rosproxy.spec.multicast:
+            yield from _delete_ears(context, ears, "no proxy needs it")
         else:
-            yield from _wanted(context, place, found)
+            yield from _ensure_ear(context, place, ears)
 
 
-def ear_findings(context: ClusterContext, of: RosProxy) -> Iterator[ClusterFinding]:
+def ear_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
     """Where a RosProxy's proxy can't have an ear though it ought to."""
-    for place in context.view.places.get(of.id, ()) if of.spec.multicast else ():
+    for place in context.view.places.get(rosproxy.id, ()) if rosproxy.spec.multicast else ():
         site = site_of(context, place) if place in context.view.wanted else None
         if isinstance(site, Site) and site.ear is None:
             text = (
                 f"node {place.node} has no IPv4 address of type InternalIP, so its LAN is not "
                 "heard: name who is outside in spec.peers, and take spec.multicast off"
             )
-            yield finding(of, "NoLanAddress", text)
+            yield finding(rosproxy, "NoLanAddress", text)
 
 
-def _wanted(
-    context: ClusterContext, place: ProxyPlace, found: tuple[EarPod, ...]
+def _ensure_ear(
+    context: ClusterContext, place: ProxyPlace, ears: tuple[EarPod, ...]
 ) -> Iterator[Action]:
     current, wanted = context.view.current.get(place), place in context.view.wanted
     site = site_of(context, place) if wanted else None
@@ -107,14 +107,14 @@ def _wanted(
         return
     body = ear_pod(site, site.ear, address, context.settings)
     expected, id = fingerprint_of(body), ear_id(place.of, place.node)
-    wrong = [one for one in found if one.fingerprint != expected or one.pod.ended]
-    yield from _deleted(context, wrong, "made anew: its proxy or its settings have changed")
-    if not found and context.retries.ask(Task(place.of, "create", id)):
+    outdated = [ear for ear in ears if ear.fingerprint != expected or ear.pod.ended]
+    yield from _delete_ears(context, outdated, "made anew: its proxy or its settings have changed")
+    if not ears and context.retries.ask(Task(place.of, "create", id)):
         yield CreateEar(place.of, body)
 
 
-def _deleted(context: ClusterContext, ears: Iterable[EarPod], why: str) -> Iterator[Action]:
-    for one in ears:
-        task = Task(one.of, "delete", one.pod.id, one.pod.uid)
-        if not one.pod.deleting and context.retries.ask(task):
-            yield DeleteEar(one.of, one.pod.id, one.pod.uid, why)
+def _delete_ears(context: ClusterContext, ears: Iterable[EarPod], why: str) -> Iterator[Action]:
+    for ear in ears:
+        task = Task(ear.of, "delete", ear.pod.id, ear.pod.uid)
+        if not ear.pod.deleting and context.retries.ask(task):
+            yield DeleteEar(ear.of, ear.pod.id, ear.pod.uid, why)

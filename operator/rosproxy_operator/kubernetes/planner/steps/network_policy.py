@@ -14,7 +14,7 @@ and a proxy that gets a range finds it open.
 
 That of the pods says to what they may connect (`pods_policy`); there is one with ``podEgress:
 Proxy`` alone. The selected pods reach the proxies, one another and any DNS server, and
-nothing else. All that they have of outside then comes through their proxy, where rules hold.
+nothing else. All their traffic with outside then goes through their proxy, where rules hold.
 """
 
 from collections.abc import Iterable, Iterator
@@ -59,7 +59,7 @@ def policy(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
 
 def pods_policy(rosproxy: RosProxy) -> Json:
     """The NetworkPolicy of the pods that a RosProxy selects."""
-    pods = _selected(rosproxy)
+    pods = _pod_selector(rosproxy)
     dns = [{"protocol": protocol, "port": 53} for protocol in ("UDP", "TCP")]
     spec = {
         "podSelector": pods,
@@ -78,92 +78,92 @@ def pods_policy(rosproxy: RosProxy) -> Json:
     }
 
 
-def wanted_policies(of: RosProxy, settings: ClusterSettings) -> dict[Name, Json]:
+def wanted_policies(rosproxy: RosProxy, settings: ClusterSettings) -> dict[Name, Json]:
     """The NetworkPolicies that a RosProxy is to have, by their names."""
     if not settings.network_policy:
         return {}
-    wanted = {policy_id(of.id): policy(of, settings)}
-    if of.spec.pod_egress == "proxy":
-        wanted[pods_policy_id(of.id)] = pods_policy(of)
+    wanted = {policy_id(rosproxy.id): policy(rosproxy, settings)}
+    if rosproxy.spec.pod_egress == "proxy":
+        wanted[pods_policy_id(rosproxy.id)] = pods_policy(rosproxy)
     return wanted
 
 
-def reconcile_policies(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
+def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """Make, mend or remove the NetworkPolicies of a RosProxy."""
     if context.observed.no_policies:
         return
-    wanted = wanted_policies(of, context.settings)
-    there = {name: one for name, one in context.observed.policies.items() if one.of == of.id}
-    for found in there.values():
-        if found.owner != of.uid:
-            yield from _delete(context, found, "it is that of a RosProxy that is gone")
-        elif found.id not in wanted:
+    wanted = wanted_policies(rosproxy, context.settings)
+    existing = {name: p for name, p in context.observed.policies.items() if p.of == rosproxy.id}
+    for current in existing.values():
+        if current.owner != rosproxy.uid:
+            yield from _delete(context, current, "it is that of a RosProxy that is gone")
+        elif current.id not in wanted:
             on = context.settings.network_policy
-            yield from _delete(context, found, "not asked for" if on else "--no-network-policy")
+            yield from _delete(context, current, "not asked for" if on else "--no-network-policy")
     for name, body in wanted.items():
-        yield from _keep(context, of, body, there.get(name))
+        yield from _keep(context, rosproxy, body, existing.get(name))
 
 
 def _keep(
-    context: ClusterContext, of: RosProxy, body: Json, there: ProxyPolicy | None
+    context: ClusterContext, rosproxy: RosProxy, body: Json, current: ProxyPolicy | None
 ) -> Iterator[Action]:
     """Make a policy that is not there, or mend the one that is."""
     name, ask = name_of(body["metadata"]), context.retries.ask
-    if there is None:
-        if ask(Task(of.id, "create policy", name)):
-            yield CreatePolicy(of.id, body)
+    if current is None:
+        if ask(Task(rosproxy.id, "create policy", name)):
+            yield CreatePolicy(rosproxy.id, body)
         return
-    changed = there.owner == of.uid and there.spec != body["spec"]
-    if changed and ask(Task(of.id, "set policy", name, there.uid)):
-        yield SetPolicy(of.id, name, there.uid, body["spec"])
+    changed = current.owner == rosproxy.uid and current.spec != body["spec"]
+    if changed and ask(Task(rosproxy.id, "set policy", name, current.uid)):
+        yield SetPolicy(rosproxy.id, name, current.uid, body["spec"])
 
 
 def reconcile_orphaned_policies(context: ClusterContext) -> Iterator[Action]:
     """Delete the policies of RosProxies that are gone; the garbage collector may come first."""
-    unusable = {one.uid for one in context.observed.unusable.values()}
-    for there in context.observed.policies.values():
-        if there.of not in context.view.rosproxies and there.owner not in unusable:
-            yield from _delete(context, there, "its RosProxy is gone")
+    unusable = {r.uid for r in context.observed.unusable.values()}
+    for current in context.observed.policies.values():
+        if current.of not in context.view.rosproxies and current.owner not in unusable:
+            yield from _delete(context, current, "its RosProxy is gone")
 
 
-def _delete(context: ClusterContext, there: ProxyPolicy, why: str) -> Iterator[Action]:
-    task = Task(there.of, "delete policy", there.id, there.uid)
-    if not there.deleting and context.retries.ask(task):
-        yield DeletePolicy(there.of, there.id, there.uid, why)
+def _delete(context: ClusterContext, current: ProxyPolicy, why: str) -> Iterator[Action]:
+    task = Task(current.of, "delete policy", current.id, current.uid)
+    if not current.deleting and context.retries.ask(task):
+        yield DeletePolicy(current.of, current.id, current.uid, why)
 
 
-def _spec(of: RosProxy, settings: ClusterSettings) -> Json:
-    """As the API server gives it back: whether it is there as it ought to be is told by that."""
+def _spec(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
+    """The spec as the API server gives it back: it is compared with the one that exists."""
     admin: dict[str, Any] = {"ports": [_port(ADMIN_PORT)]}
     if settings.admin_from is not None:
-        admin["from"] = [dict(one) for one in settings.admin_from]
+        admin["from"] = [dict(peer) for peer in settings.admin_from]
     return {
-        "podSelector": {"matchLabels": own_labels(of.id.name)},
+        "podSelector": {"matchLabels": own_labels(rosproxy.id.name)},
         "policyTypes": ["Ingress"],
         "ingress": [
-            {"ports": [*_open(of)]},
-            {"ports": [*_for_pods(of)], "from": [{"podSelector": _selected(of)}]},
+            {"ports": [*_public_ports(rosproxy)]},
+            {"ports": [*_pod_ports(rosproxy)], "from": [{"podSelector": _pod_selector(rosproxy)}]},
             admin,
         ],
     }
 
 
-def _open(of: RosProxy) -> Iterator[Json]:
+def _public_ports(rosproxy: RosProxy) -> Iterator[Json]:
     """The ports that are for everybody: never the proxy's own, even if the window has them."""
-    known = well_known_ports(of.spec.ros2.number) if of.spec.ros2 else ()
-    own = (MASTER_PORT, ADMIN_PORT, *known)
-    for protocol in _protocols(of):
-        for first, last in _but_for(of.spec.window, own):
+    ros2_ports = well_known_ports(rosproxy.spec.ros2.number) if rosproxy.spec.ros2 else ()
+    own_ports = (MASTER_PORT, ADMIN_PORT, *ros2_ports)
+    for protocol in _protocols(rosproxy):
+        for first, last in _ranges_without(rosproxy.spec.window, own_ports):
             yield _port(first, last, protocol)
-    publish = of.spec.master.publish
-    if publish and publish not in of.spec.window:
+    publish = rosproxy.spec.master.publish
+    if publish and publish not in rosproxy.spec.window:
         yield _port(publish)
 
 
-def _but_for(window: PortRange, own: Iterable[int]) -> Iterator[tuple[int, int]]:
-    """The ports of a window but for some, as ranges of first and last."""
+def _ranges_without(window: PortRange, excluded: Iterable[int]) -> Iterator[tuple[int, int]]:
+    """The ports of a window but for excluded ones, as ranges of first and last."""
     first = window.first
-    for port in sorted(own):
+    for port in sorted(excluded):
         if first <= port <= window.last:
             if first < port:
                 yield first, port - 1
@@ -172,31 +172,31 @@ def _but_for(window: PortRange, own: Iterable[int]) -> Iterator[tuple[int, int]]
         yield first, window.last
 
 
-def _protocols(of: RosProxy) -> list[str]:
-    return [*(["TCP"] if of.spec.ros1 else []), *(["UDP"] if of.spec.takes_udp else [])]
+def _protocols(rosproxy: RosProxy) -> list[str]:
+    return [*(["TCP"] if rosproxy.spec.ros1 else []), *(["UDP"] if rosproxy.spec.takes_udp else [])]
 
 
-def _for_pods(of: RosProxy) -> Iterator[Json]:
-    if of.spec.ros1:
+def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
+    if rosproxy.spec.ros1:
         yield _port(MASTER_PORT)
-        if of.spec.direction == "both":
+        if rosproxy.spec.direction == "both":
             yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1])
-    if of.spec.ros2:
-        yield _port(discovery_port(of.spec.ros2.number), protocol="UDP")
-    if of.spec.ros2 or of.spec.direction == "both":
+    if rosproxy.spec.ros2:
+        yield _port(discovery_port(rosproxy.spec.ros2.number), protocol="UDP")
+    if rosproxy.spec.ros2 or rosproxy.spec.direction == "both":
         yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1], "UDP")
 
 
 def _port(first: int, last: int = 0, protocol: str = "TCP") -> Json:
-    more = {"endPort": last} if last > first else {}
-    return {"protocol": protocol, "port": first, **more}
+    end = {"endPort": last} if last > first else {}
+    return {"protocol": protocol, "port": first, **end}
 
 
-def _selected(of: RosProxy) -> Json:
+def _pod_selector(rosproxy: RosProxy) -> Json:
     """The selector of the pods that a RosProxy takes, as in `selection`."""
-    selector = of.spec.pod_selector
+    selector = rosproxy.spec.pod_selector
     if selector is None:
-        values = sorted(own_values(of.id.name))
+        values = sorted(own_values(rosproxy.id.name))
         return {"matchExpressions": [{"key": INJECT, "operator": "In", "values": values}]}
     expressions: list[Json] = [
         {"key": key, "operator": operator, **({"values": sorted(values)} if values else {})}

@@ -63,7 +63,7 @@ class Call(msgspec.Struct, frozen=True):
         return self.params[index] if self.params[index].kind == "string" else None
 
     def string(self, index: int | None) -> str | None:
-        """The text of that."""
+        """The text of parameter ``index`` if it is there and a string, else None."""
         value = self.string_value(index)
         return value.text if value else None
 
@@ -100,11 +100,11 @@ def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
 
     Several insertions at one place keep the order in which they are given.
     """
-    parts, position = [], 0
+    pieces, position = [], 0
     for edit in sorted(edits, key=lambda edit: (edit.start, edit.end)):
-        parts += [body[position : edit.start], edit.text]
+        pieces += [body[position : edit.start], edit.text]
         position = edit.end
-    return b"".join([*parts, body[position:]])
+    return b"".join([*pieces, body[position:]])
 
 
 def parse_call(body: bytes, limits: Limits = OWN_REPLY) -> Call:
@@ -150,8 +150,8 @@ def parse_response(body: bytes, limits: Limits = OWN_REPLY) -> tuple[Value, bool
 
 def read_response(body: bytes, limits: Limits = OWN_REPLY) -> Any:
     """What a reply of the master's or a node's holds, a fault's value too. Raises XmlRpcError."""
-    found = fast.lists(body, limits)
-    return python_value(parse_response(body, limits)[0]) if found is None else found
+    plain = fast.lists(body, limits)
+    return python_value(parse_response(body, limits)[0]) if plain is None else plain
 
 
 def dump_call(method: str, *params: Any) -> bytes:

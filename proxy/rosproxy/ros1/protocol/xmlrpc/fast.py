@@ -63,7 +63,7 @@ _Tokens = Iterator[re.Match[bytes]]
 
 
 class _NotPlain(Exception):
-    """A document of another form, or of none."""
+    """A document that is not of the plain form."""
 
 
 def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | None:
@@ -96,25 +96,25 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
         return None
     top = list[Any]()
     end = _read_lists(body, param.end(), top, (limits.depth - len(_AROUND)) // 3)
-    found = top[0] if end is not None and _LAST_PARAM.match(body, end) else None
-    return found if isinstance(found, list) else None
+    value = top[0] if end is not None and _LAST_PARAM.match(body, end) else None
+    return value if isinstance(value, list) else None
 
 
 def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
-    """Read one value into a list, with at most so many lists in each other; where it ends."""
-    around, match = [top], _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
-    while (token := match()) and len(around) <= depth:
-        which = token.lastindex
-        if which == _STRING:
-            around[-1].append(token[_STRING].decode())
-        elif which == _INTEGER:
-            around[-1].append(int(token[_INTEGER]))
-        elif which == _LIST:
-            around[-1].append([])
-            around.append(around[-1][-1])
+    """Read one value into ``top``, with at most ``depth`` lists in each other; where it ends."""
+    stack, match = [top], _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
+    while (token := match()) and len(stack) <= depth:
+        group = token.lastindex
+        if group == _STRING:
+            stack[-1].append(token[_STRING].decode())
+        elif group == _INTEGER:
+            stack[-1].append(int(token[_INTEGER]))
+        elif group == _LIST:
+            stack[-1].append([])
+            stack.append(stack[-1][-1])
         else:
-            around.pop()
-        if len(around) < 2:
+            stack.pop()
+        if len(stack) < 2:
             return int(token.end())
     return None
 
@@ -129,7 +129,7 @@ def _is_plain(body: bytes, limits: Limits) -> bool:
 
 
 def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list[Value] | None:
-    tokens, params, place = _TOKEN.finditer(body, start), list[Value](), start
+    tokens, params, position = _TOKEN.finditer(body, start), list[Value](), start
     try:
         for token in tokens:
             if token.lastindex != _PARAM:
@@ -138,27 +138,27 @@ def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list
             last = next(tokens)
             if last.lastindex != _PARAM_END:
                 return None
-            place = last.end()
+            position = last.end()
     except (_NotPlain, StopIteration):
         return None
-    return params if end.match(body, place) else None
+    return params if end.match(body, position) else None
 
 
 def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> Value:
     """The value that a token begins; ``depth`` is how many elements may be around its text."""
-    which = token.lastindex
+    group = token.lastindex
     start, inside = token.span(_VALUE)
-    if which == _TYPED and depth > 1:
+    if group == _TYPED and depth > 1:
         kind = _KINDS[token[_TYPE]]
         return Value(body, "utf-8", kind, (start, token.end()), token.span(_TYPED), [], [])
-    if which == _TEXT and depth:
+    if group == _TEXT and depth:
         return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
     if depth < 4:
         raise _NotPlain
     items, members = list[Value](), list[str]()
-    if which == _ARRAY:
+    if group == _ARRAY:
         kind, end = "array", _array(body, tokens, depth - 3, items)
-    elif which == _STRUCT:
+    elif group == _STRUCT:
         kind, end = "struct", _struct(body, tokens, depth - 3, items, members)
     else:
         raise _NotPlain

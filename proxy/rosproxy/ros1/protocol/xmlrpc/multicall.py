@@ -78,9 +78,9 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
     """
     edits, items = [], array.items
     for done, (index, raw) in enumerate(inserts):
-        before = index - done
-        place = items[before].outer[0] if before < len(items) else items[-1].outer[1]
-        edits.append(Edit(place, place, raw))
+        successor = index - done
+        offset = items[successor].outer[0] if successor < len(items) else items[-1].outer[1]
+        edits.append(Edit(offset, offset, raw))
     return edits
 
 

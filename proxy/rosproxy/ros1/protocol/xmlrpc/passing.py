@@ -63,15 +63,15 @@ _LEVELS = (
     {"string", "array"},
 )
 """The elements of a multicall, from the root down to what a call's members hold."""
-_CALL, _MEMBER, _PART, _HELD = 8, 9, 10, 11
+_CALL_DEPTH, _MEMBER_DEPTH, _FIELD_DEPTH, _CONTENT_DEPTH = 8, 9, 10, 11
 """How deep a call's struct lies, its members, their names and values, and what the values hold."""
 _METHOD, _PARAMS = ["name:methodName", "value"], ["name:params", "value", "array"]
 
 
 def method_of(head: bytes) -> str | None:
     """The method of a call whose document begins so; None if that can't be told from its head."""
-    found = _HEAD.match(head, 0, HEAD)
-    return found[2].decode() if found else None
+    match = _HEAD.match(head, 0, HEAD)
+    return match[2].decode() if match else None
 
 
 def first_strings(head: bytes, count: int) -> list[str | None]:
@@ -79,9 +79,9 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
 
     None for one that can't be told for sure, and fewer from there on.
     """
-    found = _HEAD.match(head, 0, HEAD)
-    position, strings = found.end() if found else 0, list[str | None]()
-    opening = _PARAMS_BEGIN.match(head, position) if found else None
+    match = _HEAD.match(head, 0, HEAD)
+    position, strings = match.end() if match else 0, list[str | None]()
+    opening = _PARAMS_BEGIN.match(head, position) if match else None
     position = opening.end() if opening else 0
     for _ in range(count if opening else 0):
         param = _STRING_PARAM.match(head, position)
@@ -94,48 +94,48 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
 
 def status_of(head: bytes) -> int | None:
     """The ROS status of a reply that begins so; None if that can't be told from its head."""
-    found = _STATUS.match(head, 0, HEAD)
-    return int(found[2]) if found else None
+    match = _STATUS.match(head, 0, HEAD)
+    return int(match[2]) if match else None
 
 
 class CallWatch:
-    """Sees a document go by, from its head on."""
+    """Watches a document that passes, from its head on."""
 
     def __init__(self) -> None:
-        self._seen: bytes | None = None
+        self._tail: bytes | None = None
         self._nested = 0
 
     def see(self, piece: bytes) -> None:
         """Look at the next piece; the first one holds the method. Raises XmlRpcError."""
-        if self._seen is None:
+        if self._tail is None:
             head = _HEAD.match(piece)
             piece = piece[head.end() :] if head else piece
-        text = (self._seen or b"") + piece
-        found = _FORBIDDEN.search(text) if any(hint in text for hint in _HINTS) else None
-        if found:
-            what = found[0].decode("latin-1").strip("\0<:/> \t\r\n") or "a NUL byte"
-            raise XmlRpcError(INVALID_REQUEST, f"{what} inside of a long call")
+        text = (self._tail or b"") + piece
+        match = _FORBIDDEN.search(text) if any(hint in text for hint in _HINTS) else None
+        if match:
+            token = match[0].decode("latin-1").strip("\0<:/> \t\r\n") or "a NUL byte"
+            raise XmlRpcError(INVALID_REQUEST, f"{token} inside of a long call")
         for tag in _NESTING.finditer(text):
-            if tag.end() <= len(self._seen or b""):  # seen with the piece before
+            if tag.end() <= len(self._tail or b""):  # seen with the piece before
                 continue
             self._nested = max(self._nested - 1, 0) if tag[1] else self._nested + 1
             if self._nested > NESTED:
                 raise XmlRpcError(PARSE_ERROR, f"more than {NESTED} arrays in each other")
-        self._seen = text[1 - _LONGEST :]
+        self._tail = text[1 - _LONGEST :]
 
     def end(self) -> None:
         """All of it was seen. Raises XmlRpcError if it should not have ended."""
 
 
 class MulticallWatch(CallWatch):
-    """Sees a multicall go by; ``may_pass`` says of each method whether it passes unread."""
+    """Watches a multicall that passes; ``may_pass`` says whether calls of a method pass unread."""
 
     def __init__(self, may_pass: Callable[[str], bool]) -> None:
         super().__init__()
         self._may_pass = may_pass
         self._depth = 0
         self._text = ""
-        self._parts: list[str] = []
+        self._elements: list[str] = []
         self._members: list[str] = []
         self._parser = parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
@@ -160,41 +160,41 @@ class MulticallWatch(CallWatch):
         self._depth += 1
         if self._depth > DEPTH:
             raise XmlRpcError(PARSE_ERROR, f"nested deeper than {DEPTH} elements")
-        if self._depth > _HELD:
+        if self._depth > _CONTENT_DEPTH:
             return
         if name not in _LEVELS[self._depth - 1]:
             raise XmlRpcError(INVALID_REQUEST, f"<{name[:40]}> in a long {MULTICALL}")
-        if self._depth == _CALL:
+        if self._depth == _CALL_DEPTH:
             self._members = []
-        elif self._depth == _MEMBER:
-            self._parts = []
-        elif self._depth >= _PART:
-            self._parts.append(name)
+        elif self._depth == _MEMBER_DEPTH:
+            self._elements = []
+        elif self._depth >= _FIELD_DEPTH:
+            self._elements.append(name)
             self._text = ""
-            self._parser.CharacterDataHandler = None if name == "array" else self._add
+            self._parser.CharacterDataHandler = None if name == "array" else self._add_text
 
     def _end(self, name: str) -> None:
-        if self._depth == _PART and name == "name":
-            self._parts[-1] += f":{self._text}"
-        elif self._depth == _MEMBER:
+        if self._depth == _FIELD_DEPTH and name == "name":
+            self._elements[-1] += f":{self._text}"
+        elif self._depth == _MEMBER_DEPTH:
             self._end_member()
-        elif self._depth == _CALL and sorted(self._members) != ["methodName", "params"]:
+        elif self._depth == _CALL_DEPTH and sorted(self._members) != ["methodName", "params"]:
             raise XmlRpcError(INVALID_REQUEST, f"a call of {MULTICALL} needs a method and params")
-        if self._depth in (_PART, _HELD):
+        if self._depth in (_FIELD_DEPTH, _CONTENT_DEPTH):
             self._parser.CharacterDataHandler = None
         self._depth -= 1
 
     def _end_member(self) -> None:
-        if self._parts == _PARAMS:
+        if self._elements == _PARAMS:
             self._members.append("params")
-        elif self._parts in (_METHOD, [*_METHOD, "string"]):
+        elif self._elements in (_METHOD, [*_METHOD, "string"]):
             self._members.append("methodName")
             if self._text == MULTICALL or not self._may_pass(self._text):
                 raise XmlRpcError(INVALID_REQUEST, f"{self._text} in a long {MULTICALL}")
         else:
             raise XmlRpcError(INVALID_REQUEST, f"an odd member of a call in a long {MULTICALL}")
 
-    def _add(self, text: str) -> None:
+    def _add_text(self, text: str) -> None:
         self._text += text
         if len(self._text) > HEAD:
             raise XmlRpcError(INVALID_REQUEST, f"a name of more than {HEAD} characters")

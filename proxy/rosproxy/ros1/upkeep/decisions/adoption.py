@@ -40,8 +40,8 @@ class DirectNode(msgspec.Struct, frozen=True):
 
     @property
     def topics(self) -> set[str]:
-        """Its topics, without everybody's /rosout as far as it has others."""
-        names = {held.name for held in self.registrations if held.kind in TOPIC_KINDS}
+        """Its topics, without /rosout, which nearly every node has, if it has others."""
+        names = {r.name for r in self.registrations if r.kind in TOPIC_KINDS}
         return names - {ROSOUT} or names
 
 
@@ -49,53 +49,53 @@ def find_direct(
     graph: Graph, arrived: Iterable[Container], addressing: Addressing
 ) -> list[DirectNode]:
     """The nodes of a master whose URI may mean one of the containers that have arrived."""
-    found, containers = [], list(arrived)
+    direct_nodes, containers = [], list(arrived)
     for name, uri in graph.uris.items():
-        where = parse_slave_uri(uri)
-        if where is None or addressing.advertises(where):
+        slave = parse_slave_uri(uri)
+        if slave is None or addressing.advertises(slave):
             continue
-        host = where.host.lower()
-        called = dict.fromkeys(a for a, names in containers if host in (a, *names))
-        if called:
-            places = tuple(HostPort(address, where.port) for address in called)
-            found.append(DirectNode(name, uri, places, tuple(graph.held.get(name, ()))))
-    return found
+        host = slave.host.lower()
+        addresses = dict.fromkeys(a for a, names in containers if host in (a, *names))
+        if addresses:
+            slaves = tuple(HostPort(address, slave.port) for address in addresses)
+            direct_nodes.append(DirectNode(name, uri, slaves, tuple(graph.held.get(name, ()))))
+    return direct_nodes
 
 
 def locate(
     nodes: Iterable[DirectNode],
     infos: Mapping[HostPort, NodeInfo],
-    sure: Collection[tuple[str, HostPort]] = (),
+    verified: Collection[tuple[str, HostPort]] = (),
 ) -> tuple[dict[HostPort, list[DirectNode]], dict[str, str]]:
     """Where each node is, and why some are left alone, by name.
 
-    ``infos`` is what the node at a place says of itself; places without a node are missing. Those
-    that are ``sure``, by name and place, have borne out what is registered for them.
+    ``infos`` is what the node at a slave address says of itself; addresses without a node are
+    missing. Nodes that are ``verified``, by name and address, bear out what is registered for them.
     """
-    found: dict[HostPort, list[DirectNode]] = {}
+    located: dict[HostPort, list[DirectNode]] = {}
     doubts: dict[str, str] = {}
     for node in nodes:
-        places = [p for p in node.places if p in infos and (node.caller_id, p) in sure]
-        likely = {place: _score(node, infos[place]) for place in places}
-        best = [place for place, score in likely.items() if score == max(likely.values())]
+        slaves = [s for s in node.places if s in infos and (node.caller_id, s) in verified]
+        scores = {slave: _score(node, infos[slave]) for slave in slaves}
+        best = [slave for slave, score in scores.items() if score == max(scores.values())]
         if len(best) == 1:
-            found.setdefault(best[0], []).append(node)
+            located.setdefault(best[0], []).append(node)
         else:
             doubts[node.caller_id] = _doubt(node, best, infos)
-    return found, doubts
+    return located, doubts
 
 
 def renamed_node(caller_id: str, reason: str) -> str | None:
-    """The name whose URI has changed, if that is why somebody calls ``shutdown``."""
-    found = _NEW_URI.match(reason)
-    return found[1] if found and caller_id == "/master" else None
+    """The name whose URI has changed, if that is why ``shutdown`` is called."""
+    match = _NEW_URI.match(reason)
+    return match[1] if match and caller_id == "/master" else None
 
 
 def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool:
     """Whether no other node has taken a name of an endpoint, which the master has by a URI now.
 
-    The master calls ``shutdown`` at the URI that the name had before. The new one may be a former
-    one of the same node, which has registered around the proxy, or is advertised again by now.
+    The master calls ``shutdown`` at the URI that the name had before. The new URI may be a former
+    one of the same node, which registered around the proxy, or the advertised one again by now.
     """
     if uri is None:
         return endpoint.direct
@@ -103,17 +103,17 @@ def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool
 
 
 def _score(node: DirectNode, info: NodeInfo) -> int:
-    """How well the topics of whoever answers at a place fit a node."""
-    told = Counter(info.has(topic) for topic in node.topics)
-    return told[True] - told[False]
+    """How well the topics of the node that answers at an address fit a direct node."""
+    counts = Counter(info.has(topic) for topic in node.topics)
+    return counts[True] - counts[False]
 
 
 def _doubt(node: DirectNode, best: list[HostPort], infos: Mapping[HostPort, NodeInfo]) -> str:
-    places = ", ".join(map(str, node.places))
+    slaves = ", ".join(map(str, node.places))
     if best:
-        why = f"could be at {' and '.join(map(str, best))}; left alone"
-    elif any(place in infos for place in node.places):
-        why = f"the node at {places} is another"
+        reason = f"could be at {' and '.join(map(str, best))}; left alone"
+    elif any(slave in infos for slave in node.places):
+        reason = f"the node at {slaves} is another"
     else:
-        why = f"no node answers at {places}"
-    return f"registered as {node.uri} around the proxy: {why}"
+        reason = f"no node answers at {slaves}"
+    return f"registered as {node.uri} around the proxy: {reason}"

@@ -74,8 +74,8 @@ def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint
     """
 
     def is_spared(endpoint: Endpoint) -> bool:
-        held = endpoint.registrations.values()
-        return endpoint.pending > 0 or any(one.since >= since for one in held)
+        registrations = endpoint.registrations.values()
+        return endpoint.pending > 0 or any(r.since >= since for r in registrations)
 
     return [
         endpoint
@@ -88,9 +88,9 @@ def movable(
     endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
 ) -> dict[Endpoint, str]:
     """The endpoints at addresses that have changed, with their new one, if that is inside."""
-    found = {e: moved.get(e.location.address, "") for e in endpoints}
+    moves = {e: moved.get(e.location.address, "") for e in endpoints}
     return {
-        e: new for e, new in found.items() if new != e.location.address and is_inside(new, networks)
+        e: new for e, new in moves.items() if new != e.location.address and is_inside(new, networks)
     }
 
 
@@ -100,17 +100,17 @@ def new_place(endpoint: Endpoint, address: str) -> NodeLocation:
     Neighbours are sent through the proxy from now on, even if the node's host name leads there:
     to a URI that they know already, rospy doesn't connect again.
     """
-    host, before = endpoint.node.host, endpoint.location
+    host, previous = endpoint.node.host, endpoint.location
     stale = is_address(host) and not is_loopback(host) and host != address
-    return NodeLocation(address, named=False, confirmed=before.confirmed, stale=stale)
+    return NodeLocation(address, named=False, confirmed=previous.confirmed, stale=stale)
 
 
-def is_same_process(known: int | None, pid: int | None, borne_out: bool | None) -> bool:
+def is_same_process(known_pid: int | None, pid: int | None, borne_out: bool | None) -> bool:
     """Whether the node that answers elsewhere with a pid is one with a known pid.
 
     In a container of its own every node has the same pid, so the node has to bear out as well what
     it has registered; if that can't be told (None), the pid alone decides.
     """
-    if pid is not None and known not in UNKNOWN_PID and known != pid:
+    if pid is not None and known_pid not in UNKNOWN_PID and known_pid != pid:
         return False
-    return known == pid and pid is not None if borne_out is None else borne_out
+    return known_pid == pid and pid is not None if borne_out is None else borne_out

@@ -45,7 +45,7 @@ class Claim:
     @property
     def topics(self) -> set[str]:
         """The topics that the master has for it."""
-        return {held.name for held in self.registrations if held.kind in TOPIC_KINDS}
+        return {r.name for r in self.registrations if r.kind in TOPIC_KINDS}
 
     @property
     def uri(self) -> str:
@@ -58,60 +58,60 @@ def claims(
 ) -> tuple[list[Claim], dict[str, list[Registration]]]:
     """The endpoints of this proxy among the nodes of a master, by what it remembers of each port.
 
-    Second what the master has by advertised URIs of which nothing is remembered.
+    Second, by URI, what the master has by advertised URIs of which nothing is remembered.
     """
-    found, forgotten = dict[str, Claim](), dict[str, list[Registration]]()
+    claims_by_uri, forgotten = dict[str, Claim](), dict[str, list[Registration]]()
     for node, uri in graph.uris.items():
         port = addressing.lease_of(uri)
         if port is None:
             continue
-        lease, held = memory.get(port), graph.held.get(node, [])
+        lease, registrations = memory.get(port), graph.held.get(node, [])
         inside = parse_inside_path(uri) or (lease.node if lease else None)
         if inside is None:
-            forgotten.setdefault(uri, []).extend(held)
+            forgotten.setdefault(uri, []).extend(registrations)
             continue
         claim = Claim(port, inside.node, inside.slave, advertised=uri, path=inside.path)
         claim.service_ports = lease.service_ports if lease else ()
-        found.setdefault(uri, claim).registrations += held
-    return list(found.values()), forgotten
+        claims_by_uri.setdefault(uri, claim).registrations += registrations
+    return list(claims_by_uri.values()), forgotten
 
 
-def contested(found: Sequence[Claim]) -> list[Claim]:
+def contested(candidates: Sequence[Claim]) -> list[Claim]:
     """The claims that share their port or their inside address with another."""
-    ports, slaves = Counter(c.port for c in found), Counter(c.slave for c in found)
-    return [claim for claim in found if ports[claim.port] > 1 or slaves[claim.slave] > 1]
+    ports, slaves = Counter(c.port for c in candidates), Counter(c.slave for c in candidates)
+    return [claim for claim in candidates if ports[claim.port] > 1 or slaves[claim.slave] > 1]
 
 
-def settle(found: Sequence[Claim]) -> list[Claim]:
+def settle(candidates: Sequence[Claim]) -> list[Claim]:
     """One claim per port and inside address: the one that its node bears out best."""
 
     def merit(claim: Claim) -> tuple[int, int]:
         count = len(claim.registrations)
         if claim.said is None:
             return NO_MERIT, count
-        told = Counter(claim.said.has(topic) for topic in claim.topics)
-        return told[True] - told[False], count
+        counts = Counter(claim.said.has(topic) for topic in claim.topics)
+        return counts[True] - counts[False], count
 
-    ports: dict[int, Claim] = {}
+    claims_by_port: dict[int, Claim] = {}
     slaves: set[HostPort] = set()
-    for claim in sorted(found, key=merit, reverse=True):
-        if claim.port not in ports and claim.slave not in slaves:
-            ports[claim.port] = claim
+    for claim in sorted(candidates, key=merit, reverse=True):
+        if claim.port not in claims_by_port and claim.slave not in slaves:
+            claims_by_port[claim.port] = claim
             slaves.add(claim.slave)
-    return list(ports.values())
+    return list(claims_by_port.values())
 
 
-def confirmed_by(held: Iterable[Registration], info: NodeInfo) -> bool | None:
+def confirmed_by(registrations: Iterable[Registration], info: NodeInfo) -> bool | None:
     """Whether what a node says of its topics bears out what is registered for it.
 
     A forged URI that leads to something other than the node of that name finds no answer here,
     or one of another node. None: it does not tell, or no topic is registered.
     """
-    topics = {one.name for one in held if one.kind in TOPIC_KINDS}
-    told = [info.has(topic) for topic in (topics - {ROSOUT} or topics)]
-    if any(told):
+    topics = {r.name for r in registrations if r.kind in TOPIC_KINDS}
+    answers = [info.has(topic) for topic in (topics - {ROSOUT} or topics)]
+    if any(answers):
         return True
-    return False if told and None not in told else None
+    return False if answers and None not in answers else None
 
 
 def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registration]]:
@@ -120,26 +120,26 @@ def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registratio
     Several names at one slave URI are several processes, as a rule: a port is used again, and the
     master keeps what the one before had until it is taken back.
     """
-    names: dict[str, list[Registration]] = {}
+    registrations_by_name: dict[str, list[Registration]] = {}
     for registration in registrations:
-        names.setdefault(registration.caller_id, []).append(registration)
-    return names
+        registrations_by_name.setdefault(registration.caller_id, []).append(registration)
+    return registrations_by_name
 
 
 def others(registrations: Iterable[Registration], info: NodeInfo) -> list[Registration]:
-    """What names have registered that the node which says this of itself does not bear out."""
-    names = by_name(registrations).values()
-    return [one for own in names if confirmed_by(own, info) is False for one in own]
+    """The registrations of names that a node does not bear out by what it says of itself."""
+    groups = by_name(registrations).values()
+    return [r for group in groups if confirmed_by(group, info) is False for r in group]
 
 
-def to_ask(held: Iterable[Registration]) -> tuple[list[str], list[Registration]]:
+def to_ask(registrations: Iterable[Registration]) -> tuple[list[str], list[Registration]]:
     """The topics and services by which a node can show that it is the one that registered them.
 
     It is asked for a few at most, everybody's /rosout last.
     """
-    everything = list(held)
-    topics = {one.name for one in everything if one.kind is Kind.PUBLISHER}
-    services = [one for one in everything if one.kind is Kind.SERVICE]
+    candidates = list(registrations)
+    topics = {r.name for r in candidates if r.kind is Kind.PUBLISHER}
+    services = [r for r in candidates if r.kind is Kind.SERVICE]
     return sorted(topics, key=lambda topic: (topic == ROSOUT, topic))[:MOST_ASKED], (
-        sorted(services, key=lambda one: one.name)[:MOST_ASKED]
+        sorted(services, key=lambda r: r.name)[:MOST_ASKED]
     )

@@ -25,27 +25,27 @@ MethodCall = tuple[str, list[Any]]
 COMMON_PARAMETER = "/rosout_disable_topics_generation"
 """roscpp and rospy subscribe to it with their first log message; it need not exist."""
 
-_REGISTERING = {found.registers: method for method, found in MASTER_METHODS.items()}
-_UNREGISTERING = {found.unregisters: method for method, found in MASTER_METHODS.items()}
+_REGISTERING = {spec.registers: method for method, spec in MASTER_METHODS.items()}
+_UNREGISTERING = {spec.unregisters: method for method, spec in MASTER_METHODS.items()}
 
 
-def register_call(held: Registration, uri: str, service: str) -> MethodCall:
+def register_call(registration: Registration, uri: str, service: str) -> MethodCall:
     """The call that makes a registration with a slave URI, and for a service with its URI."""
-    return _call(_REGISTERING[held.kind], held, uri, service)
+    return _call(_REGISTERING[registration.kind], registration, uri, service)
 
 
-def unregister_call(held: Registration, uri: str, service: str) -> MethodCall:
+def unregister_call(registration: Registration, uri: str, service: str) -> MethodCall:
     """The call that takes back a registration that was made with these URIs."""
-    return _call(_UNREGISTERING[held.kind], held, uri, service)
+    return _call(_UNREGISTERING[registration.kind], registration, uri, service)
 
 
-def to_register(held: Iterable[EndpointRegistration]) -> list[EndpointRegistration]:
+def to_register(registrations: Iterable[EndpointRegistration]) -> list[EndpointRegistration]:
     """Those of some registrations that have not ended meanwhile, in the order to make them.
 
     Subscribers come last, so that they are handed all publishers at once.
     """
-    current = [(e, one) for e, one in held if e.registrations.get(one.key) is one]
-    return sorted(current, key=lambda item: item[1].kind is Kind.SUBSCRIBER)
+    current = [(e, r) for e, r in registrations if e.registrations.get(r.key) is r]
+    return sorted(current, key=lambda pair: pair[1].kind is Kind.SUBSCRIBER)
 
 
 def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
@@ -55,44 +55,44 @@ def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegis
     """
     topics: dict[str, EndpointRegistration] = {}
     for endpoint in endpoints:
-        for held in endpoint.registrations.values():
-            if held.kind is Kind.PUBLISHER and not held.hidden:
-                topics.setdefault(held.name, (endpoint, held))
+        for registration in endpoint.registrations.values():
+            if registration.kind is Kind.PUBLISHER and not registration.hidden:
+                topics.setdefault(registration.name, (endpoint, registration))
     return list(topics.values())
 
 
 def known_as(endpoint: Endpoint, uri: str) -> bool:
     """Whether a URI at the master is a former one of this endpoint, or its node's own.
 
-    A loopback address is everybody's own.
+    A loopback address does not count: it is every node's own.
     """
-    own = parse_slave_uri(uri) == endpoint.node and not is_loopback(endpoint.node.host)
-    return own or uri in endpoint.former_uris
+    is_own = parse_slave_uri(uri) == endpoint.node and not is_loopback(endpoint.node.host)
+    return is_own or uri in endpoint.former_uris
 
 
 def free_calls(
-    held: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
+    registrations: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
 ) -> list[MethodCall]:
     """The calls that end what names hold with their ``uris``; ``services`` are the services' URIs.
 
     Subscribers go first, so that they are not told that the publishers go.
     """
-    known = sorted(_known(held, services), key=lambda one: one.kind is not Kind.SUBSCRIBER)
-    return [unregister_call(one, uris[one.caller_id], services.get(one.name, "")) for one in known]
+    ordered = sorted(_usable(registrations, services), key=lambda r: r.kind is not Kind.SUBSCRIBER)
+    return [unregister_call(r, uris[r.caller_id], services.get(r.name, "")) for r in ordered]
 
 
 def restore_calls(
-    held: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
+    registrations: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
 ) -> list[MethodCall]:
     """The calls that make again what `free_calls` ended."""
-    known = _known(held, services)
-    return [register_call(one, uris[one.caller_id], services.get(one.name, "")) for one in known]
+    usable = _usable(registrations, services)
+    return [register_call(r, uris[r.caller_id], services.get(r.name, "")) for r in usable]
 
 
 def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
     """The calls that end the parameter subscription that every node has, and tell what is left.
 
-    There is nothing to see of such a subscription, apart from the name that stays known.
+    The master shows nothing of such a subscription, apart from the name that stays known.
     """
     ask: list[MethodCall] = [("lookupNode", [caller, name]) for name in uris]
     params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
@@ -105,31 +105,31 @@ def read_release(
     """The results of `release_calls`: subscriptions that ended; names known still, with URIs."""
     before = zip(uris, values, strict=False)
     after = zip(uris, values[2 * len(uris) :], strict=True)
-    known = {name: uri for name, uri in after if uri is not None}
-    held = [name for name, uri in before if uri is not None and name not in known]
-    return [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in held], known
+    known_uris = {name: uri for name, uri in after if uri is not None}
+    ended = [name for name, uri in before if uri is not None and name not in known_uris]
+    return [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in ended], known_uris
 
 
 def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
     """Which of an endpoint's registrations a process that is gone has left behind.
 
-    A topic is, if the node says that it does not have it; a whole node name is, if another has
-    registered since and none of its topics, apart from everybody's /rosout, may hold.
-    Registrations made after ``before`` are not.
+    A topic is left behind if the node says that it does not have it; all of a node name is, if
+    another name has registered since and none of its own topics, apart from the /rosout of nearly
+    every node, may hold. Registrations made after ``before`` are not.
     """
-    everything = list(endpoint.registrations.values())
-    newest = max(everything, key=lambda held: held.since, default=None)
+    registrations = list(endpoint.registrations.values())
+    newest = max(registrations, key=lambda r: r.since, default=None)
 
-    def may_hold(held: Registration) -> bool:
-        telling = held.kind in TOPIC_KINDS and held.name != ROSOUT
-        return telling and info.holds(held) is not False
+    def may_hold(registration: Registration) -> bool:
+        is_conclusive = registration.kind in TOPIC_KINDS and registration.name != ROSOUT
+        return is_conclusive and info.holds(registration) is not False
 
-    alive = {held.caller_id for held in everything if held is newest or may_hold(held)}
+    live_names = {r.caller_id for r in registrations if r is newest or may_hold(r)}
     gone = vanished(endpoint, info, before)
     return [
-        held
-        for held in everything
-        if held in gone or (held.since < before and held.caller_id not in alive)
+        r
+        for r in registrations
+        if r in gone or (r.since < before and r.caller_id not in live_names)
     ]
 
 
@@ -138,8 +138,8 @@ def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registra
 
     A node that registers around the proxy unregisters there too, where its URI means nothing.
     """
-    everything = endpoint.registrations.values()
-    return [held for held in everything if info.holds(held) is False and held.since < before]
+    registrations = endpoint.registrations.values()
+    return [r for r in registrations if info.holds(r) is False and r.since < before]
 
 
 def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[Registration]:
@@ -148,19 +148,19 @@ def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[R
     A topic does unless the node says that it does not have it; services and parameters, which it
     can't be asked for, if it is the ``same_process`` and not all of its topics have gone.
     """
-    everything = list(endpoint.registrations.values())
-    topics = [held for held in everything if held.kind in TOPIC_KINDS]
-    kept = [held for held in topics if info.holds(held) is not False]
+    registrations = list(endpoint.registrations.values())
+    topics = [r for r in registrations if r.kind in TOPIC_KINDS]
+    kept = [r for r in topics if info.holds(r) is not False]
     if not same_process or (topics and not kept):
         return kept
-    return kept + [held for held in everything if held.kind not in TOPIC_KINDS]
+    return kept + [r for r in registrations if r.kind not in TOPIC_KINDS]
 
 
 def unregistered(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
     """The topics that a node has, with their types, and the master does not know of.
 
-    rospy gives up a registration for which it found no master. Nothing is said of a slave API
-    that several node names share.
+    rospy gives up a registration for which it found no master. Of a slave API that several
+    node names share nothing is listed.
     """
     names = endpoint.caller_ids
     if len(names) != 1:
@@ -181,26 +181,28 @@ def lost(
     Those made after ``before``, the time at which the master was asked, don't count; nor do
     parameter subscriptions, which the master's state leaves out, unless their node is unknown.
     """
-    ours = [held for held in ours if not held.hidden]
-    known = {held.key for registrations in state.values() for held in registrations}
-    params = [held for held in ours if held.kind is Kind.PARAM]
-    gone = [h for h in ours if h.since < before and h.key not in known and h.kind is not Kind.PARAM]
-    lost_nodes = {held.caller_id for held in gone} - set(state)
-    return gone + [held for held in params if held.caller_id in lost_nodes]
+    ours = [r for r in ours if not r.hidden]
+    keys = {r.key for of_node in state.values() for r in of_node}
+    params = [r for r in ours if r.kind is Kind.PARAM]
+    gone = [r for r in ours if r.since < before and r.key not in keys and r.kind is not Kind.PARAM]
+    lost_nodes = {r.caller_id for r in gone} - set(state)
+    return gone + [r for r in params if r.caller_id in lost_nodes]
 
 
-def _known(held: Iterable[Registration], services: Mapping[str, str]) -> list[Registration]:
-    """Those of some registrations that are no services whose URI is not known (any more)."""
-    return [one for one in held if one.kind is not Kind.SERVICE or one.name in services]
+def _usable(
+    registrations: Iterable[Registration], services: Mapping[str, str]
+) -> list[Registration]:
+    """Those of some registrations that are no services, or services with a known URI."""
+    return [r for r in registrations if r.kind is not Kind.SERVICE or r.name in services]
 
 
-def _call(method: str, held: Registration, uri: str, service: str) -> MethodCall:
-    places = method_spec(method)
+def _call(method: str, registration: Registration, uri: str, service: str) -> MethodCall:
+    positions = method_spec(method)
     params = {
-        0: held.caller_id,
-        places.name: held.name,
-        places.type: held.type,
-        places.service_api: service,
-        places.caller_api: uri,
+        0: registration.caller_id,
+        positions.name: registration.name,
+        positions.type: registration.type,
+        positions.service_api: service,
+        positions.caller_api: uri,
     }
-    return method, [params[place] for place in range(4) if place in params]
+    return method, [params[position] for position in range(4) if position in params]

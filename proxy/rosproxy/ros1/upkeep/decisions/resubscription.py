@@ -37,43 +37,45 @@ class TopicSubscription(msgspec.Struct, frozen=True):
 
 
 def subscriptions(
-    held: Mapping[str, Sequence[Registration]],
+    registrations_by_node: Mapping[str, Sequence[Registration]],
     endpoints: Iterable[Endpoint],
     addressing: Addressing,
 ) -> list[TopicSubscription]:
     """Subscriptions to what the nodes of some endpoints publish, but not those of neighbours.
 
-    ``held`` is what each node has registered at the master. A neighbour that reaches a publisher
-    by its own URI is left out early: a thousand nodes that all hear each other are a million pairs.
+    ``registrations_by_node`` is what the master has. A neighbour that reaches a publisher by its
+    own URI is left out early: a thousand nodes that all hear each other are a million pairs.
     """
-    publishers: dict[str, dict[frozenset[int], list[Endpoint]]] = {}
+    topics: dict[str, dict[frozenset[int], list[Endpoint]]] = {}
     for endpoint in endpoints:
         location = endpoint.location
-        literal = location.named and not location.stale
-        joint = _networks_of(location.address, addressing) if literal else frozenset()
+        uses_own_uri = location.named and not location.stale
+        networks = _networks_of(location.address, addressing) if uses_own_uri else frozenset()
         for topic in dict.fromkeys(endpoint.shown(Kind.PUBLISHER)):
-            publishers.setdefault(topic, {}).setdefault(joint, []).append(endpoint)
-    found: list[TopicSubscription] = []
-    for node, registrations in held.items():
-        itself = addressing.registry.by_caller.get(node)
-        near = _networks_of(itself.location.address, addressing) if itself else frozenset()
-        for one in registrations:
-            groups = publishers.get(one.name, {}) if one.kind is Kind.SUBSCRIBER else {}
-            found += [
-                TopicSubscription(endpoint, one.name, node)
-                for joint, group in groups.items()
-                if not joint & near
+            topics.setdefault(topic, {}).setdefault(networks, []).append(endpoint)
+    distant: list[TopicSubscription] = []
+    for node, registrations in registrations_by_node.items():
+        subscriber = addressing.registry.by_caller.get(node)
+        local = _networks_of(subscriber.location.address, addressing) if subscriber else frozenset()
+        for registration in registrations:
+            groups = (
+                topics.get(registration.name, {}) if registration.kind is Kind.SUBSCRIBER else {}
+            )
+            distant += [
+                TopicSubscription(endpoint, registration.name, node)
+                for networks, group in groups.items()
+                if not networks & local
                 for endpoint in group
-                if endpoint is not itself
+                if endpoint is not subscriber
             ]
-    return found
+    return distant
 
 
 def without_relay(
-    wanted: Iterable[TopicSubscription], relays: Collection[TopicConnection]
+    candidates: Iterable[TopicSubscription], relays: Collection[TopicConnection]
 ) -> list[TopicSubscription]:
     """Those that no relay serves."""
-    return [one for one in wanted if (one.endpoint.port, one.topic, one.caller_id) not in relays]
+    return [s for s in candidates if (s.endpoint.port, s.topic, s.caller_id) not in relays]
 
 
 def read_bus(rows: Any) -> list[BusRow]:
@@ -81,32 +83,32 @@ def read_bus(rows: Any) -> list[BusRow]:
 
     Rows: ``[id, subscriber's name, "o", transport, topic, …]``; others are left out.
     """
-    found: list[BusRow] = []
+    connections: list[BusRow] = []
     for row in rows if isinstance(rows, list) else ():
         match row:
             case [_, str(caller_id), "o", str(transport), str(topic), *_]:
-                found.append((topic, caller_id, transport))
-    return found
+                connections.append((topic, caller_id, transport))
+    return connections
 
 
 def unconnected(
-    left: Iterable[TopicSubscription],
-    bus: Mapping[Endpoint, Sequence[BusRow]],
+    unrelayed: Iterable[TopicSubscription],
+    bus_rows: Mapping[Endpoint, Sequence[BusRow]],
     addresses: Addresses,
 ) -> list[TopicSubscription]:
     """Those of the subscriptions without relay that no other way serves either.
 
-    UDPROS is known by the publisher's own word. It is not asked for TCPROS: it takes connections
-    for open whose other end has vanished. What the kernel forwards is known by hosts alone.
+    For UDPROS the publisher's rows count. For TCPROS they don't: it takes connections for open
+    whose other end has vanished. What the kernel forwards is known by hosts alone.
     """
-    rest: dict[Endpoint, list[TopicSubscription]] = {}
-    for one in left:
-        if (one.topic, one.caller_id, "UDPROS") not in bus.get(one.endpoint, ()):
-            rest.setdefault(one.endpoint, []).append(one)
+    remaining: dict[Endpoint, list[TopicSubscription]] = {}
+    for sub in unrelayed:
+        if (sub.topic, sub.caller_id, "UDPROS") not in bus_rows.get(sub.endpoint, ()):
+            remaining.setdefault(sub.endpoint, []).append(sub)
     return [
-        one
-        for endpoint, group in rest.items()
-        for one in _not_forwarded(endpoint, group, bus.get(endpoint, ()), addresses)
+        s
+        for endpoint, group in remaining.items()
+        for s in _not_forwarded(endpoint, group, bus_rows.get(endpoint, ()), addresses)
     ]
 
 
@@ -126,28 +128,28 @@ def _not_forwarded(
     """
     if not endpoint.fast_peers:
         return group
-    hosts: dict[frozenset[str], list[TopicSubscription]] = {}
-    for one in group:
-        hosts.setdefault(frozenset(addresses.get(one.caller_id, ())), []).append(one)
-    if not any(host & endpoint.fast_peers.keys() for host in hosts):
-        return _short_of(endpoint.fast_connections, group, rows)
+    groups: dict[frozenset[str], list[TopicSubscription]] = {}
+    for sub in group:
+        groups.setdefault(frozenset(addresses.get(sub.caller_id, ())), []).append(sub)
+    if not any(host & endpoint.fast_peers.keys() for host in groups):
+        return _unserved(endpoint.fast_connections, group, rows)
     return [
-        one
-        for host, mine in hosts.items()
-        for one in _short_of(sum(endpoint.fast_peers.get(a, 0) for a in host), mine, rows)
+        s
+        for host, of_host in groups.items()
+        for s in _unserved(sum(endpoint.fast_peers.get(a, 0) for a in host), of_host, rows)
     ]
 
 
-def _short_of(
+def _unserved(
     connections: int, group: list[TopicSubscription], rows: Sequence[BusRow]
 ) -> list[TopicSubscription]:
-    """Which of some subscriptions have none of as many connections as there are.
+    """The subscriptions that none of a number of connections serves.
 
-    The publisher has all that are open among its own. If that does not tell enough of them apart,
-    all count: one that was told in vain has made a new connection, which counts for the others.
+    The publisher's rows have all that are open. If they don't tell enough subscriptions apart, all
+    count: one that was told in vain has made a new connection, which counts for the others.
     """
     if connections >= len(group):
         return []
-    named = {row[:2] for row in rows}
-    unknown = [one for one in group if (one.topic, one.caller_id) not in named]
+    connected = {row[:2] for row in rows}
+    unknown = [s for s in group if (s.topic, s.caller_id) not in connected]
     return unknown if len(unknown) >= len(group) - connections else group
