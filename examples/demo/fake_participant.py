@@ -188,7 +188,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
             self._announce([discovery], prefix)
         user = found.get(Pid.DEFAULT_UNICAST_LOCATOR, discovery)
         self.peers[prefix] = DdsPeer(discovery, user, monotonic())
-        has = announced.held.number(datagram, Pid.BUILTIN_ENDPOINT_SET) or 0
+        has = announced.parameters.number(datagram, Pid.BUILTIN_ENDPOINT_SET) or 0
         for writer, (has_writer, has_reader) in BUILT_IN.items():
             if has & has_writer:
                 self.readers[writer + TO_READER].match(prefix + writer.to_bytes(4, "big"))
@@ -198,7 +198,7 @@ class FakeParticipant(asyncio.DatagramProtocol):
     def _match(self, prefix: bytes, announced: Announcement, datagram: bytes) -> None:
         """Take in what a participant says of a reader or writer of its own."""
         entity = announced.endpoint(datagram)
-        type_name = announced.held.text(datagram, Pid.TYPE_NAME)
+        type_name = announced.parameters.text(datagram, Pid.TYPE_NAME)
         if not entity or (announced.topic(datagram), type_name) != (self.dds_topic, STRING_TYPE):
             return
         guid = prefix + entity

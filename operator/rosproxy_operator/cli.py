@@ -28,7 +28,7 @@ from rosproxy.cli.options import (
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.options import policy_options, proxy_bound_options
-from rosproxy_operator.common.words import fail, one_line
+from rosproxy_operator.common.words import exit_on_error, fail
 from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.options import bound_options
 from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
@@ -238,7 +238,7 @@ def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> 
         return
     from rosproxy_operator.docker.errors import EngineError
 
-    with one_line(EngineError):
+    with exit_on_error(EngineError):
         problems = run_once(settings, resync)
     for problem in problems:
         text = clean(f"{problem.subject}: {problem.text}")
@@ -344,12 +344,12 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     from rosproxy.telemetry import logs
     from rosproxy_operator.kubernetes.api.client import ApiError
     from rosproxy_operator.kubernetes.run import run
-    from rosproxy_operator.kubernetes.serving import quieten
+    from rosproxy_operator.kubernetes.serving import quiet_library_logs
 
     logs.set_up(log_format, log_level)
     unknown_variables(main, proxy_main)
-    quieten()
-    with one_line(ApiError):
+    quiet_library_logs()
+    with exit_on_error(ApiError):
         run(settings)
 
 

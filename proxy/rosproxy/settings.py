@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import Any, Literal, TypeVar
 
-from rosproxy.access.layers import PolicyLayer, PolicyMode, bounded, read_layers
+from rosproxy.access.layers import PolicyLayer, PolicyMode, check_bounds, read_layers
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net import addresses
@@ -107,7 +107,7 @@ class Settings:
         if self.admin_token and self.admin_token_hash:
             raise SettingError("--admin-token-hash", "goes instead of --admin-token, not with it")
         try:
-            bounded((*self.policy, *self.policy_layers))
+            check_bounds((*self.policy, *self.policy_layers))
         except ValueError as error:
             raise SettingError("--policy", str(error)) from None
         self._check_versions()

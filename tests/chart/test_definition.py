@@ -11,10 +11,10 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.policy import MOST_AUTHORS_RULES
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.cluster import (
-    NodeState,
     Obstacle,
     ProxyPod,
     ProxyReport,
+    RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import Name, Pod
 from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, RULE_KINDS, rosproxy
@@ -148,8 +148,8 @@ def test_status_is_in_the_definition() -> None:
         participants={"192.0.2.3": ("01.0f.00.00.00.00.00.00.00.00.00.01",)},
     )
     states = (
-        NodeState("n", "192.0.2.1", ports, proxy, (pod,), answer),
-        NodeState(
+        RosProxyOnNode("n", "192.0.2.1", ports, proxy, (pod,), answer),
+        RosProxyOnNode(
             "m", "192.0.2.2", None, None, (pod,), None, Obstacle("PortsExhausted", "no ports")
         ),
     )

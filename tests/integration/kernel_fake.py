@@ -18,7 +18,7 @@ def clear_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
     async def nothing(mode: str, tools: Tools) -> None:
         return None
 
-    monkeypatch.setattr(plane, "why_not", nothing)
+    monkeypatch.setattr(plane, "find_obstacle", nothing)
     monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
 
 

@@ -265,7 +265,7 @@ async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, maste
 
     idle, slow = await open_reader(NODE), await open_reader(OTHER_NODE)
     loop = asyncio.get_running_loop()
-    passes = proxy.ros1.context.passing
+    passes = proxy.ros1.context.unread_calls
     await until(lambda: passes.used == 2, "both replies are under way")
     await until(lambda: passes.used == 1, "the idle one is cut by the kernel")
     taken = len(await loop.sock_recv(slow, 100_000))
@@ -312,7 +312,7 @@ async def test_connections_to_one_port_are_bounded(make_proxy, make_node):
 
 
 async def test_the_silent_one_that_waited_longest_goes_first(proxy, node, monkeypatch):
-    monkeypatch.setattr(gate, "WAITING", 4)
+    monkeypatch.setattr(gate, "MOST_WAITING", 4)
     await node.publish(proxy.master)
     lease = proxy.lease(node)
     waiting = proxy.ros1.context.gate._waiting

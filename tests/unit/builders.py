@@ -185,7 +185,7 @@ def exchange(
     if exported.body is None:
         return Exchange(b"", exported.local_reply())
     answer = master_calls.read_reply(exported, reply)
-    facts = answer.facts(7.0)
+    facts = answer.registry_changes(7.0)
     for fact in facts:
         note(addressing.registry, fact)
     return Exchange(exported.body, master_api.import_reply(answer, addressing), facts)

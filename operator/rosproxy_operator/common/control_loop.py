@@ -35,11 +35,11 @@ Look = Callable[[], Awaitable[float | None]]
 
 
 class LookFailed(Exception):
-    """A look was not possible; the message is one line. ``away``: the engine can't be asked."""
+    """A look was not possible, in one line. ``is_engine_away``: the engine can't be asked."""
 
     def __init__(self, message: str, away: bool = False) -> None:
         super().__init__(message)
-        self.away = away
+        self.is_engine_away = away
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class ControlLoop:
             reason = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
             self._failed(LookFailed(reason, away=True))
         except LookFailed as error:
-            if error.away and not patient:
+            if error.is_engine_away and not patient:
                 raise  # the caller reports it
             self._failed(error)
         else:
@@ -161,11 +161,11 @@ class ControlLoop:
 
     def _failed(self, error: LookFailed) -> None:
         if str(error) != self._error:
-            log.log(logging.WARNING if error.away else logging.ERROR, "%s", error)
+            log.log(logging.WARNING if error.is_engine_away else logging.ERROR, "%s", error)
         self._failures += 1
         self._error = str(error)
-        self._metrics.looks.labels("unavailable" if error.away else "failed").inc()
-        self._metrics.up.set(0 if error.away else 1)
+        self._metrics.looks.labels("unavailable" if error.is_engine_away else "failed").inc()
+        self._metrics.up.set(0 if error.is_engine_away else 1)
 
     async def _pause(self, resync: float) -> None:
         """Wait until it is time for another look."""

@@ -18,9 +18,9 @@ from rosproxy.page.document import (
     MOST_LINKS,
     MOST_NODES,
     Document,
+    PageFinding,
     PageLink,
     PageNode,
-    Told,
 )
 
 Json = dict[str, Any]
@@ -39,7 +39,7 @@ def merged(documents: Mapping[str, Document | str], version: str) -> Json:
     """One document of those of all proxies, by name; a text says why one can't be asked."""
     nodes: dict[str, PageNode] = {}
     links: list[tuple[str, PageLink]] = []
-    findings: list[Told] = []
+    findings: list[PageFinding] = []
     left_out = 0
     for name, document in documents.items():
         if isinstance(document, str):

@@ -36,14 +36,15 @@ _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEP
 class ProxyError(Exception):
     """A proxy did not do what it was asked.
 
-    ``away`` if nothing at all is there: no route, or no answer. ``later`` if it is well, but needs
-    its master, which can't be asked now. ``status`` is that of an HTTP answer, 0 without one.
+    ``is_unreachable`` if nothing at all is there: no route, or no answer. ``lacks_master`` if it is
+    well, but needs its master, which can't be asked now. ``status`` is that of an HTTP answer, 0
+    without one.
     """
 
     def __init__(self, message: str, away: bool = False, status: int = 0) -> None:
         super().__init__(message)
-        self.away, self.status = away, status
-        self.later = status == 503
+        self.is_unreachable, self.status = away, status
+        self.lacks_master = status == 503
 
 
 class PolicyRefused(ProxyError):

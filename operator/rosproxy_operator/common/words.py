@@ -12,7 +12,7 @@ from rosproxy_operator.common.control_loop import LookFailed
 
 
 @contextlib.contextmanager
-def one_line(*expected: type[Exception]) -> Iterator[None]:
+def exit_on_error(*expected: type[Exception]) -> Iterator[None]:
     """Exit with one line if the engine or the API server can't be asked."""
     errors: tuple[type[Exception], ...] = (LookFailed, *expected)
     try:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import click
 
 from rosproxy.cli.options import Command, Seconds
-from rosproxy_operator.common.words import one_line
+from rosproxy_operator.common.words import exit_on_error
 from rosproxy_operator.docker.planner.model import PlanSettings
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
@@ -38,7 +38,7 @@ def status(settings: PlanSettings, as_json: bool, watch: bool, wait: float) -> N
     if watch:
         watch_status(settings)
         return
-    with one_line(EngineError):
+    with exit_on_error(EngineError):
         sys.exit(show_status(settings, as_json, wait))
 
 
@@ -55,7 +55,7 @@ def plan(settings: PlanSettings, as_json: bool, wait: float) -> None:
     from rosproxy_operator.docker.errors import EngineError
     from rosproxy_operator.docker.status import show_plan
 
-    with one_line(EngineError):
+    with exit_on_error(EngineError):
         sys.exit(show_plan(settings, as_json, wait))
 
 
@@ -70,10 +70,10 @@ def doctor(settings: PlanSettings, names: tuple[str, ...], as_json: bool) -> Non
     container. With names: about those nodes, topics and services. Exits with 0 if nothing is wrong,
     with 1 if something is.
     """
-    from rosproxy.cli.questions import tell
+    from rosproxy.cli.questions import print_findings
     from rosproxy_operator.docker.doctor import examine
     from rosproxy_operator.docker.errors import EngineError
 
-    with one_line(EngineError):
+    with exit_on_error(EngineError):
         findings = examine(settings, names)
-    tell(findings, as_json)
+    print_findings(findings, as_json)

@@ -209,10 +209,10 @@ class DockerController:
     def _hear(self, event: Json | None) -> None:
         """Take note of an event; None is a new connection: what happened before was missed."""
         if event is None:
-            self._observer.doubt(None)
+            self._observer.mark_doubtful(None)
             self._loop.retry()
         elif container := engine_json.container_of(event):
-            self._observer.doubt(container)
+            self._observer.mark_doubtful(container)
         self._loop.wake()
         self._loop.wake_in(SETTLED)
 

@@ -37,7 +37,7 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
-from rosproxy_operator.docker.planner.own import gives_away
+from rosproxy_operator.docker.planner.own import forgery_reason
 from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import (
@@ -143,7 +143,7 @@ class Executor:
         self._refused = {a: r for a, r in self._refused.items() if r[1] > now - QUIET}
         by_job: dict[Job, list[Group]] = {}
         for group in groups:
-            job = group.key, group.about
+            job = group.key, group.subject
             if self._ended_at.get(job, 0.0) < looked_at:
                 by_job.setdefault(job, []).append(group)
         self._ended_at = {job: at for job, at in self._ended_at.items() if at >= looked_at}
@@ -194,7 +194,7 @@ class Executor:
                 self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
-                problem = Problem(_subject((group.key, group.about)), f"{action}: {error}")
+                problem = Problem(_subject((group.key, group.subject)), f"{action}: {error}")
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem
@@ -264,7 +264,7 @@ class DockerApplier:
         do = self._engine.do
         match action:
             case CreateNetwork(name):
-                labels = {MANAGED: "true", SECRET: snapshot.fresh}
+                labels = {MANAGED: "true", SECRET: snapshot.new_secret}
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
                 self._create(action.name, self._config(action, snapshot), snapshot.state.image_id)
@@ -332,7 +332,7 @@ class DockerApplier:
             container = self._engine.container(name)
             own = read_own(container["Config"].get("Labels") or {})
             making = engine_json.read_making(container)
-            if own is None or gives_away(own, name, making, image_id):
+            if own is None or forgery_reason(own, name, making, image_id):
                 raise EngineError(
                     f"a container that is not this operator's is called {name}; "
                     f"rename it (docker rename {name} …) or remove it"

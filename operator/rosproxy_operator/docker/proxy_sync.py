@@ -21,7 +21,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
 from rosproxy_operator.docker.planner.model import Member, PlanSettings
-from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, facts
+from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, network_facts
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ class ProxyUpdater:
                 )
                 failures, logged = 0, ""
             except ProxyError as error:
-                if not error.away and failures >= len(PAUSES) and str(error) != logged:
+                if not error.is_unreachable and failures >= len(PAUSES) and str(error) != logged:
                     logged = str(error)
                     text = "%s could not be told who may use it: %s"
                     log.warning(text, self._name, error, extra={"proxy": self._name})
@@ -119,7 +119,7 @@ class ProxyUpdater:
                 failures = 0
             except ProxyError as error:
                 failures += 1
-                self._heard(None if error.later else error)
+                self._heard(None if error.lacks_master else error)
 
     async def _tell(self) -> None:
         self._looked.clear()
@@ -143,7 +143,7 @@ class ProxyUpdater:
             counts = {change: answer.get(change) for change in ("unregistered", "moved", "adopted")}
             if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
                 log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
-        self._news.told(now)
+        self._news.mark_delivered(now)
         self._heard(refusal)
 
     async def _policy_refusal(self) -> PolicyRefused | None:
@@ -200,8 +200,8 @@ class DockerProxySync:
                     self._former_leases(name, proxy.range),
                 )
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
-            network_facts = facts(snapshot.state, proxy, members, self._settings.policy)
-            self._running[name][0].update(network_facts)
+            facts = network_facts(snapshot.state, proxy, members, self._settings.policy)
+            self._running[name][0].update(facts)
 
     def _former_leases(self, name: str, ports: PortRange) -> Leases:
         """What its participants had, unless the proxy has all of these ports now."""
@@ -227,7 +227,7 @@ def silence(name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str)
     """The problem of a proxy that does not answer, or not as it should."""
     if isinstance(error, PolicyRefused):
         return Problem(f"proxy {name}", str(error))
-    if error.away and not snapshot.at_host:
+    if error.is_unreachable and not snapshot.at_host:
         advice = f"attach the operator to network {uplink} or run it with network_mode: host"
     else:
         advice = f"docker logs {name} may say why"

@@ -34,7 +34,7 @@ from rosproxy_operator.docker.planner.model import (
     RedirectContainer,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.own import gives_away, has_own_name
+from rosproxy_operator.docker.planner.own import forgery_reason, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     FORMER_TOKEN,
     ROLE_EAR,
@@ -82,14 +82,14 @@ class DockerSnapshot:
     """A Docker host at one moment.
 
     ``access`` to those proxies that run is by name. ``at_host``: the operator is in the host's
-    network namespace. ``fresh`` is the secret for an uplink network that is made now.
+    network namespace. ``new_secret`` is the secret for an uplink network that is made now.
     """
 
     state: HostState
     labels: LabelReading
     access: Mapping[str, ProxyAccess]
     at_host: bool
-    fresh: str = field(default="", repr=False)
+    new_secret: str = field(default="", repr=False)
 
 
 class Inspector:
@@ -100,9 +100,9 @@ class Inspector:
     from it changes but the aliases, and those only with the endpoints, whose ids are in the list.
 
     The operator's own containers can be started anew without a trace in the list: a proxy's has no
-    network of its own, and the list is late to tell that one has ended. The engine's events tell
-    it (`doubt`), and those are inspected with each look for a moment; all of them once in a while,
-    beside the look, in case an event was missed.
+    network of its own, and the list is late to tell that one has ended. The engine's events tell it
+    (`mark_doubtful`), and those are inspected with each look for a moment; all of them once in a
+    while, beside the look, in case an event was missed.
 
     One that can't be read is logged once, and treated as missing: it affects no other container.
     ``late`` is called when something new comes after a look.
@@ -132,13 +132,13 @@ class Inspector:
         """The last known inspection of a container; None if there is none yet."""
         return self._cached.get(container, (None, None))[1]
 
-    def sure(self, row: Json) -> bool:
+    def is_current(self, row: Json) -> bool:
         """Whether the list and the inspection of a container, which is newer, say the same."""
         mark, inspected = self._cached.get(row["Id"], (None, None))
         fresh = mark == self._marks[row["Id"]]
         return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
 
-    def doubt(self, container: str | None) -> None:
+    def mark_doubtful(self, container: str | None) -> None:
         """Something has happened to a container; None: perhaps to any, with events missed."""
         if container is None:
             self._all_doubted = time.monotonic()
@@ -239,9 +239,9 @@ class DockerObserver:
         """Whether inspections are under way whose end may call ``late``."""
         return self._inspector.waiting
 
-    def doubt(self, container: str | None) -> None:
+    def mark_doubtful(self, container: str | None) -> None:
         """The engine tells that something has happened to a container, by id; None: to any."""
-        self._inspector.doubt(container)
+        self._inspector.mark_doubtful(container)
 
     async def look(self, patience: float = PATIENCE) -> DockerSnapshot:
         """What there is now. Raises EngineError.
@@ -267,8 +267,8 @@ class DockerObserver:
             busy = [sandbox for sandbox in state.sandboxes if sandbox.container.name in state.busy]
             state = replace(
                 state,
-                listening=strangers(busy, (), listening),
-                listening_udp=strangers(busy, state.ears, bound),
+                listening=foreign_ports(busy, (), listening),
+                listening_udp=foreign_ports(busy, state.ears, bound),
                 far=host.far_address(),
             )
         secret = self._settings.secret or engine_json.uplink_secret(net_rows, self._settings.uplink)
@@ -286,7 +286,7 @@ class DockerObserver:
             labels=labels,
             access={p.container.name: a for p in state.proxies if (a := self._access(p, state))},
             at_host=at_host,
-            fresh=self._fresh,
+            new_secret=self._fresh,
         )
 
     def _read_own(self, row: Json) -> OwnLabels | None:
@@ -318,14 +318,14 @@ class DockerObserver:
             claimed = read_own(container.labels)
             if claimed and inspected is not None and row.get("Names"):
                 making = engine_json.read_making(inspected)
-                forged = gives_away(claimed, container.name, making, image)
+                forged = forgery_reason(claimed, container.name, making, image)
             if own is None or forged:
                 containers.append(replace(container, forged=forged))
                 own = None
             else:
                 own_container = _KINDS[own.role](own.key, container, own.range, own.fingerprint)
                 own_by_role[own.role].append(own_container)
-            if own and not self._inspector.sure(row):
+            if own and not self._inspector.is_current(row):
                 busy.add(container.name)
         return HostState(
             containers=tuple(containers),
@@ -364,7 +364,7 @@ class DockerObserver:
         return ProxyAccess(admin, token, run) if address else None
 
 
-def strangers(
+def foreign_ports(
     starting: Iterable[Sandbox], ears: Iterable[EarContainer], listening: frozenset[int]
 ) -> frozenset[int]:
     """Which of the host's ports on which something listens may belong to other programs.

@@ -29,7 +29,7 @@ from rosproxy_operator.docker.planner.model import (
     PlanSettings,
 )
 from rosproxy_operator.docker.planner.plan import plan
-from rosproxy_operator.docker.planner.redirect import in_place
+from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import ear_name, proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -222,13 +222,13 @@ def _redirects(
     by_id = {container.id: container for container in observed.containers}
     return {
         (member.container.id, member.key): {
-            "master": str(member.by_address),
+            "master": str(member.redirected_master),
             "in_place": bool(
-                in_place(observed, member.key, network_owner(member.container, by_id))
+                redirect_record_name(observed, member.key, network_owner(member.container, by_id))
             ),
         }
         for member in members
-        if member.by_address and member.container.alive
+        if member.redirected_master and member.container.alive
     }
 
 

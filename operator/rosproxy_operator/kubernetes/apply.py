@@ -19,11 +19,11 @@ from rosproxy_operator.kubernetes.api.client import (
     Api,
     ApiConflict,
     ApiError,
-    ApiGone,
     ApiInvalid,
+    ApiNotFound,
     NotLeading,
 )
-from rosproxy_operator.kubernetes.confirm import Deletion, Stale, confirm
+from rosproxy_operator.kubernetes.confirm import Deletion, StateChanged, confirm
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateEar,
@@ -47,8 +47,8 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
-from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
-from rosproxy_operator.kubernetes.status.events import counted, event_body
+from rosproxy_operator.kubernetes.resources.values import submap, submaps, text_at, texts_at
+from rosproxy_operator.kubernetes.status.events import count_patch, event_body
 
 log = logging.getLogger(__name__)
 
@@ -79,9 +79,9 @@ Count = Callable[[Action, str], None]
 class ClusterApplier:
     """Carries out actions, those of one RosProxy one after the other.
 
-    ``counted`` is called with each action and its outcome (ok, failed); ``doubted`` if the watched
-    state still differs from what is read: a watch has missed something. ``busy`` is the number of
-    actions that are under way or wait for their turn.
+    ``count_patch`` is called with each action and its outcome (ok, failed); ``doubted`` if the
+    watched state still differs from what is read: a watch has missed something. ``busy`` is the
+    number of actions that are under way or wait for their turn.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class ClusterApplier:
                 return None
             async with self._room:
                 await in_thread(self._call_api, action, observed)
-        except Stale as error:
+        except StateChanged as error:
             log.debug("%s: not now: %s has changed meanwhile", describe(action), error)
             self._doubt(_subject(action))
             return None
@@ -305,8 +305,8 @@ def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
     The object is gone, or its whole namespace is about to be; or it is another one by now.
     """
     if isinstance(action, ObjectAction | PatchStatus):
-        return ApiGone, ApiConflict
-    return (ApiGone,)
+        return ApiNotFound, ApiConflict
+    return (ApiNotFound,)
 
 
 def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED) -> None:
@@ -335,11 +335,11 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
     the same name has just been deleted.
     """
     try:
-        metadata = part(api.get(kind, name_of(body["metadata"])), "metadata")
-    except ApiGone:
+        metadata = submap(api.get(kind, name_of(body["metadata"])), "metadata")
+    except ApiNotFound:
         return
-    owners = {word(owner, "kind") for owner in parts(metadata, "ownerReferences")}
-    if not is_own(words(metadata, "labels")) or KIND not in owners:
+    owners = {text_at(owner, "kind") for owner in submaps(metadata, "ownerReferences")}
+    if not is_own(texts_at(metadata, "labels")) or KIND not in owners:
         raise ApiConflict(
             f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
             "or rename the RosProxy"
@@ -354,6 +354,6 @@ def _emit(api: Api, event: Emit) -> None:
         api.create("events", body)
     except ApiConflict:
         id = name_of(body["metadata"])
-        operations = counted(api.get("events", id), now)
+        operations = count_patch(api.get("events", id), now)
         if operations:
             api.patch("events", id, operations)

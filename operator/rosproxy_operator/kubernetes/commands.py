@@ -5,7 +5,7 @@ It imports what it needs when it runs: the Kubernetes client may not be installe
 
 import click
 
-from rosproxy_operator.common.words import one_line
+from rosproxy_operator.common.words import exit_on_error
 
 
 @click.command()
@@ -19,10 +19,10 @@ def doctor(namespaces: tuple[str, ...], names: tuple[str, ...], as_json: bool) -
     right to create pods/exec. With names: about those nodes, topics and services. Exits with 0 if
     nothing is wrong, with 1 if something is.
     """
-    from rosproxy.cli.questions import tell
+    from rosproxy.cli.questions import print_findings
     from rosproxy_operator.kubernetes.api.client import ApiError
     from rosproxy_operator.kubernetes.doctor import examine
 
-    with one_line(ApiError):
+    with exit_on_error(ApiError):
         findings = examine(namespaces, names)
-    tell(findings, as_json)
+    print_findings(findings, as_json)

@@ -22,12 +22,12 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, own_
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Json, Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.records import pod_record, rosproxy_record
-from rosproxy_operator.kubernetes.resources.values import part, word
+from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 Deletion = DeleteService | DeletePolicy | DeleteProxy | DeleteEar | EvictPod
 
 
-class Stale(Exception):
+class StateChanged(Exception):
     """The facts behind a deletion have changed; the message says which object differs."""
 
 
@@ -41,46 +41,56 @@ def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
     own = own_pods(observed.proxies, observed.ears)
     target = next((p for p in own if p.pod.uid == action.uid), None)
     if target is None:
-        raise Stale(f"pod {action.id}")
-    _check_node(api, target.on, observed)
-    raw_pods = api.fresh("pods", "", f"spec.nodeName={target.on}")
+        raise StateChanged(f"pod {action.id}")
+    _check_node(api, target.node, observed)
+    raw_pods = api.list_fresh("pods", "", f"spec.nodeName={target.node}")
     current = [pod for pod in map(_pod, raw_pods) if _matters(pod, action.of)]
-    expected = (pod for pod in observed.pods if pod.node == target.on and _matters(pod, action.of))
+    expected = (
+        pod for pod in observed.pods if pod.node == target.node and _matters(pod, action.of)
+    )
     if _by_uid(current) != _by_uid(expected):
-        raise Stale(f"the pods on node {target.on}")
-    if target.pod.node != target.on:
+        raise StateChanged(f"the pods on node {target.node}")
+    if target.pod.node != target.node:
         return ""
     return next((_version(obj) for obj in raw_pods if _uid(obj) == action.uid), "")
 
 
 def _check_rosproxy(api: Api, name: Name, observed: ClusterSnapshot) -> bool:
     """Whether the RosProxy is gone."""
-    objs = api.fresh(PLURAL, name.namespace, f"metadata.name={name.name}")
+    objs = api.list_fresh(PLURAL, name.namespace, f"metadata.name={name.name}")
     current = {_requested(rosproxy_record(obj)) for obj in objs}
     expected = {_requested(rosproxy) for rosproxy in observed.rosproxies if rosproxy.id == name}
     if name in observed.unusable:
         expected.add(_requested(observed.unusable[name]))
     if current != expected:
-        raise Stale(f"RosProxy {name}")
+        raise StateChanged(f"RosProxy {name}")
     return not current
 
 
 def _check_node(api: Api, name: str, observed: ClusterSnapshot) -> None:
-    nodes = [objects.node(obj) for obj in api.fresh("nodes", "", f"metadata.name={name}")]
+    nodes = [objects.node(obj) for obj in api.list_fresh("nodes", "", f"metadata.name={name}")]
     if nodes != [*filter(None, [observed.nodes.get(name)])]:
-        raise Stale(f"node {name}")
+        raise StateChanged(f"node {name}")
 
 
 def _check_pod(api: Api, action: EvictPod, observed: ClusterSnapshot) -> None:
-    objs = api.fresh("pods", action.id.namespace, f"metadata.name={action.id.name}")
+    objs = api.list_fresh("pods", action.id.namespace, f"metadata.name={action.id.name}")
     current = {_wiring(pod) for pod in map(_pod, objs)}
     if current != {_wiring(pod) for pod in observed.pods if pod.uid == action.uid}:
-        raise Stale(f"pod {action.id}")
+        raise StateChanged(f"pod {action.id}")
 
 
 def _wiring(pod: Pod) -> tuple[object, ...]:
     labels = tuple(sorted(pod.labels.items()))
-    return pod.uid, pod.deleting, pod.ended, pod.wired, pod.own_masters, pod.controller, labels
+    return (
+        pod.uid,
+        pod.deleting,
+        pod.ended,
+        pod.wired_master_uri,
+        pod.own_masters,
+        pod.controller,
+        labels,
+    )
 
 
 def _requested(rosproxy: RosProxy | InvalidRosProxy) -> tuple[object, ...]:
@@ -107,8 +117,8 @@ def _by_uid(pods: Iterable[Pod]) -> dict[str, object]:
 
 
 def _uid(obj: Json) -> str:
-    return word(part(obj, "metadata"), "uid")
+    return text_at(submap(obj, "metadata"), "uid")
 
 
 def _version(obj: Json) -> str:
-    return word(part(obj, "metadata"), "resourceVersion")
+    return text_at(submap(obj, "metadata"), "resourceVersion")

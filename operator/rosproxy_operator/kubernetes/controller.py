@@ -25,10 +25,15 @@ from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api, ApiAway, ApiError
+from rosproxy_operator.kubernetes.api.client import Api, ApiError, ApiUnavailable
 from rosproxy_operator.kubernetes.apply import ClusterApplier
-from rosproxy_operator.kubernetes.due import Due
-from rosproxy_operator.kubernetes.planner.parts import Part, cut, cut_state, joined
+from rosproxy_operator.kubernetes.due import PlanSchedule
+from rosproxy_operator.kubernetes.planner.parts import (
+    Partition,
+    merge_state,
+    partition_snapshot,
+    partition_state,
+)
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan, stand_by
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxies.proxy_sync import ClusterProxySync
@@ -40,7 +45,7 @@ from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.status.events import stamp
 from rosproxy_operator.kubernetes.status.status import participants
-from rosproxy_operator.kubernetes.watch.reflector import Reflector, every_kind
+from rosproxy_operator.kubernetes.watch.reflector import Reflector, watched_collections
 from rosproxy_operator.kubernetes.watch.store import ClusterStore
 
 log = logging.getLogger(__name__)
@@ -76,8 +81,10 @@ class KubernetesController:
         self.retry = loop.retry
         self._tasks, self._proxies = Tasks(), ProxyClient()
         self._key = TokenKey(api, settings.key_secret)
-        kinds, corrected = every_kind(api), metrics.view_corrections.inc
-        self._store = ClusterStore(kinds, api.places(PLURAL), loop.wake, loop.retry, corrected)
+        kinds, corrected = watched_collections(api), metrics.view_corrections.inc
+        self._store = ClusterStore(
+            kinds, api.namespaces_of(PLURAL), loop.wake, loop.retry, corrected
+        )
         self._sandbox = SandboxFailures(api)
         self._applier = applier = ClusterApplier(
             api, self._proxies, self._tasks, metrics.count, self._relist
@@ -85,7 +92,7 @@ class KubernetesController:
         metrics.watch_jobs(lambda: applier.busy, lambda: applier.failed)
         leads = self._leads
         self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, self._wake_for, leads)
-        self._state, self._due, self._stood_by = ClusterState(), Due(), -STANDING_BY
+        self._state, self._due, self._stood_by = ClusterState(), PlanSchedule(), -STANDING_BY
         self._reflectors: list[Reflector] = []
         self._secret = b""
         self._problems: dict[str, list[ClusterFinding]] = {}
@@ -97,7 +104,7 @@ class KubernetesController:
         count_restart = self._metrics.watch_restarts.inc
         self._reflectors = reflectors = [
             Reflector(self._api, collection, self._store, call_soon, count_restart)
-            for collection in every_kind(self._api)
+            for collection in watched_collections(self._api)
         ]
         for reflector in reflectors:
             reflector.start()
@@ -117,16 +124,16 @@ class KubernetesController:
 
     async def documents(self) -> dict[str, Document | str]:
         """What the live pages of all proxies show, or why one can't be asked."""
-        return await self._proxies.documents(self._proxy_sync.ways)
+        return await self._proxies.documents(self._proxy_sync.admin_endpoints)
 
     async def look(self) -> float | None:
         """One look and what follows from it; when to look again. Raises LookFailed."""
         try:
             return await self._look()
         except ApiError as error:
-            raise LookFailed(str(error), away=isinstance(error, ApiAway)) from error
+            raise LookFailed(str(error), away=isinstance(error, ApiUnavailable)) from error
         except BaseException:
-            self._due.all()
+            self._due.mark_all_due()
             raise
 
     async def _look(self) -> float | None:
@@ -148,7 +155,7 @@ class KubernetesController:
             self._state = ClusterState(former=self._state.former)
             self._report(ClusterSnapshot())
         self._acting, self._stood_by = self._term(), -STANDING_BY
-        self._due.all()
+        self._due.mark_all_due()
 
     async def _stand_by(self) -> float:
         """Remember what the next term needs. Returns in how many seconds to do that again."""
@@ -156,7 +163,7 @@ class KubernetesController:
         if remaining > 0:
             return remaining
         self._secret = await in_thread(self._key.read)
-        self._store.touched()
+        self._store.take_changes()
         observed = self._store.snapshot(self._secret)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(observed, reports=self._proxy_sync.reports)
@@ -170,13 +177,15 @@ class KubernetesController:
             self._secret = await in_thread(self._key.read)
         self._due.at_once(await self._sandbox.read(self._store.snapshot()))
         # No await before all is planned: so the snapshot has exactly the changes noted so far.
-        touched, observed = self._store.touched(), self._store.snapshot(self._secret)
-        observed = self._sandbox.shown(observed)
+        touched, observed = self._store.take_changes(), self._store.snapshot(self._secret)
+        observed = self._sandbox.with_messages(observed)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(
             observed, reports=self._proxy_sync.reports, failures=self._applier.failures
         )
-        scope = self._due.part(observed, touched.namespaces, touched.nodes, time.monotonic())
+        scope = self._due.due_partition(
+            observed, touched.namespaces, touched.nodes, time.monotonic()
+        )
         planned = self._planned(observed, scope)
         took = time.monotonic() - started
         self._metrics.look_time.observe(took)
@@ -185,35 +194,35 @@ class KubernetesController:
         self._report(observed)
         return self._due.again_in(time.monotonic(), self._sandbox.again_in())
 
-    def _planned(self, observed: ClusterSnapshot, scope: Part | None) -> ClusterPlan:
+    def _planned(self, observed: ClusterSnapshot, scope: Partition | None) -> ClusterPlan:
         """The plan for a part of the cluster, None for all; the state that it returns is kept."""
         now, timestamp, settings = time.monotonic(), stamp(time.time()), self._settings.plan
         if scope is None:
             planned = plan(observed, settings, self._state, now, timestamp)
             self._state, self._problems = planned.state, {}
         else:
-            state = cut_state(self._state, scope)
-            planned = plan(cut(observed, scope), settings, state, now, timestamp)
-            self._state = joined(self._state, scope, planned.state)
+            state = partition_state(self._state, scope)
+            planned = plan(partition_snapshot(observed, scope), settings, state, now, timestamp)
+            self._state = merge_state(self._state, scope, planned.state)
             for namespace in scope.namespaces:
                 self._problems.pop(namespace, None)
         for problem in planned.problems:
             self._problems.setdefault(problem.of.namespace, []).append(problem)
-        self._due.planned(scope, observed, planned.again_in, now)
+        self._due.planned(scope, observed, planned.next_look_in, now)
         return planned
 
     async def _carry_out(
-        self, planned: ClusterPlan, observed: ClusterSnapshot, scope: Part | None
+        self, planned: ClusterPlan, observed: ClusterSnapshot, scope: Partition | None
     ) -> None:
         self._proxy_sync.report_policies(planned.policies)
-        self._proxy_sync.report_callers(planned.callers, planned.peers, planned.former)
-        self._proxy_sync.report_gone(planned.gone)
+        self._proxy_sync.report_callers(planned.callers, planned.peers, planned.former_ports)
+        self._proxy_sync.report_gone(planned.departed_addresses)
         await self._applier.carry_out(planned.actions, observed)
         concerned = {action.of.namespace for action in planned.actions}
         if self._applier.failures != observed.failures:
             self._wake_for(concerned)  # their statuses have to show it
         else:
-            self._due.soon(concerned, time.monotonic() + SETTLED)
+            self._due.due_at(concerned, time.monotonic() + SETTLED)
 
     def _wake_for(self, namespaces: Iterable[str]) -> None:
         """Plan these soon: something about them has changed that no watch reports."""
@@ -223,7 +232,7 @@ class KubernetesController:
     def _relist(self) -> None:
         """The watched state is wrong: have everything listed anew."""
         for reflector in self._reflectors:
-            reflector.doubt()
+            reflector.relist()
 
     def _report(self, observed: ClusterSnapshot) -> None:
         own_problems = (*self._applier.problems.values(), *self._key.problems)

@@ -5,26 +5,26 @@ All of them are due every ``resync`` seconds in any case: whatever was missed is
 
 from collections.abc import Iterable
 
-from rosproxy_operator.kubernetes.planner.parts import Part, part_of
+from rosproxy_operator.kubernetes.planner.parts import Partition, partition_of
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 
 
-class Due:
+class PlanSchedule:
     """When which namespace is to be planned again, in seconds of a monotonic clock."""
 
     def __init__(self) -> None:
         self._at: dict[str, float] = {}
         self._all_due, self._all_at = True, 0.0
 
-    def all(self) -> None:
+    def mark_all_due(self) -> None:
         """Everything is due."""
         self._all_due = True
 
     def at_once(self, namespaces: Iterable[str]) -> None:
         """These namespaces are due now."""
-        self.soon(namespaces, 0.0)
+        self.due_at(namespaces, 0.0)
 
-    def soon(self, namespaces: Iterable[str], at: float) -> None:
+    def due_at(self, namespaces: Iterable[str], at: float) -> None:
         """These namespaces are due at a time, if not before."""
         for namespace in namespaces:
             self._at[namespace] = min(self._at.get(namespace, at), at)
@@ -34,21 +34,21 @@ class Due:
         self._all_due = self._all_due or now - self._all_at >= resync
         return self._all_due
 
-    def part(
+    def due_partition(
         self,
         observed: ClusterSnapshot,
         namespaces: Iterable[str],
         nodes: Iterable[str],
         now: float,
-    ) -> Part | None:
+    ) -> Partition | None:
         """The part to be planned now, with the given namespaces and nodes; None if it is all."""
         if self._all_due:
             return None
         due = {namespace for namespace, at in self._at.items() if at <= now}
-        return part_of(observed, {*namespaces, *due}, nodes)
+        return partition_of(observed, {*namespaces, *due}, nodes)
 
     def planned(
-        self, scope: Part | None, observed: ClusterSnapshot, again_in: float | None, now: float
+        self, scope: Partition | None, observed: ClusterSnapshot, again_in: float | None, now: float
     ) -> None:
         """A part was planned just now, None: all; it is due again in ``again_in`` seconds."""
         if scope is None:
@@ -60,7 +60,7 @@ class Due:
             for namespace in planned:
                 self._at.pop(namespace, None)
         if again_in is not None:
-            self.soon(planned, now + again_in)
+            self.due_at(planned, now + again_in)
 
     def again_in(self, now: float, delay: float | None) -> float | None:
         """In how many seconds something is due, ``delay`` at most; None: once something changes."""

@@ -23,12 +23,12 @@ from rosproxy_operator.kubernetes.api.client import (
     Api,
     ApiConflict,
     ApiError,
-    ApiGone,
+    ApiNotFound,
 )
 from rosproxy_operator.kubernetes.planner import leadership
 from rosproxy_operator.kubernetes.planner.leadership import LOOK, RENEW, Candidate, LeaseRecord
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import number, part, word
+from rosproxy_operator.kubernetes.resources.values import int_at, submap, text_at
 
 log = logging.getLogger(__name__)
 
@@ -49,26 +49,26 @@ class LeaderElection:
 
     def __init__(self, api: Api, lease: Name | None, metrics: ClusterMetrics) -> None:
         self._api, self._lease, self._metrics = api, lease, metrics
-        self._one = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
-        self._leaving, self._room = False, asyncio.Lock()
+        self._candidate = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
+        self._leaving, self._lock = False, asyncio.Lock()
         self._shown = (-1, "")
         self._error = ""
         metrics.leader.set(lease is None)
 
     def leads(self) -> bool:
         """Whether this operator may act, at this moment."""
-        return self._lease is None or self._one.leads(clock())
+        return self._lease is None or self._candidate.leads(clock())
 
     def term(self) -> int:
         """The number of this operator's present term, from 1; 0: it does not lead."""
-        return (1 if self._lease is None else self._one.terms) if self.leads() else 0
+        return (1 if self._lease is None else self._candidate.terms) if self.leads() else 0
 
     async def run(self, changed: Callable[[], None]) -> None:
         """Take part until it has left, or is cancelled. ``changed``: it leads now, or no more."""
         while self._lease is not None and not self._leaving:
-            async with self._room:
+            async with self._lock:
                 if not self._leaving:
-                    self._one = await in_thread(self._round, self._one, self._lease)
+                    self._candidate = await in_thread(self._round, self._candidate, self._lease)
             self._show(changed)
             # Candidates are spread in time; a leader that fails to renew has little time left.
             calm = self.leads() and not self._error
@@ -78,12 +78,12 @@ class LeaderElection:
     def resign(self) -> None:
         """Lead no more. The Lease is kept until `release`."""
         self._leaving = self._lease is not None
-        self._one = leadership.resigned(self._one)
+        self._candidate = leadership.after_resignation(self._candidate)
 
     async def release(self) -> None:
         """Let another operator lead at once: this one has stopped acting."""
-        async with self._room:  # a renewal may be under way
-            self._one = leadership.resigned(self._one)
+        async with self._lock:  # a renewal may be under way
+            self._candidate = leadership.after_resignation(self._candidate)
             if self._lease is not None:
                 await in_thread(self._release, self._lease)
         self._metrics.leader.set(0)
@@ -92,11 +92,11 @@ class LeaderElection:
         """Look at the Lease once, and write it if that is right."""
         try:
             candidate = leadership.observe(candidate, self._read(lease), clock())
-            record = leadership.wanted(candidate, clock())
+            record = leadership.next_record(candidate, clock())
             if record is not None:
                 begun = clock()
                 self._write(lease, record)
-                candidate = leadership.wrote(candidate, record, begun, clock())
+                candidate = leadership.after_write(candidate, record, begun, clock())
             self._error = ""
         except ApiConflict:
             log.debug("Lease %s: somebody else was faster", lease)
@@ -108,7 +108,7 @@ class LeaderElection:
 
     def _release(self, lease: Name) -> None:
         try:
-            record = leadership.released(self._read(lease), self._one.name)
+            record = leadership.released_record(self._read(lease), self._candidate.name)
             if record is not None:
                 self._write(lease, record)
                 log.info("leads no more: released the Lease %s", lease)
@@ -118,7 +118,7 @@ class LeaderElection:
     def _read(self, lease: Name) -> LeaseRecord | None:
         try:
             return lease_record(self._api.get(LEASES, lease, SOON))
-        except ApiGone:
+        except ApiNotFound:
             return None
 
     def _write(self, lease: Name, record: LeaseRecord) -> None:
@@ -137,9 +137,9 @@ class LeaderElection:
 
     def _show(self, changed: Callable[[], None]) -> None:
         """Report who leads, if that has changed."""
-        term, record = self.term(), self._one.seen
-        rival = record.holder if record and record.holder != self._one.name else ""
-        holder = self._one.name if term else rival
+        term, record = self.term(), self._candidate.record
+        rival = record.holder if record and record.holder != self._candidate.name else ""
+        holder = self._candidate.name if term else rival
         previous, self._shown = self._shown, (term, holder)
         if self._shown == previous:
             return
@@ -155,13 +155,13 @@ class LeaderElection:
 
 def lease_record(obj: Json) -> LeaseRecord:
     """A Lease, as k8s.io/api, coordination/v1/types.go, has it."""
-    spec = part(obj, "spec")
+    spec = submap(obj, "spec")
     return LeaseRecord(
-        version=word(part(obj, "metadata"), "resourceVersion"),
-        holder=word(spec, "holderIdentity"),
-        duration=min(float(number(spec, "leaseDurationSeconds")), LONGEST),
-        transitions=number(spec, "leaseTransitions"),
-        acquired=word(spec, "acquireTime"),
+        version=text_at(submap(obj, "metadata"), "resourceVersion"),
+        holder=text_at(spec, "holderIdentity"),
+        duration=min(float(int_at(spec, "leaseDurationSeconds")), LONGEST),
+        transitions=int_at(spec, "leaseTransitions"),
+        acquired=text_at(spec, "acquireTime"),
     )
 
 

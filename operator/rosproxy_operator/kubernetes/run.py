@@ -23,7 +23,7 @@ from rosproxy_operator.kubernetes.leader import LeaderElection
 from rosproxy_operator.kubernetes.serving import ClusterServing
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
-from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, source
+from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, certificate_source
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,9 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     controller = KubernetesController(settings, api, metrics, election.term)
     webhook = rotation = None
     if settings.webhook:
-        rotation = CertificateRotation(source(api, settings.webhook, election.leads), metrics)
+        rotation = CertificateRotation(
+            certificate_source(api, settings.webhook, election.leads), metrics
+        )
         server = WebhookServer(settings.webhook.bind, rotation)
         webhook = Injector(api, settings.plan, metrics, controller.wake), server
     page = operator_page(controller.documents)

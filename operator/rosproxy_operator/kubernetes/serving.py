@@ -35,7 +35,7 @@ STOPPING = 3.0
 _BETWEEN_TRIES = (1.0, 1.0, 2.0, 3.0, 5.0)
 
 
-class Endless:
+class EndlessBackoff:
     """Seconds between the tries of a request, without end: kopf would give up and end otherwise."""
 
     def __iter__(self) -> Iterator[float]:
@@ -45,7 +45,7 @@ class Endless:
             yield _BETWEEN_TRIES[-1]
 
 
-def quieten() -> None:
+def quiet_library_logs() -> None:
     """Keep kopf and its libraries from logging each request; looks report what is wrong."""
     debug = logging.getLogger().isEnabledFor(logging.DEBUG)
     for name in ("kopf", "kubernetes", "urllib3"):
@@ -93,7 +93,7 @@ class ClusterServing:
         settings.peering.standalone = True
         # It would kill this thread some minutes after kopf was only started again.
         settings.process.ultimate_exiting_timeout = None
-        settings.networking.error_backoffs = Endless()
+        settings.networking.error_backoffs = EndlessBackoff()
         settings.networking.request_timeout = 30.0
         settings.networking.connect_timeout = 5.0
         settings.admission.managed = None

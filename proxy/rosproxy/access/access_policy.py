@@ -14,7 +14,7 @@ from rosproxy.access.layers import (
     PolicyLayer,
     PolicyMode,
     Verdict,
-    bounded,
+    check_bounds,
     decide,
     decide_below,
     may_deny,
@@ -58,13 +58,13 @@ class AccessPolicy:
 
     def use_file(self, layer: PolicyLayer) -> None:
         """Take in what the file says now. Raises ValueError if that is too much."""
-        bounded((*self._option_layers, layer, *self._operator_layers))
+        check_bounds((*self._option_layers, layer, *self._operator_layers))
         self._file_layers = (layer,)
         self._note_change()
 
-    def use_told(self, layers: Sequence[PolicyLayer]) -> None:
+    def use_operator_layers(self, layers: Sequence[PolicyLayer]) -> None:
         """Take in what an operator says now. Raises ValueError if that is too much."""
-        bounded((*self._option_layers, *self._file_layers, *layers))
+        check_bounds((*self._option_layers, *self._file_layers, *layers))
         self._operator_layers = tuple(layers)
         self._note_change()
         self._operator_told.set()
@@ -97,13 +97,13 @@ class AccessPolicy:
         """The same, and a denial is reported; ``source`` is the address of who asks, if another."""
         verdict = self.judge(kind, name, callers, address)
         subject = f"{name} of {callers[0]}" if callers else name
-        return self.tell(verdict, kind, subject, source or address)
+        return self.report(verdict, kind, subject, source or address)
 
     def judge_below(self, kind: RuleKind, prefix: str, caller: str, address: str) -> Verdict:
         """Whether all is allowed whose name begins with a prefix; nothing is reported."""
         return decide_below(self._layers_for(kind), kind, prefix, caller, address)
 
-    def tell(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Verdict:
+    def report(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Verdict:
         """Report a verdict in metrics, log and status, if a rule denies or would deny."""
         if verdict.rule is not None:
             is_audit = verdict.mode is PolicyMode.AUDIT

@@ -149,7 +149,7 @@ def read_layers(value: object) -> tuple[PolicyLayer, ...]:
         written = msgspec.convert(value, tuple[WrittenLayer, ...])
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from None
-    return bounded([read_layer(layer) for layer in written])
+    return check_bounds([read_layer(layer) for layer in written])
 
 
 def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
@@ -165,7 +165,7 @@ def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
     ]
 
 
-def bounded(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
+def check_bounds(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
     """The layers, unless they are too many. Raises ValueError."""
     if len(layers) > MOST_LAYERS:
         raise ValueError(f"{len(layers)} layers, at most {MOST_LAYERS} are accepted")

@@ -29,7 +29,7 @@ class DomainPlane(Collector):
         is_read = lease.kind is LeaseKind.METATRAFFIC
         status = document.LocatorStatus(
             lease.port,
-            str(lease.where),
+            str(lease.target),
             lease.kind.value,
             lease.datagrams,
             lease.bytes,

@@ -76,14 +76,14 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
 def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, DomainProblem]]:
     """The mismatches of pairs of which neither participant has a grave problem of its own."""
     hindered = {p.guid_prefix for p, problem in _participant_problems(domain) if problem.grave}
-    labels = {p.guid_prefix: named(p, True) for p in domain.inside}
-    labels |= {p.guid_prefix: named(p, False) for p in domain.outside}
+    labels = {p.guid_prefix: participant_label(p, True) for p in domain.inside}
+    labels |= {p.guid_prefix: participant_label(p, False) for p in domain.outside}
     for pair in domain.mismatches:
         if not hindered & {pair.writer, pair.reader}:
             yield pair, _mismatch(pair, labels.get(pair.writer, ""), labels.get(pair.reader, ""))
 
 
-def named(participant: ParticipantStatus, is_inside: bool) -> str:
+def participant_label(participant: ParticipantStatus, is_inside: bool) -> str:
     """A participant as texts name it, besides its GUID prefix."""
     return (
         f"at {participant.address} ({participant.vendor}, {'inside' if is_inside else 'outside'})"
@@ -104,7 +104,7 @@ def _problems(
     participant: ParticipantStatus, domain: DomainStatus, is_inside: bool
 ) -> Iterator[DomainProblem]:
     """What is wrong with a participant, the first cause first."""
-    label = named(participant, is_inside)
+    label = participant_label(participant, is_inside)
     if participant.domain is not None and participant.domain != domain.domain:
         text = (
             f"{label}: it is of domain {participant.domain}, and was heard in "

@@ -27,7 +27,7 @@ class BodyError(ValueError):
     """A body that can't be used; the message names the field and says what it must be."""
 
 
-class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class EmptyBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The body of ``POST /probe`` and ``POST /retire``: none, or an empty object."""
 
 
@@ -40,7 +40,7 @@ class MasterAddress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         msgspec.structs.force_setattr(self, "address", _address("address", self.address))
 
 
-class Arrival(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ArrivedContainer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A container on an inside network: its IP address there, and the host names it goes by."""
 
     address: str
@@ -67,7 +67,7 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     gone: tuple[str, ...] = ()
     moved: dict[str, str] = {}
-    arrived: tuple[Arrival, ...] = ()
+    arrived: tuple[ArrivedContainer, ...] = ()
     selected: tuple[str, ...] | None = None
     peers: tuple[str, ...] | None = None
     former: dict[str, tuple[int, ...]] = {}

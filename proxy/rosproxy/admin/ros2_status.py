@@ -86,7 +86,7 @@ class Ros2State(Collector):
             domain, number = server.domain, str(server.domain.settings.number)
             used.add_metric([number], len(domain.inside.leases))
             free.add_metric([number], domain.ports.pool.free)
-            lacking.add_metric([number], len(domain.inside.lacking))
+            lacking.add_metric([number], len(domain.inside.port_shortages))
             dropped.add_metric([number], domain.refused.count)
             for (kind, inwards), size in domain.passed.items():
                 passed.add_metric([number, kind.value, "inward" if inwards else "outward"], size)
@@ -121,7 +121,7 @@ class Ros2State(Collector):
             mismatches=tuple(map(_mismatch, pairs[:MOST_MISMATCHES])),
             mismatches_left_out=max(len(pairs) - MOST_MISMATCHES, 0),
             inside=bounded_names(
-                self._inside(p, domain.inside.lacking.get(p.prefix, ""), domain.is_kept(p))
+                self._inside(p, domain.inside.port_shortages.get(p.prefix, ""), domain.is_kept(p))
                 for p in domain.inside.by_prefix.values()
             ),
             outside=bounded_names(self._outside(p) for p in domain.outside.by_prefix.values()),

@@ -24,7 +24,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.admin.requests import BodyError
-from rosproxy.admin.status_changes import Crowded, StatusChanges
+from rosproxy.admin.status_changes import StatusChanges, TooManyWaiting
 from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.http_client import TooLong, read_bounded
@@ -135,7 +135,7 @@ class AdminServer:
             version, status = await self._changes.after(
                 since, within, lambda: transport is not None and not transport.is_closing()
             )
-        except Crowded:
+        except TooManyWaiting:
             return web.Response(status=503, text="rosproxy: too many wait already; ask /status\n")
         return web.json_response({"version": version, "status": to_json(status)})
 

@@ -71,7 +71,7 @@ class ProxyState(Collector):
             stand_ins=msgspec.convert(self._stand_ins.status(), tuple[document.StandInStatus, ...]),
             policy=self._policy(),
             nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
-            problems=told_problems(context.problems),
+            problems=problem_statuses(context.problems),
         )
         return bounded(whole)
 
@@ -98,9 +98,9 @@ class ProxyState(Collector):
         context, endpoints = self._context, self._context.registry
         pool, buffered = endpoints.pool, context.buffered
         yield "leases_used", "Ports held by inside nodes.", len(endpoints)
-        yield "leases_free", "Ports left for inside nodes.", fast_ports.left(pool, endpoints)
+        yield "leases_free", "Ports left for inside nodes.", fast_ports.ports_left(pool, endpoints)
         text = "Of the ports left, those that serve topics meanwhile."
-        yield "fast_ports", text, fast_ports.held(endpoints)
+        yield "fast_ports", text, fast_ports.fast_port_count(endpoints)
         yield "leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)
         yield "open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)
         text = "Ports that stand in for nodes outside."
@@ -178,7 +178,7 @@ class ProxyState(Collector):
             listen=str(ports.listen),
             advertise=str(ports.advertise),
             used=len(registry),
-            free=fast_ports.left(registry.pool, registry),
+            free=fast_ports.ports_left(registry.pool, registry),
             blocked=len(registry.pool.blocked),
             held_by=self._held_by() if registry.pool.blocked else (),
         )
@@ -187,7 +187,9 @@ class ProxyState(Collector):
         """The other proxies on this machine that have ports of the range."""
         settings = self._context.settings
         ports = settings.ports.listen
-        return tuple(map(str, signs.others("1", ports.first, ports.last, settings.admin)))
+        return tuple(
+            map(str, signs.overlapping_proxies("1", ports.first, ports.last, settings.admin))
+        )
 
     def _policy(self) -> document.PolicyStatus:
         policy = self._context.policy
@@ -237,7 +239,7 @@ def policy_status(
     return document.PolicyStatus(layers, tuple(shown), left_out + len(hidden) - len(shown))
 
 
-def told_problems(problems: Problems) -> tuple[document.ProblemStatus, ...]:
+def problem_statuses(problems: Problems) -> tuple[document.ProblemStatus, ...]:
     """The problems that were noted, each with how long ago."""
     return tuple(
         document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)

@@ -13,17 +13,17 @@ from collections.abc import Callable
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.admin.status_news import version_of
 
-EVERY = 0.5
+POLL_INTERVAL = 0.5
 """Seconds between two looks at the state, at least."""
 SHARE = 0.01
 """Share of a processor that polling may cost for each caller that waits."""
 LONGEST = 300.0
 """Seconds that a caller may wait."""
-MOST = 4
+MOST_WAITING = 4
 """Callers that may wait at the same time: operators, one after the other."""
 
 
-class Crowded(Exception):
+class TooManyWaiting(Exception):
     """Too many wait already."""
 
 
@@ -46,8 +46,8 @@ class StatusChanges:
 
         Or after ``within`` seconds, or once the caller is no longer ``connected``. Raises Crowded.
         """
-        if self._waiting >= MOST:
-            raise Crowded
+        if self._waiting >= MOST_WAITING:
+            raise TooManyWaiting
         self._waiting += 1
         try:
             clock = asyncio.get_running_loop().time
@@ -58,7 +58,7 @@ class StatusChanges:
                 version, took = version_of(status), time.perf_counter() - began
                 if version != since or clock() >= until or self._ending.is_set() or not connected():
                     return version, status
-                await self._pause(min(max(EVERY, took / SHARE), until - clock()))
+                await self._pause(min(max(POLL_INTERVAL, took / SHARE), until - clock()))
         finally:
             self._waiting -= 1
 

@@ -8,7 +8,9 @@ from rosproxy.settings import SettingError
 
 
 @contextlib.contextmanager
-def binding(option: str, subject: object, holders: Collection[object] = ()) -> Iterator[None]:
+def setting_error_if_taken(
+    option: str, subject: object, holders: Collection[object] = ()
+) -> Iterator[None]:
     """While ``subject`` is bound; raises SettingError instead of OSError.
 
     ``holders`` are those who are likely to have it, if somebody has.

@@ -12,7 +12,7 @@ from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 
-MOST_TOLD = 20
+MOST_NOTED = 20
 """Problems noted at a time, so that nobody hides all others behind those of his own."""
 
 
@@ -30,7 +30,7 @@ class DomainWatch:
         lasting = sorted(problems & self._previous, key=lambda p: (not p.grave, p.subject))
         self._previous = problems
         current: dict[str, set[DomainProblem]] = {}
-        for problem in lasting[:MOST_TOLD]:
+        for problem in lasting[:MOST_NOTED]:
             current.setdefault(problem.subject, set()).add(problem)
         for subject in self._noted.keys() | current.keys():
             self._note(subject, self._noted.get(subject, set()), current.get(subject, set()))

@@ -3,8 +3,8 @@
 import asyncio
 import logging
 
-from rosproxy.app.binding import binding
-from rosproxy.app.signals import stopped
+from rosproxy.app.binding import setting_error_if_taken
+from rosproxy.app.signals import stop_event
 from rosproxy.ros2.servers.ear import Ear, EarSettings
 
 log = logging.getLogger(__name__)
@@ -16,9 +16,9 @@ def run_ear(settings: EarSettings) -> None:
 
 
 async def _run(settings: EarSettings) -> None:
-    ending, ear = stopped(), Ear(settings)
+    ending, ear = stop_event(), Ear(settings)
     try:
-        with binding("--bind", settings.bind):
+        with setting_error_if_taken("--bind", settings.bind):
             ear.start()
         log.info(
             "ready: carries announcements of domain %d between the LAN at %s and the proxy at %s",

@@ -11,7 +11,9 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 
-def tell_taken(ros: str, settings: Settings, taken: Sequence[int], problems: Problems) -> None:
+def report_taken_ports(
+    ros: str, settings: Settings, taken: Sequence[int], problems: Problems
+) -> None:
     """Report taken ports in the log and as a problem, for one version of ROS.
 
     Raises SettingError if no port is left: it would be a proxy that no node can use.
@@ -20,7 +22,7 @@ def tell_taken(ros: str, settings: Settings, taken: Sequence[int], problems: Pro
     if not taken:
         return
     port_kind = "ports" if ros == "1" else "UDP ports"
-    proxies = signs.others(ros, ports.first, ports.last, settings.admin)
+    proxies = signs.overlapping_proxies(ros, ports.first, ports.last, settings.admin)
     holders = "; ".join(map(str, proxies))
     cure = "give one of the two another range (ROSPROXY_PORT_RANGE), or end one"
     if len(taken) == len(ports):

@@ -14,7 +14,7 @@ from rosproxy.admin.requests import BodyError, PolicyNews, read_body
 from rosproxy.admin.status_document import to_json
 from rosproxy.app.ros1 import Ros1
 from rosproxy.app.ros2 import Ros2
-from rosproxy.ros1.upkeep.policy_enforcer import Enforced
+from rosproxy.ros1.upkeep.policy_enforcer import EnforcementCounts
 from rosproxy.runtime import Runtime
 from rosproxy.settings import SettingError, Settings
 from rosproxy.telemetry.metrics import Metrics
@@ -57,13 +57,13 @@ class PolicySources:
         problems.solved(OPERATOR_POLICY)
         if self._ros2:
             await self._ros2.apply_policy()
-        return to_json(await self._ros1.enforce_policy() if self._ros1 else Enforced())
+        return to_json(await self._ros1.enforce_policy() if self._ros1 else EnforcementCounts())
 
     def _use_operator_layers(self, body: Any) -> None:
         """Take in the rules of a post. Raises BodyError."""
         written = read_body(body, PolicyNews).layers
         try:
-            self._runtime.policy.use_told([read_layer(layer) for layer in written])
+            self._runtime.policy.use_operator_layers([read_layer(layer) for layer in written])
         except ValueError as error:
             raise BodyError(f"layers: {error}") from None
 

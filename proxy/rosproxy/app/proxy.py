@@ -15,7 +15,7 @@ import msgspec
 from rosproxy import __version__
 from rosproxy.admin.client import default_url
 from rosproxy.admin.server import Action, AdminServer
-from rosproxy.admin.status import told_problems
+from rosproxy.admin.status import problem_statuses
 from rosproxy.admin.status_document import (
     DomainStatus,
     PortsStatus,
@@ -23,14 +23,14 @@ from rosproxy.admin.status_document import (
     StatusSettings,
     to_json,
 )
-from rosproxy.app.binding import binding
+from rosproxy.app.binding import setting_error_if_taken
 from rosproxy.app.policy_sources import PolicySources
 from rosproxy.app.ros1 import Ros1
 from rosproxy.app.ros2 import Ros2
 from rosproxy.app.self_check import SelfCheck
-from rosproxy.app.signals import stopped
+from rosproxy.app.signals import stop_event
 from rosproxy.net import signs, sockets
-from rosproxy.page.feed import Feed, Look
+from rosproxy.page.feed import Feed, PageWatch
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
@@ -75,23 +75,23 @@ class App:
         admin = default_url(str(settings.admin))
 
         def look() -> AsyncGenerator[dict[str, Any]]:
-            return Look(self.state, lambda: self._check.findings, admin).documents()
+            return PageWatch(self.state, lambda: self._check.findings, admin).documents()
 
         return Page(Feed(runtime.tasks, look), Visitors(settings.token_hash, runtime.now))
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
         settings = self.settings
-        with binding("--bind", settings.bind):
+        with setting_error_if_taken("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
         self._policy.start()
         stacks = [stack for stack in (self.ros1, self.ros2) if stack]
         for stack in stacks:
             await stack.start()
-        with binding("--admin-bind", settings.admin):
+        with setting_error_if_taken("--admin-bind", settings.admin):
             await self._admin.start(settings.admin)
         ports = settings.ports.listen
-        self._sign = signs.put_up(settings.ros, ports.first, ports.last, settings.admin)
+        self._sign = signs.publish_sign(settings.ros, ports.first, ports.last, settings.admin)
         await self._check.start()
         log.info("ready: %s", "; ".join(stack.greeting for stack in stacks))
 
@@ -151,7 +151,7 @@ class App:
                 sum(domain.ports_free for domain in domains),
             ),
             data_plane=domains[0].data_plane if domains else None,
-            problems=told_problems(runtime.problems),
+            problems=problem_statuses(runtime.problems),
         )
 
 
@@ -179,7 +179,7 @@ def run(settings: Settings, remarks: Mapping[str, str]) -> None:
 
 
 async def _run_until_signal(settings: Settings, remarks: Mapping[str, str]) -> None:
-    ending = stopped()
+    ending = stop_event()
     _raise_file_limit()
     app = App(settings)
     for subject, text in remarks.items():

@@ -13,15 +13,15 @@ from typing import Any
 
 from rosproxy.admin.requests import (
     ContainerNews,
+    EmptyBody,
     MasterAddress,
-    Nothing,
     read_body,
 )
 from rosproxy.admin.server import Action
 from rosproxy.admin.status import ProxyState
 from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.app.binding import binding
-from rosproxy.app.holders import tell_taken
+from rosproxy.app.binding import setting_error_if_taken
+from rosproxy.app.holders import report_taken_ports
 from rosproxy.forwarding.kernel.nft import Table
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
@@ -45,7 +45,7 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, Enforced, PolicyEnforcer
+from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, EnforcementCounts, PolicyEnforcer
 from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -75,8 +75,9 @@ class Ros1:
         self.tcpros = TcprosServer(context)
         holders = BothSides(context.registry, context.stand_ins.by_port)
         table = KernelTable(Table(settings.master_port, settings.ports.listen), Tools())
+        networks = context.client_networks
         self.plane = plane = KernelPlane(
-            settings, holders, context.tasks, context.problems, context.now, table, context.near
+            settings, holders, context.tasks, context.problems, context.now, table, networks
         )
         self._callers = Callers(context)
         self.stand_ins = StandInPorts(context, self._callers, self.tcpros, access, plane)
@@ -151,7 +152,7 @@ class Ros1:
         self.reserve_range()
         await self.plane.start()
         master = self._make_master_api()
-        context.tasks.spawn(self._callers.hold(), "waiting for an operator")
+        context.tasks.spawn(self._callers.await_operator(), "waiting for an operator")
         guard, title = self._callers.refusal, "ROS master API, proxied"
         self._listen("--master-port", settings.master_port, master, title, guard)
         if settings.publish_master is not None:
@@ -194,13 +195,13 @@ class Ros1:
         self.leases.close_all()
         self.stand_ins.close()
         await self.context.tasks.cancel()
-        self.prober.kept.close_all()
+        self.prober.kept_connections.close_all()
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
         await asyncio.gather(self.tcpros.relays.stop(), *servers)
         await self.context.upstream.close()
 
-    async def enforce_policy(self) -> Enforced:
+    async def enforce_policy(self) -> EnforcementCounts:
         """Make everything fit the policy. Raises Unreachable, MasterError."""
         return await self._enforcer.enforce()
 
@@ -231,7 +232,7 @@ class Ros1:
 
     async def _retire(self, body: Any) -> dict[str, Any]:
         """``POST /retire``: how many nodes were unregistered."""
-        read_body(body, Nothing)
+        read_body(body, EmptyBody)
         count = await self._containers.retire()
         await self._memory.write()
         return {"unregistered": count}
@@ -253,10 +254,10 @@ class Ros1:
             text = f"{ports} are more ports than this process may have open files (ulimit -Hn)"
             raise SettingError(RANGE_OPTION, text)
         spare = max(files, 0) - len(ports) - SPARE_FILES
-        self.prober.kept.most = max(0, min(len(ports), spare // 2))
-        self.context.gate.bound(spare - self.prober.kept.most)
+        self.prober.kept_connections.most = max(0, min(len(ports), spare // 2))
+        self.context.gate.bound(spare - self.prober.kept_connections.most)
         taken = self.leases.reserve_range()
-        tell_taken("1", self.settings, taken, self.context.problems)
+        report_taken_ports("1", self.settings, taken, self.context.problems)
 
     def _listen(
         self,
@@ -266,7 +267,7 @@ class Ros1:
         title: str,
         guard: Guard | None = None,
     ) -> None:
-        with binding(option, f"port {port}"):
+        with setting_error_if_taken(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
         context, greeting = self.context, f"rosproxy: {title}; nodes use it by ROS_MASTER_URI\n"
         server = XmlRpcServer(context, service, greeting, context.master_call, service, guard)

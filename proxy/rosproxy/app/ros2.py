@@ -8,13 +8,13 @@ from typing import Any
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.admin.domain_plane import DomainPlane
-from rosproxy.admin.requests import ContainerNews, Nothing, PortProbe, read_body
+from rosproxy.admin.requests import ContainerNews, EmptyBody, PortProbe, read_body
 from rosproxy.admin.ros2_status import Ros2State
 from rosproxy.admin.server import Action
 from rosproxy.admin.udp_probe import try_udp
-from rosproxy.app.binding import binding
+from rosproxy.app.binding import setting_error_if_taken
 from rosproxy.app.domain_watch import DomainWatch
-from rosproxy.app.holders import tell_taken
+from rosproxy.app.holders import report_taken_ports
 from rosproxy.forwarding.kernel.nft import Table, Transport
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
@@ -94,7 +94,7 @@ class Ros2:
                 number=number,
                 hosts=self._hosts,
                 ports=ports,
-                near=address_towards,
+                proxy_address_for=address_towards,
                 note=self._runtime.refusals.note,
                 judge=self._is_allowed,
                 both_ways=settings.direction == "both",
@@ -111,10 +111,12 @@ class Ros2:
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
             self._leases.domains.append(server.domain.inside)
-            other_proxies = signs.others("2", 1, 65535, settings.admin)
-            with binding("--ros2-domain", f"a port of domain {number}", other_proxies):
+            other_proxies = signs.overlapping_proxies("2", 1, 65535, settings.admin)
+            with setting_error_if_taken(
+                "--ros2-domain", f"a port of domain {number}", other_proxies
+            ):
                 taken += server.start()
-        tell_taken("2", settings, taken, self._runtime.problems)
+        report_taken_ports("2", settings, taken, self._runtime.problems)
 
     async def probe(self) -> tuple[PortProbe, ...]:
         """Whether the discovery port of each domain is reached by UDP where outside finds it."""
@@ -159,7 +161,7 @@ class Ros2:
 
     async def _retire(self, body: Any) -> dict[str, Any]:
         """``POST /retire``: how many participants were ended."""
-        read_body(body, Nothing)
+        read_body(body, EmptyBody)
         ended = 0
         for server in self.servers:
             server.select(())

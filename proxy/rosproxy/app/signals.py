@@ -4,7 +4,7 @@ import asyncio
 import signal
 
 
-def stopped() -> asyncio.Event:
+def stop_event() -> asyncio.Event:
     """Set when a signal asks the process to end; needs a running event loop."""
     event = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -17,8 +17,8 @@ from rosproxy.admin.range_probe import probe_range
 from rosproxy.admin.requests import PortProbe, RangeProbe
 from rosproxy.admin.status_document import PortsStatus, ProxyStatus, StatusSettings
 from rosproxy.admin.udp_probe import try_udp
-from rosproxy.app.binding import binding
-from rosproxy.app.holders import tell_taken
+from rosproxy.app.binding import setting_error_if_taken
+from rosproxy.app.holders import report_taken_ports
 from rosproxy.app.ros1 import Ros1
 from rosproxy.doctor.collect import look_at_master
 from rosproxy.doctor.facts import DoctorFacts, SystemState
@@ -43,7 +43,7 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
     facts = DoctorFacts(
         advertise_host=host,
         advertised_addresses=tuple(await resolve(host)),
-        all_here=not settings.for_ros1 and all(is_loopback(p.host) for p in settings.ros2_peer),
+        is_all_local=not settings.for_ros1 and all(is_loopback(p.host) for p in settings.ros2_peer),
         graph=SystemState(),
         status=ProxyStatus(
             settings=StatusSettings(ros=settings.ros, advertise_host=host),
@@ -75,9 +75,9 @@ async def _try_ports(runtime: Runtime, addresses: tuple[str, ...]) -> RangeProbe
     ports = {"--master-port": settings.master_port, "--publish-master": settings.publish_master}
     for option, port in ports.items():
         if port and settings.for_ros1:
-            with binding(option, f"port {port}"):
+            with setting_error_if_taken(option, f"port {port}"):
                 sockets.listen(settings.bind, port).close()
-    with binding("--admin-bind", settings.admin):
+    with setting_error_if_taken("--admin-bind", settings.admin):
         sockets.listen(await _own_address(settings.admin.host), settings.admin.port).close()
     return RangeProbe(probes)
 
@@ -111,7 +111,7 @@ async def _try_udp(runtime: Runtime, addresses: tuple[str, ...]) -> tuple[PortPr
                 bound[port] = stack.enter_context(datagrams.bind(settings.bind, port))
             except OSError:
                 taken.append(port)
-        tell_taken("2", settings, taken, runtime.problems)
+        report_taken_ports("2", settings, taken, runtime.problems)
         first = ports.listen.first
         if first not in bound or not addresses:
             return ()
@@ -128,5 +128,5 @@ async def _try_udp(runtime: Runtime, addresses: tuple[str, ...]) -> tuple[PortPr
 
 def _listen_for(sock: socket.socket, secret: bytes, heard: asyncio.Event) -> None:
     with contextlib.suppress(OSError):
-        if sock.recv(datagrams.LARGEST) == secret:
+        if sock.recv(datagrams.LARGEST_DATAGRAM) == secret:
             heard.set()

@@ -266,9 +266,9 @@ def _check(settings: Any, deep: bool) -> None:
     read_policy_file(settings)
     if deep:
         from rosproxy.cli.deep_check import deep_check
-        from rosproxy.cli.questions import tell
+        from rosproxy.cli.questions import print_findings
 
-        tell(deep_check(settings), as_json=False)
+        print_findings(deep_check(settings), as_json=False)
 
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY_EAR", "show_default": True})

@@ -106,7 +106,7 @@ class OneLineError(click.ClickException):
         click.echo(f"{self.program}: {self.format_message()}", file, err=True)
 
 
-class Shown(click.Command):
+class CommandShowingVariables(click.Command):
     """A command, or group, whose help names the variable of each option that has one."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
@@ -127,11 +127,11 @@ def variables_of(option: click.Option, prefix: str | None) -> list[str]:
     return [f"{prefix}_{option.name}".upper().replace("-", "_")] if automatic else []
 
 
-class Commands(Shown, click.Group):
+class Commands(CommandShowingVariables, click.Group):
     """Commands whose usage errors are one line, led by the program's name; click prints four."""
 
     program = "rosproxy"
-    command_class = Shown
+    command_class = CommandShowingVariables
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         """Parse the words before the command. Raises OneLineError."""

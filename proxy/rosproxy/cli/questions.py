@@ -52,7 +52,7 @@ _admin_option = click.option(
 )
 
 
-@click.command(cls=options.Shown)
+@click.command(cls=options.CommandShowingVariables)
 @_admin_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state as JSON.")
 @click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
@@ -107,14 +107,14 @@ def _why_not_ready(admin: Any) -> str:
     return ""
 
 
-@click.command(cls=options.Shown)
+@click.command(cls=options.CommandShowingVariables)
 @_admin_option
 def health(admin: Any) -> None:
     """Exit with 0 if the proxy is alive, with 1 if not; for container health checks."""
     _or_exit(lambda: admin.get("/healthz", within=3.0))
 
 
-@click.command(cls=options.Shown)
+@click.command(cls=options.CommandShowingVariables)
 @click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
 @_admin_option
 @click.option(
@@ -176,10 +176,10 @@ def doctor(
     )
     unknown = options.unknown_variables(click.get_current_context().find_root().command, log=False)
     findings = rules.diagnose(asyncio.run(collecting))
-    tell([*findings, *(rules.unknown_variable(v.name, v.text) for v in unknown)], as_json)
+    print_findings([*findings, *(rules.unknown_variable(v.name, v.text) for v in unknown)], as_json)
 
 
-def tell(diagnosis: Any, as_json: bool) -> NoReturn:
+def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
     """Print findings, and exit with 1 if something is wrong."""
     import json
 

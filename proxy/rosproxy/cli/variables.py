@@ -17,12 +17,12 @@ class UnknownVariable(msgspec.Struct, frozen=True):
     """A variable that nobody reads, and the one that was probably meant, if any is like it."""
 
     name: str
-    meant: str = ""
+    suggestion: str = ""
 
     @property
     def text(self) -> str:
         """What is wrong, in words that follow the name."""
-        hint = f"; did you mean {self.meant}?" if self.meant else ""
+        hint = f"; did you mean {self.suggestion}?" if self.suggestion else ""
         return f"is no variable of rosproxy's and is ignored{hint}"
 
 

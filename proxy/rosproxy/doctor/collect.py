@@ -36,7 +36,7 @@ from rosproxy.doctor.facts import (
     slave_report,
     system_state,
 )
-from rosproxy.doctor.rules.pair import connected
+from rosproxy.doctor.rules.pair import is_connected
 from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
@@ -96,7 +96,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     if status.domains:
         heard = await _survey(status)
         status = await asyncio.to_thread(admin.status)  # by now it has heard those just started
-        facts = replace(facts, heard=heard, status=status)
+        facts = replace(facts, heard_participants=heard, status=status)
     address = master.address if master.pinned else None
     uri = master.uri if status.settings.for_ros1 else ""
     graph_task = asyncio.create_task(_ask_graph(facts, uri, address))
@@ -105,7 +105,8 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
         probe = await asyncio.to_thread(admin.probe)
     except AdminError as error:
         reason = str(error)
-    return replace(await graph_task, probe=probe, probe_error=reason, all_here=_all_here(status))
+    facts = replace(await graph_task, probe=probe, probe_error=reason)
+    return replace(facts, is_all_local=_all_here(status))
 
 
 def _all_here(status: ProxyStatus) -> bool:
@@ -203,7 +204,7 @@ class _Collector:
         attempt, _ = await _attempt(self._master.call_master("getPid"))
         trip = time.monotonic() - started
         looped = "leads back to the proxy itself" in attempt.reason
-        master = MasterFacts(uri, attempt, addresses, looped=looped, round_trip=trip)
+        master = MasterFacts(uri, attempt, addresses, is_this_proxy=looped, round_trip=trip)
         root = parse_slave_uri(uri)
         if attempt.reach is Reach.STRANGER and root and urlsplit(uri).path not in ("", "/"):
             at_root = await self._ask_pid(root)
@@ -225,7 +226,7 @@ class _Collector:
         facts = replace(
             facts,
             graph=graph,
-            clock=await self._simulated_time(),
+            uses_simulated_time=await self._simulated_time(),
             service_uris=await self._master.look_up("lookupService", graph.services),
         )
         to_try = facts.scope.nodes if facts.names else names
@@ -243,7 +244,7 @@ class _Collector:
         unconnected = {
             (publisher, topic)
             for topic, publisher, subscriber in scope.pairs
-            if not connected(topic, facts.nodes[publisher], facts.nodes[subscriber])
+            if not is_connected(topic, facts.nodes[publisher], facts.nodes[subscriber])
         }
         return replace(
             facts,
@@ -261,13 +262,12 @@ class _Collector:
         A node at a port of this proxy that no node here holds may be behind another proxy that
         advertises the same: it is tried at that port, and at its address inside.
         """
-        slave = node.where
+        slave = node.slave
         if slave is None or facts.lease(slave):
             return node
-        if facts.ours(slave):
-            targets = [slave, *([node.inside] if node.inside else [])]
+        if facts.is_ours(slave):
             async with self._limit:
-                attempts = [await self._ask_pid(target) for target in targets]
+                attempts = [await self._ask_pid(s) for s in (slave, node.inside) if s]
             answered = next((a for a in attempts if a.reach is Reach.ANSWERED), None)
             return replace(node, attempt=answered) if answered else node
         async with self._limit:
@@ -283,7 +283,7 @@ class _Collector:
 
     async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """What a node says of itself, asked through the proxy if it is behind it."""
-        slave, ask = _reached_at(facts, node.where), self._nodes.call_node
+        slave, ask = _reached_at(facts, node.slave), self._nodes.call_node
         if slave is None or node.attempt.failed:
             return node
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
@@ -302,7 +302,7 @@ class _Collector:
     ) -> tuple[str, Attempt]:
         """Where a publisher serves a topic, and whether a subscriber gets through to there."""
         node = facts.nodes[publisher]
-        slave = _reached_at(facts, node.where)
+        slave = _reached_at(facts, node.slave)
         if slave is None or node.report is None:
             return "", Attempt()
         attempt, answer = await _attempt(
@@ -313,7 +313,7 @@ class _Collector:
             return "", attempt
         if target is None:
             return "", Attempt(Reach.STRANGER, "no TCPROS address")
-        if facts.ours(node.where):
+        if facts.is_ours(node.slave):
             return str(target), Attempt()
         header = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
         return str(target), await _shake_hands(self._nodes.reach(target), header)
@@ -335,7 +335,7 @@ def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
 
     None if no node holds that port.
     """
-    if not facts.ours(target):
+    if not facts.is_ours(target):
         return target
     lease, admin = facts.lease(target), parse_host_port(facts.admin.removeprefix("http://"))
     if lease is None or admin is None:

@@ -26,7 +26,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     SPDP_MULTICAST,
     SPDP_UNICAST,
 )
-from rosproxy.ros2.protocol.announcement import ANNOUNCES, announcement, farewell
+from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, farewell
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, source_vendor
 from rosproxy.ros2.registry.participants import Participant
@@ -77,12 +77,12 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
         send_through(sock, own_address, loop=False)
         prefix, targets = os.urandom(PREFIX), list(_targets(own_address, domains))
         own_locator = HostPort(own_address, sock.getsockname()[1])
-        _send(sock, announcement(prefix, [own_locator], LEASE, ANNOUNCES), targets)
+        _send(sock, announcement(prefix, [own_locator], LEASE, SPDP_ENDPOINTS), targets)
         deadline = time.monotonic() + WITHIN
         while len(by_prefix) < MOST_HEARD and (remaining := deadline - time.monotonic()) > 0:
             sock.settimeout(remaining)
             with contextlib.suppress(TimeoutError):
-                datagram, sender = sock.recvfrom(datagrams.LARGEST)
+                datagram, sender = sock.recvfrom(datagrams.LARGEST_DATAGRAM)
                 participant = heard_participant(datagram, plain_address(sender[0]))
                 by_prefix |= {participant.guid_prefix: participant} if participant else {}
         _send(sock, farewell(prefix), targets)

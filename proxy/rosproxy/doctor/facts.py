@@ -46,14 +46,15 @@ class Attempt(msgspec.Struct, frozen=True):
 class MasterFacts(msgspec.Struct, frozen=True):
     """The master as the doctor found it.
 
-    ``at_root``: it does answer at the path ``/``. ``looped``: what answers is this very proxy.
+    ``at_root``: it does answer at the path ``/``. ``is_this_proxy``: what answers is this very
+    proxy.
     """
 
     uri: str
     attempt: Attempt = Attempt()
     addresses: tuple[str, ...] = ()
     at_root: bool = False
-    looped: bool = False
+    is_this_proxy: bool = False
     round_trip: float | None = None
 
 
@@ -149,7 +150,7 @@ class NodeFacts(msgspec.Struct, frozen=True):
     report: SlaveReport | None = None
 
     @property
-    def where(self) -> HostPort | None:
+    def slave(self) -> HostPort | None:
         """Host and port of its URI."""
         return parse_slave_uri(self.uri)
 
@@ -191,13 +192,13 @@ def system_state(state: Any) -> SystemState:
 class Scope(msgspec.Struct, frozen=True):
     """What the names that the user asked for lead to.
 
-    ``named`` are the nodes among the names, ``nodes`` all that have to be looked at; ``pairs`` are
-    (topic, publisher, subscriber), ``lonely`` topics that lack one side.
+    ``named_nodes`` are the nodes among the names, ``nodes`` all that have to be looked at;
+    ``pairs`` are (topic, publisher, subscriber), ``one_sided_topics`` topics that lack one side.
     """
 
-    named: Sequence[str] = ()
+    named_nodes: Sequence[str] = ()
     pairs: Sequence[tuple[str, str, str]] = ()
-    lonely: Sequence[str] = ()
+    one_sided_topics: Sequence[str] = ()
     services: Sequence[str] = ()
     unknown: Sequence[str] = ()
     nodes: frozenset[str] = frozenset()
@@ -253,13 +254,13 @@ class HeardParticipant(msgspec.Struct, frozen=True):
 class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     """Everything gathered.
 
-    ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status``
-    and ``probe`` are what it said. ``advertised_addresses`` is what the advertised host resolves
-    to here. ``service_uris`` are the master's, by service. ``clock``: nodes are told to use
-    simulated time. ``names`` are the nodes, topics and services that the user asked for;
+    ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status`` and
+    ``probe`` are what it said. ``advertised_addresses`` is what the advertised host resolves to
+    here. ``service_uris`` are the master's, by service. ``uses_simulated_time``: nodes are told to
+    use simulated time. ``names`` are the nodes, topics and services that the user asked for;
     ``data_ports`` tells, by publisher and topic, where its subscribers have to connect to and
-    whether that was reached from here. ``heard`` are participants on the networks inside.
-    ``all_here``: of ROS 2 everybody outside is on this machine.
+    whether that was reached from here. ``heard_participants`` are participants on the networks
+    inside. ``is_all_local``: of ROS 2 everybody outside is on this machine.
     """
 
     admin: str = ""
@@ -275,11 +276,11 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     nodes: Mapping[str, NodeFacts] = {}
     service_uris: Mapping[str, str] = {}
     services: Mapping[str, Attempt] = {}
-    clock: bool = False
+    uses_simulated_time: bool = False
     names: tuple[str, ...] = ()
     data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = {}
-    heard: tuple[HeardParticipant, ...] = ()
-    all_here: bool = False
+    heard_participants: tuple[HeardParticipant, ...] = ()
+    is_all_local: bool = False
 
     @property
     def proxy(self) -> ProxyStatus:
@@ -304,9 +305,9 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
 
     def lease(self, host_port: HostPort | None) -> EndpointStatus | None:
         """The node behind an address from the master, if this proxy gave that address."""
-        return self.leases.get(host_port.port) if host_port and self.ours(host_port) else None
+        return self.leases.get(host_port.port) if host_port and self.is_ours(host_port) else None
 
-    def ours(self, host_port: HostPort | None) -> bool:
+    def is_ours(self, host_port: HostPort | None) -> bool:
         """Whether an address from the master is one that this proxy gives to inside nodes."""
         first, _, last = self.proxy.ports.advertise.partition("-")
         if host_port is None or not (first.isdecimal() and last.isdecimal()):

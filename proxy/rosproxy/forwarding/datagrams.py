@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 DATAGRAMS_PER_TURN = 64
 """Passed on before the loop looks at anything else."""
-LARGEST = 65_536
+LARGEST_DATAGRAM = 65_536
 RECEIVE_BUFFER = 1024 * 1024
 """Bytes that may wait while the loop is busy; Linux grants what its rmem_max allows."""
 
@@ -75,7 +75,7 @@ class DatagramRelay:
     def _pass_on(self) -> None:
         try:
             for _ in range(DATAGRAMS_PER_TURN):
-                data, sender = self._in.recvfrom(LARGEST)
+                data, sender = self._in.recvfrom(LARGEST_DATAGRAM)
                 if plain_address(sender[0]) not in self._sources:
                     self.dropped += 1
                     continue
@@ -89,7 +89,7 @@ class DatagramRelay:
     def _read_error(self) -> None:
         """A target says nothing, except that it refuses."""
         try:
-            self._out.recv(LARGEST)
+            self._out.recv(LARGEST_DATAGRAM)
         except BlockingIOError:
             return
         except OSError as error:

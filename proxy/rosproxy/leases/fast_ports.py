@@ -138,7 +138,7 @@ def give_back(pool: PortPool, endpoint: LeaseHolder, blocked: bool = False) -> N
     endpoint.fast_port = None
 
 
-def to_give_back(holders: Iterable[_H]) -> _H | None:
+def least_used_holder(holders: Iterable[_H]) -> _H | None:
     """The holder that loses its fast port first when the range is short: with fewest connections.
 
     Those go on all the same: the kernel keeps forwarding what it has begun to forward.
@@ -147,7 +147,7 @@ def to_give_back(holders: Iterable[_H]) -> _H | None:
     return min(candidates, key=lambda e: e.fast_connections, default=None)
 
 
-def why_none(pool: PortPool, endpoint: LeaseHolder) -> str:
+def why_no_fast_port(pool: PortPool, endpoint: LeaseHolder) -> str:
     """Why an endpoint that could have a fast port has none."""
     port = partner(pool.range, endpoint.port)
     if port is None:
@@ -157,11 +157,11 @@ def why_none(pool: PortPool, endpoint: LeaseHolder) -> str:
     return f"port {port}, which goes with its port {endpoint.port}, is in use"
 
 
-def held(holders: Iterable[LeaseHolder]) -> int:
+def fast_port_count(holders: Iterable[LeaseHolder]) -> int:
     """How many ports are fast ports now."""
     return sum(endpoint.fast_port is not None for endpoint in holders)
 
 
-def left(pool: PortPool, holders: Iterable[LeaseHolder]) -> int:
+def ports_left(pool: PortPool, holders: Iterable[LeaseHolder]) -> int:
     """How many ports are left for nodes: those that are free, and fast ports."""
-    return pool.free + held(holders)
+    return pool.free + fast_port_count(holders)

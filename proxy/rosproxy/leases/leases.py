@@ -35,7 +35,7 @@ class LeaseBook(LeaseHolders[_H], Protocol[_H]):
     def remove(self, endpoint: _H, /) -> None:
         """Forget an endpoint and give its lease back."""
 
-    def reclaimable(self) -> _H | None:
+    def longest_idle(self) -> _H | None:
         """The endpoint to give up first when the range is short."""
 
 
@@ -165,7 +165,7 @@ class Leases(Generic[_H]):
             return True
         return self._give_fast_port_back() is not None
 
-    def take_fast_port(self, endpoint: _H) -> None:
+    def withdraw_fast_port(self, endpoint: _H) -> None:
         """Take the fast port of an endpoint back: its topics have to go through the lease."""
         port = endpoint.fast_port
         self._refuse(port)
@@ -175,7 +175,7 @@ class Leases(Generic[_H]):
 
     def end_idle(self) -> bool:
         """End the lease that is needed least, if nobody needs it."""
-        oldest = self._holders.reclaimable()
+        oldest = self._holders.longest_idle()
         if oldest is not None:
             self.end(oldest)
         return oldest is not None
@@ -274,10 +274,10 @@ class Leases(Generic[_H]):
 
     def _give_fast_port_back(self) -> int | None:
         """Give back the fast port that is needed least, and tell which it was; None: none left."""
-        holder = fast_ports.to_give_back(self._holders)
+        holder = fast_ports.least_used_holder(self._holders)
         if holder is None:
             return None
         port = holder.fast_port
         log.info("%s: port %s is needed otherwise", holder.label, port)
-        self.take_fast_port(holder)
+        self.withdraw_fast_port(holder)
         return port

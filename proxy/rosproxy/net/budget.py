@@ -17,41 +17,41 @@ class Budget:
 
     def __init__(self, most: int, share: int, unit: str) -> None:
         self.most, self._share, self._unit = most, share, unit
-        self._held: dict[str, int] = {}
+        self._used_by_source: dict[str, int] = {}
         self.used = 0
 
     def take(self, source: str, size: int) -> None:
         """Take so much for a source. Raises OverBudget, and takes nothing."""
         if self.used + size > self.most:
             raise OverBudget(f"more than {self.most} {self._unit} at once; try again")
-        total = self._held.get(source, 0) + size
+        total = self._used_by_source.get(source, 0) + size
         if total > self._share:
             raise OverBudget(f"more than {self._share} {self._unit} at once from {source}")
         self.used += size
-        self._held[source] = total
+        self._used_by_source[source] = total
 
     def give(self, source: str, size: int) -> None:
         """Give back what was taken."""
         self.used -= size
-        remaining = self._held.get(source, 0) - size
+        remaining = self._used_by_source.get(source, 0) - size
         if remaining:
-            self._held[source] = remaining
+            self._used_by_source[source] = remaining
         else:
-            self._held.pop(source, None)
+            self._used_by_source.pop(source, None)
 
 
 class Charge:
     """What one piece of work holds of a budget; all of it is given back when the context ends."""
 
-    __slots__ = ("_budget", "_source", "held")
+    __slots__ = ("_budget", "_source", "taken")
 
     def __init__(self, budget: Budget, source: str) -> None:
-        self._budget, self._source, self.held = budget, source, 0
+        self._budget, self._source, self.taken = budget, source, 0
 
     def add(self, size: int) -> None:
         """Hold more. Raises OverBudget."""
         self._budget.take(self._source, size)
-        self.held += size
+        self.taken += size
 
     def __enter__(self) -> "Charge":
         """Begin to hold something."""
@@ -64,5 +64,5 @@ class Charge:
         trace: TracebackType | None,
     ) -> None:
         """Give all of it back."""
-        self._budget.give(self._source, self.held)
-        self.held = 0
+        self._budget.give(self._source, self.taken)
+        self.taken = 0

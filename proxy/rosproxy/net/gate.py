@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 
-WAITING = 512
+MOST_WAITING = 512
 """Connections of a source that have not said anything yet. In ROS clients speak first, at once."""
-LEAST = 64
+LEAST_PER_SOURCE = 64
 """Connections that a source may have, however few file descriptors there are."""
 SHARE = 4
 """Of the file descriptors that the process may open a source gets one in so many connections: a
@@ -35,7 +35,7 @@ class Gate:
 
     def bound(self, files: int) -> None:
         """Never let one source have so many that so many open files run out."""
-        self.per_source = min(self.per_source, max(files // SHARE, LEAST))
+        self.per_source = min(self.per_source, max(files // SHARE, LEAST_PER_SOURCE))
 
     def admits(self, source: str, port: int) -> bool:
         """Whether another connection may come in; makes room if one of the source waits."""
@@ -69,8 +69,8 @@ class Gate:
         Returns what is to be called when it has spoken, or is gone.
         """
         number, connections = next(self._numbers), self._waiting.setdefault(source, {})
-        if len(connections) >= WAITING:
-            text = f"{WAITING} connections from one source that say nothing"
+        if len(connections) >= MOST_WAITING:
+            text = f"{MOST_WAITING} connections from one source that say nothing"
             self._note_refusal("silent_connections", source, text)
             self._end_oldest(source)
         self._waiting.setdefault(source, {})[number] = end

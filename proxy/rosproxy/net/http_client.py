@@ -75,7 +75,7 @@ class HttpClient:
     ``headers`` are sent with each call. A connection that is not used for ``keepalive`` seconds is
     closed; there are never more than ``most`` in use, those of long bodies apart, and those in
     ``late``, which have been given up. No body is longer than ``longest`` bytes. ``source`` is who
-    gives the peers' names (see `resolver`). ``last`` is the address reached last.
+    gives the peers' names (see `resolver`). ``last_address`` is the address reached last.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class HttpClient:
         longest: int = MAX_BODY,
         source: str = "",
     ) -> None:
-        self.last: str | None = None
+        self.last_address: str | None = None
         lines = {"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers}
         self._headers = "".join(f"{name}: {text}\r\n" for name, text in lines.items())
         self._keepalive, self._limit = keepalive, asyncio.Semaphore(most)
@@ -248,7 +248,7 @@ class HttpClient:
                 failure = error
                 continue
             _, handler = await loop.create_connection(lambda: ResponseHandler(loop), sock=sock)
-            self.last = address
+            self.last_address = address
             return handler
         raise failure
 

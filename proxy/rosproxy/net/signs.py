@@ -43,7 +43,9 @@ class Sign:
         )
 
 
-def put_up(ros: Collection[str], first: int, last: int, admin: object) -> socket.socket | None:
+def publish_sign(
+    ros: Collection[str], first: int, last: int, admin: object
+) -> socket.socket | None:
     """Put up the sign of this process; it stays until the socket is closed.
 
     None where that is not possible: a sign only helps people.
@@ -60,7 +62,7 @@ def put_up(ros: Collection[str], first: int, last: int, admin: object) -> socket
     return None
 
 
-def others(ros: str, first: int, last: int, admin: object) -> list[Sign]:
+def overlapping_proxies(ros: str, first: int, last: int, admin: object) -> list[Sign]:
     """The other proxies on this machine, for a version of ROS, that have some of these ports.
 
     ``admin`` is the own admin endpoint, which no other can have. MOST at most, and none whose admin

@@ -107,7 +107,7 @@ def document(
     }
 
 
-class Told(msgspec.Struct, frozen=True):
+class PageFinding(msgspec.Struct, frozen=True):
     """A finding, with its severity in words."""
 
     severity: str = ""
@@ -116,7 +116,7 @@ class Told(msgspec.Struct, frozen=True):
     fix: str = ""
 
 
-class About(msgspec.Struct, frozen=True):
+class PageProxy(msgspec.Struct, frozen=True):
     """What of a proxy's own is needed to show it among several."""
 
     host: str = ""
@@ -128,8 +128,8 @@ class Document(msgspec.Struct, frozen=True):
 
     nodes: dict[str, PageNode]
     links: dict[str, PageLink]
-    findings: tuple[Told, ...] = ()
-    proxy: About = About()
+    findings: tuple[PageFinding, ...] = ()
+    proxy: PageProxy = PageProxy()
     left_out: int = 0
 
 
@@ -143,12 +143,12 @@ def rounded(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def short(name: str) -> str:
+def shown_name(name: str) -> str:
     """A name as it is shown."""
     return brief(name, LONGEST)
 
 
-def told(text: str) -> str:
+def shown_text(text: str) -> str:
     """What is wrong, or a cure, as it is shown."""
     return brief(text, LONGEST_TEXT)
 
@@ -160,11 +160,11 @@ def _plain(struct: PageNode | PageLink) -> Json:
 
 def _finding(finding: DoctorFinding) -> Json:
     plain: Json = msgspec.to_builtins(
-        Told(
+        PageFinding(
             finding.severity.name.lower(),
-            short(finding.subject),
-            told(finding.text),
-            told(finding.fix),
+            shown_name(finding.subject),
+            shown_text(finding.text),
+            shown_text(finding.fix),
         )
     )
     return plain

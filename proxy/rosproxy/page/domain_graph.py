@@ -24,8 +24,8 @@ from rosproxy.page.document import (
     PageNode,
     is_quiet_service,
     rounded,
-    short,
-    told,
+    shown_name,
+    shown_text,
 )
 from rosproxy.ros2.registry.participants import LeaseKind
 
@@ -70,11 +70,11 @@ def _node(
     return PageNode(
         CONTAINER if is_inside else outside_lane,
         "participant",
-        short(f"{participant.address} {participant.guid_prefix[-11:]}"),
+        shown_name(f"{participant.address} {participant.guid_prefix[-11:]}"),
         _state(problem),
-        told(problem.text) if problem else "",
-        told(problem.fix) if problem else "",
-        short(f"{participant.address}, {participant.vendor}"),
+        shown_text(problem.text) if problem else "",
+        shown_text(problem.fix) if problem else "",
+        shown_name(f"{participant.address}, {participant.vendor}"),
         ", ".join(str(lease.port) for lease in participant.leases),
         rounded(sum(lease.rate for lease in data)) if data else None,
     )
@@ -95,7 +95,7 @@ def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator
             problem = problems.get(participant.guid_prefix)
             yield PageLink(
                 "service",
-                short(service),
+                shown_name(service),
                 _key(domain, participant),
                 state=_state(problem),
                 quiet=quiet,
@@ -133,13 +133,13 @@ def _link(
     data = [lease for lease in reader.leases if lease.kind == LeaseKind.DATA.value]
     return PageLink(
         "topic",
-        short(topic),
+        shown_name(topic),
         _key(domain, writer),
         _key(domain, reader),
         carried=data[0].plane if data and state != BROKEN else "",
         port=data[0].port if data else None,
         state=state,
-        text=told(problem.text) if problem else "",
-        fix=told(problem.fix) if problem else "",
+        text=shown_text(problem.text) if problem else "",
+        fix=shown_text(problem.fix) if problem else "",
         quiet=topic in QUIET,
     )

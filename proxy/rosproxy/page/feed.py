@@ -21,7 +21,7 @@ from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
 from rosproxy.net.tasks import Tasks
 from rosproxy.page.document import Json
-from rosproxy.page.graph import Judged, chosen, graph_document, judge, relayed
+from rosproxy.page.graph import Judged, graph_document, judge, relayed, topics_to_ask_about
 from rosproxy.page.measures import Measures
 
 log = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ class Feed:
                 self._renewed.notify_all()
 
 
-class Look:
+class PageWatch:
     """What was counted and found out of a proxy since somebody began to look at its page."""
 
     def __init__(
@@ -183,7 +183,7 @@ class Look:
     async def _ask(self) -> float:
         """One round of questions; the seconds until the next."""
         began, status = time.monotonic(), self._status()
-        facts = await collect_running(status, self._admin, partial(chosen, status))
+        facts = await collect_running(status, self._admin, partial(topics_to_ask_about, status))
         judged = await asyncio.to_thread(judge, facts, self._judged)
         async with self._counting:
             relayed_links = relayed(status, facts.system)

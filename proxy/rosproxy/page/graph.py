@@ -6,6 +6,7 @@ the proxy and are left out.
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 
 import msgspec
 
@@ -32,8 +33,8 @@ from rosproxy.page.document import (
     document,
     is_quiet_service,
     rounded,
-    short,
-    told,
+    shown_name,
+    shown_text,
 )
 from rosproxy.page.measures import FLOWS, Key, Measures
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -46,17 +47,18 @@ _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
 class Judged(msgspec.Struct, frozen=True):
     """The ``facts`` with the doctor's findings: on nodes, on pairs, and on the rest.
 
-    ``apart`` are all pairs that are not connected; of them ``pairs`` has those that were so before.
+    ``unconnected_pairs`` are all pairs that are not connected; of them ``pairs`` has those that
+    were so before.
     """
 
     facts: DoctorFacts
     nodes: dict[str, DoctorFinding] = {}
     pairs: dict[Key, DoctorFinding] = {}
     rest: tuple[DoctorFinding, ...] = ()
-    apart: frozenset[Key] = frozenset()
+    unconnected_pairs: frozenset[Key] = frozenset()
 
 
-def chosen(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
+def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
     """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
     inside = inside_nodes(status)
     topics, remaining = [], MOST_LINKS
@@ -90,7 +92,7 @@ def judge(facts: DoctorFacts, previous: Judged | None = None) -> Judged:
         if inside.keys() & {pair[1], pair[2]}
     }
     apart = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
-    for key in apart - (previous.apart if previous else frozenset()):
+    for key in apart - (previous.unconnected_pairs if previous else frozenset()):
         del pairs[key]
     return Judged(facts, nodes, pairs, tuple(rest), apart)
 
@@ -143,12 +145,12 @@ def _about(status: ProxyStatus) -> Json:
         "version": status.version,
         "instance": status.instance,
         "ros": list(status.settings.ros),
-        "host": short(status.settings.advertise_host),
+        "host": shown_name(status.settings.advertise_host),
         "ports": status.ports.advertise,
         "used": status.ports.used,
         "free": status.ports.free,
         "plane": status.data_plane.plane if status.data_plane else "",
-        "master": short(status.master.uri),
+        "master": shown_name(status.master.uri),
         "master_up": status.master.up,
     }
 
@@ -156,7 +158,7 @@ def _about(status: ProxyStatus) -> Json:
 def _proxy_node(status: ProxyStatus) -> PageNode:
     ports = f"{status.ports.advertise}, {status.ports.used} used, {status.ports.free} free"
     return PageNode(
-        HOST, "proxy", "rosproxy", address=short(status.settings.advertise_host), ports=ports
+        HOST, "proxy", "rosproxy", address=shown_name(status.settings.advertise_host), ports=ports
     )
 
 
@@ -170,12 +172,14 @@ class _Ros1Graph:
     def nodes(self) -> dict[str, PageNode]:
         master = self._status.master
         state = OK if master.up else BROKEN if master.error else UNKNOWN
-        text = "" if master.up else told(master.error)
-        nodes = {MASTER: PageNode(ROBOT, "master", "master", state, text, "", short(master.uri))}
+        text = "" if master.up else shown_text(master.error)
+        nodes = {
+            MASTER: PageNode(ROBOT, "master", "master", state, text, "", shown_name(master.uri))
+        }
         nodes |= {name: self._inside_node(name, e) for name, e in self._inside.items()}
         # Who is connected though the master does not know it, or has not been asked yet.
         nodes |= {
-            c.caller_id: PageNode(ROBOT, address=short(c.peer))
+            c.caller_id: PageNode(ROBOT, address=shown_name(c.peer))
             for endpoint in self._status.nodes
             for c in endpoint.connections
             # Whoever connects names himself; what is no node on this page has no slash.
@@ -194,7 +198,7 @@ class _Ros1Graph:
         rate = plane.sent_rate + plane.received_rate if plane and plane.connections else None
         node = PageNode(
             CONTAINER,
-            address=short(endpoint.address),
+            address=shown_name(endpoint.address),
             ports=", ".join(str(port) for port in ports if port),
             rate=None if rate is None else rounded(rate),
         )
@@ -203,15 +207,15 @@ class _Ros1Graph:
     def _outside_node(self, name: str, facts: NodeFacts) -> PageNode:
         own_addresses = {*self._facts.advertised_addresses}
         is_here = any(a in own_addresses or is_loopback(a) for a in facts.addresses)
-        return self._marked(name, PageNode(HOST if is_here else ROBOT, address=short(facts.uri)))
+        node = PageNode(HOST if is_here else ROBOT, address=shown_name(facts.uri))
+        return self._marked(name, node)
 
     def _marked(self, name: str, node: PageNode) -> PageNode:
         finding = self._judged.nodes.get(name)
         if finding is None:
             return node
-        return msgspec.structs.replace(
-            node, state=_STATES[finding.severity], text=told(finding.text), fix=told(finding.fix)
-        )
+        text, fix = shown_text(finding.text), shown_text(finding.fix)
+        return msgspec.structs.replace(node, state=_STATES[finding.severity], text=text, fix=fix)
 
 
 class _Ros1Links:
@@ -246,8 +250,8 @@ class _Ros1Links:
     def _alone(self, topic: str, name: str) -> PageLink:
         """A topic of a node with nobody on the other side; perhaps it is hidden from there."""
         reason = self._hidden.get((topic, name))
-        text = "" if reason is None else told(f"hidden from outside by the policy: {reason}")
-        return PageLink("topic", short(topic), name, text=text, quiet=topic in QUIET)
+        text = "" if reason is None else shown_text(f"hidden from outside by the policy: {reason}")
+        return PageLink("topic", shown_name(topic), name, text=text, quiet=topic in QUIET)
 
     def _pairs(self) -> set[Key]:
         """Publishers and subscribers of which one is inside; of /tf there may be very many."""
@@ -258,12 +262,8 @@ class _Ros1Links:
             if len(pairs) + len(publishers) * len(subscribers) > 2 * MOST_LINKS:
                 self.left_out += len(publishers) * len(subscribers)
                 continue
-            pairs |= {
-                (topic, publisher, subscriber)
-                for publisher in publishers
-                for subscriber in subscribers
-                if publisher in self._inside or subscriber in self._inside
-            }
+            every_pair = product((topic,), publishers, subscribers)
+            pairs |= {pair for pair in every_pair if not self._inside.keys().isdisjoint(pair[1:])}
         return pairs
 
     def _has_topic(self, name: str, endpoint: EndpointStatus, topic: str) -> bool:
@@ -281,7 +281,7 @@ class _Ros1Links:
         flows = age is not None and age < FLOWS and state != BROKEN
         return PageLink(
             "topic",
-            short(topic),
+            shown_name(topic),
             publisher,
             subscriber,
             carried="" if state == BROKEN else carried,
@@ -291,8 +291,8 @@ class _Ros1Links:
             since=None if link.last is None or flows else round(self._epoch + link.last),
             flows=flows,
             state=state,
-            text=told(finding.text) if finding else "",
-            fix=told(finding.fix) if finding else "",
+            text=shown_text(finding.text) if finding else "",
+            fix=shown_text(finding.fix) if finding else "",
             quiet=topic in QUIET,
         )
 
@@ -306,7 +306,7 @@ class _Ros1Links:
         finding = self._judged.pairs.get(key)
         if finding and finding.severity is Severity.ERROR and key not in self._relayed:
             return finding
-        if self._measures.get(key).stalled(self._now):
+        if self._measures.get(key).is_stalled(self._now):
             return self._stalled(key)
         return None
 
@@ -314,9 +314,8 @@ class _Ros1Links:
         topic, publisher, subscriber = key
         text = (
             f"connected, but nothing of what {publisher} publishes arrives at {subscriber}: "
-            "packets are "
+            "packets are dropped on the way"
         )
-        text += "dropped on the way"
         _, port = self._way(key)
         host = self._status.settings.advertise_host
         fix = (
@@ -375,7 +374,7 @@ class _Ros1Links:
                 ]
                 yield PageLink(
                     "service",
-                    short(service),
+                    shown_name(service),
                     name,
                     carried=self._user_plane() if clients else "",
                     port=slave.port if slave else endpoint.port,
@@ -390,7 +389,9 @@ class _Ros1Links:
         for endpoint in self._status.nodes:
             for name in endpoint.parameters:
                 for node in endpoint.nodes[:1]:
-                    yield PageLink("parameter", short(name), MASTER, node, state=OK, quiet=True)
+                    yield PageLink(
+                        "parameter", shown_name(name), MASTER, node, state=OK, quiet=True
+                    )
 
 
 def _owner(endpoint: EndpointStatus, holders: Sequence[str]) -> str:

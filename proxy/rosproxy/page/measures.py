@@ -84,7 +84,7 @@ class Link:
         elif self.mark is None or (arrived.grew or 0.0) > self.mark[1] or sent.value < self.mark[0]:
             self.mark = sent.value, max(sent.at, arrived.at)
 
-    def stalled(self, now: float) -> bool:
+    def is_stalled(self, now: float) -> bool:
         """Whether messages are sent, and none arrives."""
         if self.mark is None:
             return False
@@ -129,8 +129,8 @@ class Measures:
                 if subscriber not in uris:
                     uris[subscriber] = _publishers(target.report)
                 uri = source.uri
-                if source.where is not None:
-                    uri = uris[subscriber].get((topic, source.where), uri)
+                if source.slave is not None:
+                    uri = uris[subscriber].get((topic, source.slave), uri)
                 _read(link, "taken", target.report, ("i", topic, uri))
             link.note_progress()
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from aiohttp import web
 
-from rosproxy.admin.requests import Nothing, read_body
+from rosproxy.admin.requests import EmptyBody, read_body
 from rosproxy.net.addresses import is_address, is_loopback, parse_authority
 
 SESSION = 12 * 3600.0
@@ -31,7 +31,7 @@ LOCAL = (".localhost", ".local", ".internal")
 """Ends of names that are nobody's on the Internet."""
 
 
-class Passes:
+class ExpiringTokens:
     """Random texts that are good for some seconds, of which only hashes are kept."""
 
     def __init__(self, seconds: float, now: Callable[[], float]) -> None:
@@ -72,7 +72,7 @@ class Visitors:
         self, token_hash: str | None, now: Callable[[], float], local: bool = False
     ) -> None:
         self._token_hash, self._local = token_hash, local
-        self._sessions, self._keys = Passes(SESSION, now), Passes(KEY, now)
+        self._sessions, self._keys = ExpiringTokens(SESSION, now), ExpiringTokens(KEY, now)
 
     def may_look(self, request: web.BaseRequest) -> bool:
         """Whether a request is of somebody who may."""
@@ -82,7 +82,7 @@ class Visitors:
         if scheme == "Bearer" and self.knows_token(token):
             return True
         open_to_all = self._token_hash is None and not self._local
-        return (open_to_all or is_loopback(request.remote or "")) and names_us(
+        return (open_to_all or is_loopback(request.remote or "")) and is_own_host(
             request.headers.get("Host", "")
         )
 
@@ -117,7 +117,7 @@ class Visitors:
 
     async def issue_key(self, body: Any) -> dict[str, Any]:
         """``POST /page-key``: a key with which a browser gets in. Raises BodyError."""
-        read_body(body, Nothing)
+        read_body(body, EmptyBody)
         return {"key": self._keys.issue()}
 
 
@@ -127,7 +127,7 @@ def cookie_name(request: web.BaseRequest) -> str:
     return f"rosproxy-{port}" if port.isascii() and port.isdecimal() else "rosproxy"
 
 
-def names_us(host: str) -> bool:
+def is_own_host(host: str) -> bool:
     """Whether the ``Host`` of a request is none that a stranger may have registered."""
     host_port = parse_authority(f"//{host}")
     name = (host_port.host if host_port else host.partition(":")[0]).lower().rstrip(".")

@@ -42,8 +42,8 @@ class Context:
     ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
     ``lease_call`` and ``master_call`` bound what is read of a call from outside and from inside.
     ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
-    ``passing`` the calls that pass unread; ``refusals`` tells what is over these and other bounds.
-    ``policy``: what outside may see and do.
+    ``unread_calls`` the calls that pass unread; ``refusals`` tells what is over these and other
+    bounds. ``policy``: what outside may see and do.
     """
 
     def __init__(self, runtime: Runtime) -> None:
@@ -62,7 +62,7 @@ class Context:
         capacity = settings.max_buffered * MEBIBYTE
         self.buffered = Budget(capacity, capacity // 2, "bytes of requests and replies")
         self._turn = asyncio.Lock()
-        self.passing = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
+        self.unread_calls = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
         self.registry = Registry(settings.ports.listen)
         self.stand_ins = StandIns(settings)
         self.addressing = Addressing(
@@ -122,7 +122,7 @@ class Context:
             self._client_kinds[address] = kind
         return kind
 
-    def near(self) -> Sequence[Network]:
+    def client_networks(self) -> Sequence[Network]:
         """The networks that may use the proxy as their master; none overlaps another."""
         if self._client_networks is None:
             networks = self.addressing.networks
@@ -133,7 +133,7 @@ class Context:
             self._client_networks = [*ipv4, *ipv6]
         return self._client_networks
 
-    async def after_registration(self, endpoint: Endpoint) -> None:
+    async def wait_for_registration(self, endpoint: Endpoint) -> None:
         """Let the reply to a registration that is under way reach a node first.
 
         A node that applies an older list of publishers after a newer one loses a publisher; the
@@ -159,7 +159,7 @@ class Context:
         self._client_kinds.clear()
         self._client_networks = None
         self._networks_read = self.now()
-        configured, both = self.settings.inside_networks, self.stand_ins.both
+        configured, both = self.settings.inside_networks, self.stand_ins.is_bidirectional
         self.addressing.networks = configured or interface_networks(without_uplink=both)
 
     def caller_at(self, endpoint: Endpoint) -> Caller:

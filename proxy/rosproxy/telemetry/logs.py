@@ -29,15 +29,15 @@ from rosproxy.telemetry.text import brief, clean
 LONGEST = 2000
 """Characters of a message at most, and of each exception's text: the longest of the proxy's own
 has some 400."""
-BURST_OF_ONE, ONE_EVERY = 20, 5.0
+SUBJECT_BURST, SUBJECT_INTERVAL = 20, 5.0
 """Warnings and errors of one kind about one subject that are written at once, and the seconds
 after which one more is. What is told of a real node changes a few times in a minute at most; where
 the subject is an address, there may be some nodes that each say the same of five topics."""
-BURST_OF_ALL, ALL_EVERY = 2000, 1.0
+KIND_BURST, KIND_INTERVAL = 2000, 1.0
 """The same for all messages of one kind: a thousand nodes that start at once have a line each."""
 USUAL = 200
 """Characters of a message that counts as one; a longer one counts as several."""
-MOST_KNOWN = 1024
+MOST_BUCKETS = 1024
 """Kinds and subjects that are remembered; of more the one that came last the longest ago goes."""
 
 _NAMES = {"levelname": "level", "name": "logger", "exc_info": "error"}
@@ -75,16 +75,16 @@ class LogRateLimit(logging.Filter):
         weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL
         with self._lock:
             if record.levelno >= logging.WARNING:
-                bucket = self._bucket((*kind, _subject(record)), BURST_OF_ONE, ONE_EVERY)
+                bucket = self._bucket((*kind, _subject(record)), SUBJECT_BURST, SUBJECT_INTERVAL)
                 if not _take(bucket, record, weight):
                     return False
-            return _take(self._bucket(kind, BURST_OF_ALL, ALL_EVERY), record, weight)
+            return _take(self._bucket(kind, KIND_BURST, KIND_INTERVAL), record, weight)
 
     def _bucket(self, key: Hashable, burst: int, every: float) -> _Bucket:
         """What is left of a bound by now."""
         now = self._clock()
         bucket = self._buckets.pop(key, None) or _Bucket(burst, now)
-        if len(self._buckets) >= MOST_KNOWN:
+        if len(self._buckets) >= MOST_BUCKETS:
             del self._buckets[next(iter(self._buckets))]
         self._buckets[key] = bucket  # the last, so that the first is unused for the longest time
         bucket.remaining = min(bucket.remaining + (now - bucket.since) / every, burst)

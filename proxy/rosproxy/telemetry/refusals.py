@@ -26,14 +26,14 @@ class Refusals:
 
     def __init__(self, metrics: Metrics, problems: Problems, now: Callable[[], float]) -> None:
         self._metrics, self._problems, self._now = metrics, problems, now
-        self._told: dict[tuple[str, str], float] = {}
+        self._logged_at: dict[tuple[str, str], float] = {}
         self._lines: dict[str, tuple[float, int]] = {}
 
     def note(self, reason: str, source: str, text: str) -> None:
         """Tell that something from a source was refused, and why."""
         self._metrics.refused.labels(reason).inc()
         now, key = self._now(), (reason, source)
-        if now - self._told.get(key, -QUIET) < QUIET:
+        if now - self._logged_at.get(key, -QUIET) < QUIET:
             return
         since, lines = self._lines.get(reason, (now, 0))
         if now - since >= QUIET:
@@ -41,10 +41,10 @@ class Refusals:
         if lines >= LINES:
             return
         self._lines[reason] = since, lines + 1
-        self._told.pop(key, None)
-        if len(self._told) >= MOST:
-            del self._told[next(iter(self._told))]
-        self._told[key] = now
+        self._logged_at.pop(key, None)
+        if len(self._logged_at) >= MOST:
+            del self._logged_at[next(iter(self._logged_at))]
+        self._logged_at[key] = now
         subject = f"refused: {reason.replace('_', ' ')}"
         log.warning("%s, from %s: %s", subject, source, text)
         self._problems.solved(subject)

@@ -191,7 +191,7 @@ async def test_a_node_that_hangs_is_not_waited_for(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "rosproxy.ros1.upkeep.containers.YOUNG", -1.0
+        "rosproxy.ros1.upkeep.containers.YOUNG_NODE_AGE", -1.0
     )  # it is none that is just starting
     proxy = await make_proxy(**PATIENT, probe_timeout=10.0)
     await node.publish(proxy.master)

@@ -32,7 +32,7 @@ async def changes(proxy: Proxy, since: str = "", within: str = "60") -> tuple[st
 async def test_a_change_is_told(
     make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(status_changes, "EVERY", 0.01)
+    monkeypatch.setattr(status_changes, "POLL_INTERVAL", 0.01)
     proxy = await make_proxy()
     await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     version, status = await changes(proxy)
@@ -62,17 +62,17 @@ async def test_nonsense_is_no_time(make_proxy: MakeProxy, within: str) -> None:
 
 async def test_so_many_may_wait(make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who goes away makes room, and nobody is waited for when the proxy ends."""
-    monkeypatch.setattr(status_changes, "EVERY", 0.01)
+    monkeypatch.setattr(status_changes, "POLL_INTERVAL", 0.01)
     proxy = await make_proxy()
     await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     version, _ = await changes(proxy)
     room = proxy.app._admin._changes
-    some = [asyncio.create_task(wait(proxy, version)) for _ in range(status_changes.MOST)]
-    await until(lambda: room._waiting == status_changes.MOST, "all wait")
+    some = [asyncio.create_task(wait(proxy, version)) for _ in range(status_changes.MOST_WAITING)]
+    await until(lambda: room._waiting == status_changes.MOST_WAITING, "all wait")
     refused = await wait(proxy, version)
     assert refused.status == 503
     some[0].cancel()
-    await until(lambda: room._waiting < status_changes.MOST, "there is room again")
+    await until(lambda: room._waiting < status_changes.MOST_WAITING, "there is room again")
     room.end()
     assert {(await one).status for one in some[1:]} == {200}
 

@@ -144,7 +144,7 @@ KNOWN = ("ROSPROXY_PORT_RANGE", "ROSPROXY_ADMIN", "ROS_MASTER_URI", "ROS_DOMAIN_
 )
 def test_a_variable_that_looks_like_ours(name: str, meant: str):
     (found,) = unknown({name: "1", "ROSPROXY_PORT_RANGE": "1-2"}, KNOWN)
-    assert (found.name, found.meant) == (name, meant)
+    assert (found.name, found.suggestion) == (name, meant)
 
 
 @pytest.mark.parametrize(

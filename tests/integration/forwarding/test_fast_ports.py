@@ -35,7 +35,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
         return None
 
     monkeypatch.setattr(app, "Tools", lambda: made)
-    monkeypatch.setattr(kernel_plane, "why_not", nothing)
+    monkeypatch.setattr(kernel_plane, "find_obstacle", nothing)
     monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
     monkeypatch.setattr(syncer, "address_towards", lambda address: "192.0.2.1")
     monkeypatch.setattr(decisions, "is_loopback", lambda address: False)
@@ -47,7 +47,7 @@ def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     async def something(mode: str, tools: Tools) -> str:
         return "not in this test"
 
-    monkeypatch.setattr(kernel_plane, "why_not", something)
+    monkeypatch.setattr(kernel_plane, "find_obstacle", something)
 
 
 async def ask(proxy: Any, node: Any) -> Where:

@@ -63,7 +63,7 @@ class Bench:
             self.context.problems,
             lambda: self.context.now() + self.later,
             KernelTable(Table(11311, self.context.settings.ports.listen), self.tools),
-            self.context.near,
+            self.context.client_networks,
         )
 
     def node(self, number: int = 0, tcpros_port: int | None = 50000) -> Endpoint:
@@ -83,7 +83,7 @@ class Bench:
     def stand_in(self) -> StandIn:
         where = HostPort("robot", 40000)
         local, uri = HostPort("172.30.0.2", 20016), f"http://{where}/"
-        stand_in = StandIn(local, uri, where, kept=False, topic_ports={"/chatter": 50000})
+        stand_in = StandIn(local, uri, where, is_uri_kept=False, topic_ports={"/chatter": 50000})
         stand_in.address = NODE
         self.context.stand_ins.add(stand_in)
         assert stand_in.fast_candidate is not None
@@ -266,7 +266,7 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
     bench.later = kernel_plane.UNANSWERED_PATIENCE
     await bench.plane.look()
     assert bench.tools.forwards == {}
-    waiting = False, ("--mark", Marks(11311).one(45002), "--state", "SYN_SENT")
+    waiting = False, ("--mark", Marks(11311).port_selector(45002), "--state", "SYN_SENT")
     assert waiting in bench.tools.forgotten
     assert "nothing came back" in bench.plane.status_of(endpoint)["reason"]
     bench.tools.flows = ""
@@ -277,7 +277,7 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
 async def test_cutting_forgets_the_connections(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     bench.plane.cut(endpoint)
-    mark = Marks(11311).one(45002)
+    mark = Marks(11311).port_selector(45002)
     await until(lambda: bench.tools.forgotten == [(False, ("--mark", mark))])
 
 
@@ -285,7 +285,7 @@ async def test_stopping_leaves_nothing(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     await bench.plane.stop()
     assert bench.tools.table is None
-    marked = "--mark", Marks(11311).all
+    marked = "--mark", Marks(11311).table_selector
     assert set(bench.tools.forgotten) == {(False, marked), (True, marked)}
     assert not await bench.plane.syncer.forwards(endpoint, 50001)
 

@@ -43,17 +43,17 @@ class ChainTools(FakeTools):
 
 async def test_a_sound_container_has_nothing_in_the_way(place: Path) -> None:
     for mode in ("auto", "kernel"):
-        assert await preflight.why_not(mode, ChainTools()) is None
+        assert await preflight.find_obstacle(mode, ChainTools()) is None
     assert preflight.read_forwarding() == HostForwarding(ipv4=True, ipv6=False)
 
 
 async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:
     (place / "net" / "eth0" / "device").mkdir()
-    said = await preflight.why_not("auto", ChainTools())
+    said = await preflight.find_obstacle("auto", ChainTools())
     assert said is not None
     assert "eth0" in said
     assert "--data-plane kernel" in said
-    assert await preflight.why_not("kernel", ChainTools()) is None
+    assert await preflight.find_obstacle("kernel", ChainTools()) is None
 
 
 @pytest.mark.parametrize(
@@ -62,14 +62,14 @@ async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:
 )
 async def test_what_is_in_the_way(place: Path, name: str, text: str, said: str) -> None:
     (place / name).write_text(text)
-    assert said in (await preflight.why_not("kernel", ChainTools()) or "")
+    assert said in (await preflight.find_obstacle("kernel", ChainTools()) or "")
 
 
 async def test_a_file_that_is_not_there_is_not_in_the_way(place: Path) -> None:
     (place / "tables").unlink()
     (place / "net" / "eth0").rmdir()
     (place / "net").rmdir()
-    assert await preflight.why_not("auto", ChainTools()) is None
+    assert await preflight.find_obstacle("auto", ChainTools()) is None
 
 
 async def test_a_firewall_that_drops_is_in_the_way(place: Path) -> None:
@@ -78,9 +78,9 @@ async def test_a_firewall_that_drops_is_in_the_way(place: Path) -> None:
         '{"nftables": [{"chain": {"family": "ip", "table": "filter", "name": "FORWARD", '
         '"hook": "forward", "policy": "drop"}}]}'
     )
-    assert "ip filter FORWARD" in (await preflight.why_not("kernel", tools) or "")
+    assert "ip filter FORWARD" in (await preflight.find_obstacle("kernel", tools) or "")
     tools.chains = "what?"
-    assert "nft printed" in (await preflight.why_not("kernel", tools) or "")
+    assert "nft printed" in (await preflight.find_obstacle("kernel", tools) or "")
 
 
 def program(folder: Path, name: str, script: str, mode: int = 0o755) -> None:

@@ -102,7 +102,9 @@ async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
     bench.tools.flows = LED.format(mark=MARKS.of(45001))
     bench.end(participant)
     await bench.forwarding({})
-    await until(lambda: bench.forgotten("--mark", MARKS.one(45001)), "its senders are forgotten")
+    await until(
+        lambda: bench.forgotten("--mark", MARKS.port_selector(45001)), "its senders are forgotten"
+    )
 
 
 async def test_senders_follow_to_another_locator(bench: Bench) -> None:
@@ -114,7 +116,9 @@ async def test_senders_follow_to_another_locator(bench: Bench) -> None:
     bench.end(participant)
     bench.lend(OTHER)
     await bench.forwarding({45001: OTHER})
-    await until(lambda: bench.forgotten("--mark", MARKS.one(45001)), "its senders are forgotten")
+    await until(
+        lambda: bench.forgotten("--mark", MARKS.port_selector(45001)), "its senders are forgotten"
+    )
 
 
 async def test_who_had_begun_before_is_forgotten_at_the_proxy_alone(bench: Bench) -> None:
@@ -145,7 +149,7 @@ async def test_a_graceful_stop_resets_nobody_and_leaves_nothing(bench: Bench) ->
     await bench.close()
     assert bench.tools.table is None
     assert not any("reset" in document for document in bench.tools.documents)
-    assert bench.forgotten("--mark", MARKS.all)
+    assert bench.forgotten("--mark", MARKS.table_selector)
 
 
 async def test_what_a_killed_process_left_goes_on_for_a_while(bench: Bench) -> None:

@@ -313,7 +313,7 @@ async def test_a_shutdown_that_comes_late_is_spared(
     assert await rpc(proxy.uri(node), "shutdown", "/master", reason) == [1, "", 0]
     assert not shutdowns(node)
     await until(lambda: "/lost" in all_of(master), "what it lacked is registered")
-    assert not proxy.endpoint(node).direct
+    assert not proxy.endpoint(node).has_registered_directly
 
 
 async def test_a_shutdown_that_is_meant_is_passed_on(

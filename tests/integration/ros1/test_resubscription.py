@@ -37,7 +37,7 @@ AFTERWARDS = 22
 
 @pytest.fixture(autouse=True)
 def _early(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resubscriber, "LOOKS", LOOKS)
+    monkeypatch.setattr(resubscriber, "LOOK_DELAYS", LOOKS)
     monkeypatch.setattr(app, "RESUBSCRIBE_TICK", 0.05)
 
 

@@ -40,24 +40,24 @@ def denies(policy: AccessPolicy, name: str) -> bool:
 
 
 def test_told_layers_replace_each_other_and_keep_the_own(policy: AccessPolicy) -> None:
-    policy.use_told([layer("deny publish /first")])
+    policy.use_operator_layers([layer("deny publish /first")])
     assert denies(policy, "/first")
     version = policy.version
-    policy.use_told([layer("deny publish /second")])
+    policy.use_operator_layers([layer("deny publish /second")])
     assert policy.version != version
     assert [denies(policy, name) for name in ("/own", "/first", "/second")] == [True, False, True]
 
 
 def test_too_many_rules_change_nothing(policy: AccessPolicy) -> None:
     with pytest.raises(ValueError, match="1001 rules"):
-        policy.use_told([layer("deny publish /first;" * 1000)])
+        policy.use_operator_layers([layer("deny publish /first;" * 1000)])
     assert not denies(policy, "/first")
 
 
 def test_denials_are_told_with_rule_and_layer(
     policy: AccessPolicy, problems: Problems, metrics: Metrics
 ) -> None:
-    policy.use_told([layer("deny publish /audited", PolicyMode.AUDIT)])
+    policy.use_operator_layers([layer("deny publish /audited", PolicyMode.AUDIT)])
     assert not policy.ask(PUBLISH, "/own", ["/n"], "10.0.0.1").allowed
     assert policy.ask(PUBLISH, "/audited", ["/n"], "10.0.0.1", source="10.0.0.9").allowed
     assert policy.ask(PUBLISH, "/else", ["/n"], "10.0.0.1").allowed
@@ -78,7 +78,7 @@ def test_denials_are_told_with_rule_and_layer(
 
 
 def test_one_of_several_names_that_is_denied_denies_all(policy: AccessPolicy) -> None:
-    policy.use_told([layer("deny publish /x by /b")])
+    policy.use_operator_layers([layer("deny publish /x by /b")])
     assert policy.judge(PUBLISH, "/x", ["/a"], "").allowed
     assert not policy.judge(PUBLISH, "/x", ["/a", "/b"], "").allowed
 

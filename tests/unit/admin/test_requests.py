@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.requests import (
-    Arrival,
+    ArrivedContainer,
     BodyError,
     ContainerNews,
+    EmptyBody,
     MasterAddress,
-    Nothing,
     read_body,
 )
 
@@ -26,10 +26,15 @@ GOOD: list[tuple[Any, ContainerNews]] = [
     (
         {"arrived": [{"address": "172.18.0.7", "names": ["Talker", "3f2a91c0b7de", "a.b-c_d"]}]},
         ContainerNews(
-            arrived=(Arrival("172.18.0.7", frozenset({"talker", "3f2a91c0b7de", "a.b-c_d"})),)
+            arrived=(
+                ArrivedContainer("172.18.0.7", frozenset({"talker", "3f2a91c0b7de", "a.b-c_d"})),
+            )
         ),
     ),
-    ({"arrived": [{"address": "172.18.0.7"}]}, ContainerNews(arrived=(Arrival("172.18.0.7"),))),
+    (
+        {"arrived": [{"address": "172.18.0.7"}]},
+        ContainerNews(arrived=(ArrivedContainer("172.18.0.7"),)),
+    ),
     ({"selected": []}, ContainerNews(selected=())),
     ({"selected": ["::ffff:172.18.0.5"]}, ContainerNews(selected=("172.18.0.5",))),
 ]
@@ -106,7 +111,7 @@ def complaint_of(kind: type[msgspec.Struct], body: Any) -> str:
 
 @given(st.dictionaries(FIELDS, JSON) | JSON)
 def test_anything_else_is_a_mistake_in_one_short_line(body: Any) -> None:
-    for kind in (ContainerNews, MasterAddress, Nothing):
+    for kind in (ContainerNews, MasterAddress, EmptyBody):
         complaint = complaint_of(kind, json.loads(json.dumps(body)))
         assert "\n" not in complaint
         assert len(complaint) < 200
@@ -123,6 +128,6 @@ def test_a_bad_master_address(body: Any) -> None:
 
 
 def test_no_body() -> None:
-    read_body({}, Nothing)
+    read_body({}, EmptyBody)
     with pytest.raises(BodyError, match="unknown field `x`; known: none"):
-        read_body({"x": 1}, Nothing)
+        read_body({"x": 1}, EmptyBody)

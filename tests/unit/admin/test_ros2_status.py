@@ -71,7 +71,7 @@ def announce(one: Domain, reliability: int) -> None:
         (SUBSCRIPTIONS, "rq/addRequest", trigger),
     ):
         one.at_stand_in(stand_in, sedp(A, writer, topic, kind, 1), INSIDE, NOW)
-    port = next(port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410)
+    port = next(port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410)
     one.at_lease(port, sedp(B, SUBSCRIPTIONS, "rt/scan", string, reliability), ROBOT, NOW)
 
 

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from rosproxy.admin.domain_plane import DomainPlane
 from rosproxy.admin.ros2_status import Ros2State
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
-from rosproxy.app.domain_watch import MOST_TOLD, DomainWatch
+from rosproxy.app.domain_watch import MOST_NOTED, DomainWatch
 from rosproxy.telemetry.problems import Problems
 
 GOOD = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
@@ -68,7 +68,7 @@ def test_another_cause_takes_the_place_of_the_first() -> None:
 def test_so_many_are_told_and_no_more() -> None:
     told, problems = Told(), Problems()
     watch = DomainWatch(told, problems)
-    crowd = [replace(TCP, guid_prefix=f"01.0f.{number:02x}") for number in range(MOST_TOLD + 5)]
+    crowd = [replace(TCP, guid_prefix=f"01.0f.{number:02x}") for number in range(MOST_NOTED + 5)]
     for _ in range(2):
         look(watch, told, *crowd)
-    assert len(problems.all()) == MOST_TOLD
+    assert len(problems.all()) == MOST_NOTED

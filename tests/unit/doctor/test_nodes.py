@@ -52,10 +52,10 @@ def test_sound_nodes_are_counted() -> None:
 
 def test_an_address_of_the_proxy_is_of_its_host_and_range() -> None:
     facts = make_facts()
-    ports = [port for port in (44999, 45000, 45099, 45100) if facts.ours(HostPort(HOST, port))]
+    ports = [port for port in (44999, 45000, 45099, 45100) if facts.is_ours(HostPort(HOST, port))]
     assert ports == [45000, 45099]
-    assert not facts.ours(HostPort("192.168.0.9", 45000))
-    assert not without_proxy().ours(HostPort(HOST, 45000))
+    assert not facts.is_ours(HostPort("192.168.0.9", 45000))
+    assert not without_proxy().is_ours(HostPort(HOST, 45000))
 
 
 def test_nobody_uses_the_proxy() -> None:
@@ -225,9 +225,9 @@ def test_a_service_with_a_port_that_nobody_holds() -> None:
 
 
 def test_simulated_time_without_a_clock() -> None:
-    assert "nobody publishes /clock" in only(check(make_facts(clock=True))).text
+    assert "nobody publishes /clock" in only(check(make_facts(uses_simulated_time=True))).text
     graph = SystemState({"/clock": ["/talker"]}, {}, {})
-    assert not faults(make_facts(clock=True, graph=graph))
+    assert not faults(make_facts(uses_simulated_time=True, graph=graph))
 
 
 def test_names_leave_out_what_is_said_of_others() -> None:

@@ -78,7 +78,7 @@ def test_what_names_lead_to(
     nodes: set[str] | None,
 ) -> None:
     found = scope(GRAPH, names)
-    assert (found.pairs, found.lonely) == (pairs, lonely)
+    assert (found.pairs, found.one_sided_topics) == (pairs, lonely)
     assert nodes is None or found.nodes == nodes
 
 

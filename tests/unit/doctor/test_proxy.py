@@ -75,7 +75,7 @@ def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
             "--master-uri http://HOST:11311",
         ),
         (
-            make_master(Reach.STRANGER, looped=True),
+            make_master(Reach.STRANGER, is_this_proxy=True),
             "leads back to this proxy itself",
             "--master-uri http://HOST:11311",
         ),

@@ -40,7 +40,7 @@ def found(
         advertise_host="host",
         advertised_addresses=("192.0.2.10",),
         names=names,
-        heard=heard,
+        heard_participants=heard,
     )
     findings = diagnose(facts)
     assert failed(findings) == any(one.severity is Severity.ERROR for one in findings)

@@ -80,13 +80,13 @@ LOCATOR = HostPort("172.30.1.11", 7411)
 def test_datagrams_that_go_elsewhere_are_found(
     line: str, forwards: dict[int, HostPort], unled: set[HostPort], misled: set[int]
 ) -> None:
-    assert conntrack.astray(line, forwards, MARKS) == (unled, misled)
+    assert conntrack.find_stray_datagrams(line, forwards, MARKS) == (unled, misled)
 
 
 @given(st.text())
 def test_nothing_breaks_it(text: str) -> None:
     assert conntrack.read(text, MARKS) == []
-    assert conntrack.astray(text, {45050: LOCATOR}, MARKS) == (set(), set())
+    assert conntrack.find_stray_datagrams(text, {45050: LOCATOR}, MARKS) == (set(), set())
 
 
 @given(st.lists(st.sampled_from(marked(OPEN).split())))

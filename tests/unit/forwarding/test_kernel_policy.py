@@ -12,8 +12,8 @@ from rosproxy.forwarding.kernel.decisions import (
     Pauses,
     changes,
     destination,
-    kept,
-    unchanged,
+    forwards_to_keep,
+    unchanged_forwards,
 )
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
@@ -51,7 +51,7 @@ BOTH = HostForwarding()
         (an_endpoint(topic_ports={}), BOTH, "nobody has asked"),
         (an_endpoint(topic_ports={"/a": 1, "/b": 2}), BOTH, "several TCPROS ports"),
         (an_endpoint("127.0.0.1"), BOTH, "namespace of the proxy itself"),
-        (an_endpoint(), HostForwarding(own={NODE}), "namespace of the proxy itself"),
+        (an_endpoint(), HostForwarding(own_addresses={NODE}), "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(ipv4=False), "net.ipv4.ip_forward"),
         (an_endpoint("fd00::5"), HostForwarding(ipv6=False), "net.ipv6.conf.all.forwarding"),
     ],
@@ -90,26 +90,26 @@ def test_changes_lead_from_what_there_is_to_what_is_wanted(
 
 @given(FORWARDS)
 def test_everything_is_kept_until_the_registry_is_rebuilt(now: dict[int, HostPort]) -> None:
-    assert kept(now, [], recovered=False) == now
-    assert kept(now, [], recovered=True) == {}
+    assert forwards_to_keep(now, [], recovered=False) == now
+    assert forwards_to_keep(now, [], recovered=True) == {}
 
 
 def test_what_leads_to_a_node_that_was_not_heard_yet_is_kept() -> None:
     waiting = an_endpoint(fast_port=45050, trusted=False)
     now = {45050: THERE, 45051: THERE}
-    assert kept(now, [waiting], recovered=True) == {45050: THERE}
+    assert forwards_to_keep(now, [waiting], recovered=True) == {45050: THERE}
     elsewhere = {45050: HostPort("10.0.0.6", 50000)}
-    assert kept(elsewhere, [waiting], recovered=True) == {}
+    assert forwards_to_keep(elsewhere, [waiting], recovered=True) == {}
     waiting.trusted = True
-    assert kept(now, [waiting], recovered=True) == {}
+    assert forwards_to_keep(now, [waiting], recovered=True) == {}
 
 
 def test_what_did_not_change_stays() -> None:
     holders = [an_endpoint(fast_port=45050 + number) for number in range(3)]
     now = dict.fromkeys(range(45050, 45055), THERE)
     owners = {endpoint.fast_port or 0: endpoint for endpoint in holders} | {45053: holders[0]}
-    assert unchanged(now, owners, []) == dict.fromkeys(range(45050, 45053), THERE)
-    assert unchanged(now, owners, {holders[1]}) == {45050: THERE, 45052: THERE}
+    assert unchanged_forwards(now, owners, []) == dict.fromkeys(range(45050, 45053), THERE)
+    assert unchanged_forwards(now, owners, {holders[1]}) == {45050: THERE, 45052: THERE}
 
 
 def test_a_forward_without_answer_is_not_made_for_longer_each_time() -> None:

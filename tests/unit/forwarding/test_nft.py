@@ -52,9 +52,9 @@ def test_marks_name_their_proxy_and_port(master: int, other: int, port: int) -> 
     assert marks.port(marks.of(port)) == port
     if other != master:
         assert Marks(other).port(marks.of(port)) is None
-    value, _, mask = marks.all.partition("/")
+    value, _, mask = marks.table_selector.partition("/")
     assert marks.of(port) & int(mask, 16) == int(value, 16)
-    assert int(marks.one(port).partition("/")[0], 16) == marks.of(port)
+    assert int(marks.port_selector(port).partition("/")[0], 16) == marks.of(port)
 
 
 def test_the_whole_table_takes_the_place_of_an_old_one() -> None:

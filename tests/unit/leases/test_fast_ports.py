@@ -51,7 +51,7 @@ def test_an_endpoint_gets_the_partner_of_its_lease_and_keeps_it() -> None:
     assert fast_ports.claim(registry.pool, endpoint)
     assert (endpoint.port, endpoint.fast_port) == (1000, 1002)
     assert registry.pool.free == 2
-    assert fast_ports.held(registry) == 1
+    assert fast_ports.fast_port_count(registry) == 1
 
 
 def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
@@ -59,7 +59,7 @@ def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
     first, second = admitted(registry, 1), admitted(registry, 2)
     assert not fast_ports.claim(registry.pool, first)
     assert not fast_ports.claim(registry.pool, second)
-    assert fast_ports.why_none(registry.pool, first) == (
+    assert fast_ports.why_no_fast_port(registry.pool, first) == (
         "port 1001, which goes with its port 1000, is in use"
     )
 
@@ -67,7 +67,7 @@ def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
 def test_the_odd_last_port_has_none() -> None:
     registry, endpoint = one_admitted(1)
     assert not fast_ports.claim(registry.pool, endpoint)
-    assert "goes with port 1000" in fast_ports.why_none(registry.pool, endpoint)
+    assert "goes with port 1000" in fast_ports.why_no_fast_port(registry.pool, endpoint)
 
 
 def test_a_fast_port_is_given_back_once() -> None:
@@ -75,9 +75,9 @@ def test_a_fast_port_is_given_back_once() -> None:
     fast_ports.claim(registry.pool, endpoint)
     for _ in range(2):
         fast_ports.give_back(registry.pool, endpoint)
-    assert fast_ports.held(registry) == 0
+    assert fast_ports.fast_port_count(registry) == 0
     assert registry.pool.free == 3
-    assert "asked for a topic" in fast_ports.why_none(registry.pool, endpoint)
+    assert "asked for a topic" in fast_ports.why_no_fast_port(registry.pool, endpoint)
 
 
 def test_a_fast_port_that_another_program_holds_is_blocked() -> None:
@@ -92,12 +92,12 @@ def test_a_fast_port_that_another_program_holds_is_blocked() -> None:
 def test_the_least_used_fast_port_goes_first() -> None:
     registry = Registry(PortRange(1000, 1005))
     endpoints = [admitted(registry, number) for number in range(3)]
-    assert fast_ports.to_give_back(registry) is None
+    assert fast_ports.least_used_holder(registry) is None
     for endpoint, count in zip(endpoints, (2, 0, 1), strict=True):
         fast_ports.claim(registry.pool, endpoint)
         endpoint.fast_peers = {"192.0.2.1": count} if count else {}
     given_back = []
-    while (holder := fast_ports.to_give_back(registry)) is not None:
+    while (holder := fast_ports.least_used_holder(registry)) is not None:
         fast_ports.give_back(registry.pool, holder)
         given_back.append(holder)
     assert given_back == [endpoints[1], endpoints[2], endpoints[0]]
@@ -108,7 +108,7 @@ def test_whoever_is_connected_through_the_kernel_is_not_idle() -> None:
     registry, endpoint = one_admitted(4)
     endpoint.idle_since = 1.0
     assert [endpoint.unused, endpoint.connected] == [True, False]
-    assert registry.reclaimable() is endpoint
+    assert registry.longest_idle() is endpoint
     endpoint.fast_peers = {"192.0.2.1": 1}
     assert [endpoint.unused, endpoint.connected] == [False, True]
-    assert registry.reclaimable() is None
+    assert registry.longest_idle() is None

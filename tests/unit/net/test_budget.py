@@ -25,7 +25,7 @@ def test_a_charge_is_given_back_whatever_happens() -> None:
     with Charge(budget, "a") as charge:
         charge.add(20)
         charge.add(30)
-        assert budget.used == charge.held == 50
+        assert budget.used == charge.taken == 50
         with pytest.raises(OverBudget):
             charge.add(1)
         assert budget.used == 50
@@ -41,4 +41,4 @@ def test_nothing_is_kept_of_a_source_that_holds_nothing() -> None:
     for number in range(1000):
         with Charge(budget, f"source {number}") as charge:
             charge.add(1)
-    assert not budget._held
+    assert not budget._used_by_source

@@ -1,7 +1,7 @@
 """How many connections there may be, and which one goes first."""
 
 from rosproxy.net import gate
-from rosproxy.net.gate import LEAST, Gate
+from rosproxy.net.gate import LEAST_PER_SOURCE, Gate
 
 Told = list[tuple[str, str]]
 
@@ -53,7 +53,7 @@ def test_a_full_source_loses_the_one_that_has_said_nothing_for_longest() -> None
 def test_silent_connections_are_bounded_by_source() -> None:
     one, told = make_gate(10_000, 10_000)
     ended: list[int] = []
-    for number in range(gate.WAITING + 2):
+    for number in range(gate.MOST_WAITING + 2):
         one.wait("a", lambda number=number: ended.append(number))  # type: ignore[misc]
     one.wait("b", lambda: ended.append(-1))
     assert ended == [0, 1]
@@ -67,7 +67,7 @@ def test_file_descriptors_bound_a_source_as_well() -> None:
     one.bound(2000)
     assert one.per_source == 500
     one.bound(-1)
-    assert one.per_source == LEAST
+    assert one.per_source == LEAST_PER_SOURCE
 
 
 def test_nothing_is_kept_of_who_has_gone() -> None:

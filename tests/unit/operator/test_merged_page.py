@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.page.document import BROKEN, MOST_LINKS, Document, PageLink, PageNode, Told
+from rosproxy.page.document import BROKEN, MOST_LINKS, Document, PageFinding, PageLink, PageNode
 from rosproxy_operator.common.merged_page import merged, read_document
 
 MASTER = "http://robot:11311"
@@ -69,7 +69,7 @@ def test_a_proxy_that_cannot_be_asked_says_why() -> None:
 def test_what_is_broken_stays_where_not_all_fits() -> None:
     node = PageNode("container")
     link = PageLink("topic", "/last", "/talker", state=BROKEN, text="why", fix="what to do")
-    wrong = Document({"/talker": node}, {"x": link}, (Told("error", "s", "t", "f"),))
+    wrong = Document({"/talker": node}, {"x": link}, (PageFinding("error", "s", "t", "f"),))
     document = merged({"many": shown("a", MOST_LINKS), "wrong": wrong}, "1.0")
     assert len(document["links"]) == MOST_LINKS
     assert document["left_out"] == 1

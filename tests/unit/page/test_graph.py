@@ -9,7 +9,7 @@ from rosproxy.admin.findings import error
 from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach, SlaveReport, SystemState
 from rosproxy.page.document import LONGEST, MOST_LINKS
-from rosproxy.page.graph import Judged, chosen, graph_document, judge, relayed
+from rosproxy.page.graph import Judged, graph_document, judge, relayed, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from tests.unit.doctor.cases import INSIDE_URI, by_name, listener, make_facts, talker
 from tests.unit.status_json import make_connection, make_node, make_status
@@ -184,7 +184,7 @@ def test_a_subscription_by_udpros() -> None:
 def test_two_nodes_outside_are_no_concern_of_the_proxy() -> None:
     graph = SystemState({"/far": ["/one"]}, {"/far": ["/listener"]}, {})
     assert not made(judged(graph=graph))["links"].keys() & {"topic /far /one /listener"}
-    assert chosen(make_facts().proxy, graph) == ()
+    assert topics_to_ask_about(make_facts().proxy, graph) == ()
 
 
 def test_a_master_that_is_away_is_told() -> None:

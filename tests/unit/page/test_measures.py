@@ -39,7 +39,7 @@ def read(*rounds: tuple[float, int | None, int | None]) -> Measures:
 
 def test_nothing_is_known_at_first() -> None:
     link = Measures().get(KEY)
-    assert (link.hz, link.rate, link.last, link.stalled(100.0)) == (None, None, None, False)
+    assert (link.hz, link.rate, link.last, link.is_stalled(100.0)) == (None, None, None, False)
     once = read((1.0, 5, 5)).get(KEY)
     assert (once.hz, once.last) == (None, None)
 
@@ -67,23 +67,23 @@ def test_a_connection_that_carries_nothing_is_told_after_a_while() -> None:
     rounds = [(1.0, 10, 10), (3.0, 20, 20)]
     rounds += [(3.0 + 2 * step, 20 + 20 * step, 20) for step in (1, 2, 3)]
     link = read(*rounds).get(KEY)
-    assert not link.stalled(3.0 + STALLED - 0.1)
-    assert link.stalled(3.0 + STALLED)
-    assert not read(*rounds, (11.0, 90, 25)).get(KEY).stalled(11.0 + STALLED)
+    assert not link.is_stalled(3.0 + STALLED - 0.1)
+    assert link.is_stalled(3.0 + STALLED)
+    assert not read(*rounds, (11.0, 90, 25)).get(KEY).is_stalled(11.0 + STALLED)
 
 
 def test_a_topic_on_which_nothing_is_sent_is_well() -> None:
-    assert not read((1.0, 10, 10), (3.0, 10, 10), (60.0, 10, 10)).get(KEY).stalled(60.0)
+    assert not read((1.0, 10, 10), (3.0, 10, 10), (60.0, 10, 10)).get(KEY).is_stalled(60.0)
 
 
 def test_one_message_under_way_is_none_that_is_lost() -> None:
-    assert not read((1.0, 10, 10), (3.0, 11, 10), (60.0, 11, 10)).get(KEY).stalled(60.0)
+    assert not read((1.0, 10, 10), (3.0, 11, 10), (60.0, 11, 10)).get(KEY).is_stalled(60.0)
 
 
 def test_a_new_connection_begins_anew() -> None:
     link = read((1.0, 900, 900), (3.0, 2, 2), (5.0, 6, 6)).get(KEY)
     assert link.hz == 2.0
-    assert not link.stalled(5.0 + STALLED)
+    assert not link.is_stalled(5.0 + STALLED)
 
 
 def test_what_the_proxy_relays_counts_while_it_does() -> None:

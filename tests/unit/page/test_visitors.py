@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from aiohttp.test_utils import make_mocked_request
 
-from rosproxy.page.visitors import KEY, MOST, SESSION, Passes, Visitors, names_us
+from rosproxy.page.visitors import KEY, MOST, SESSION, ExpiringTokens, Visitors, is_own_host
 from rosproxy.settings import hash_token
 
 TOKEN = "a token of a test"
@@ -47,7 +47,7 @@ def request(source: str = "192.0.2.9", host: str = "192.0.2.1:11312", **headers:
     ],
 )
 def test_names_that_strangers_may_have_are_none_of_ours(host: str, ours: bool) -> None:
-    assert names_us(host) is ours
+    assert is_own_host(host) is ours
 
 
 def test_without_a_token_whoever_gets_there_may_look() -> None:
@@ -101,6 +101,6 @@ async def test_a_key_is_good_once_and_not_for_long() -> None:
 
 
 def test_so_many_are_good_at_a_time_and_the_oldest_goes() -> None:
-    passes = Passes(10.0, Clock())
+    passes = ExpiringTokens(10.0, Clock())
     issued = [passes.issue() for _ in range(MOST + 1)]
     assert [passes.is_good(one) for one in issued] == [False] + [True] * MOST

@@ -117,7 +117,7 @@ def test_only_ports_of_the_masters_host_need_a_port() -> None:
         "",
     ]
     addressing = make_addressing("robot")
-    needed = {uri for uri in uris if addressing.foreign(uri)}
+    needed = {uri for uri in uris if addressing.stand_in_target(uri)}
     assert needed == {URI, SERVICE, "http://ROBOT:40004/"}
 
 
@@ -159,7 +159,7 @@ def test_datagrams_are_sent_to_the_address(dialect: str) -> None:
 
 def direct(reply: bytes, method: str = "requestTopic", address: str = ADDRESS) -> bytes:
     call = xmlrpc.parse_call(py_call(method, "/n", "/chatter", [["TCPROS"]]))
-    return slave_api.sent_directly(call, reply, ROBOT, address)
+    return slave_api.with_address_in_reply(call, reply, ROBOT, address)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -205,7 +205,9 @@ def test_other_methods_pass_unparsed() -> None:
 
 def test_of_many_topics_the_latest_are_remembered() -> None:
     where = HostPort("robot", 40001)
-    stand_in = book.StandIn(HostPort("172.30.0.2", 20001), f"http://{where}/", where, kept=False)
+    stand_in = book.StandIn(
+        HostPort("172.30.0.2", 20001), f"http://{where}/", where, is_uri_kept=False
+    )
     for number in range(book.MOST_TOPICS + 10):
         stand_in.note_topic_port(f"/topic{number}", 40000 + number % 7)
         stand_in.note_topic_port("/asked_often", 40002)

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from rosproxy.telemetry.logs import (
-    ALL_EVERY,
-    BURST_OF_ALL,
-    BURST_OF_ONE,
+    KIND_BURST,
+    KIND_INTERVAL,
     LONGEST,
-    MOST_KNOWN,
-    ONE_EVERY,
+    MOST_BUCKETS,
+    SUBJECT_BURST,
+    SUBJECT_INTERVAL,
     USUAL,
     JsonLines,
     LogRateLimit,
@@ -133,18 +133,18 @@ def written(floods: LogRateLimit, records: Iterable[logging.LogRecord]) -> list[
 
 def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) -> None:
     floods = LogRateLimit(clock)
-    assert len(written(floods, (record("%s: gone", "/a") for _ in range(1000)))) == BURST_OF_ONE
+    assert len(written(floods, (record("%s: gone", "/a") for _ in range(1000)))) == SUBJECT_BURST
     assert len(written(floods, [record("%s: gone", "/b")])) == 1
-    clock.now += ONE_EVERY
+    clock.now += SUBJECT_INTERVAL
     (again,) = written(floods, (record("%s: gone", "/a") for _ in range(1000)))
     assert (
         TextLines()
         .format(again)
-        .endswith(f"/a: gone ({1000 - BURST_OF_ONE} more like it were left out)")
+        .endswith(f"/a: gone ({1000 - SUBJECT_BURST} more like it were left out)")
     )
-    assert json.loads(JsonLines().format(again))["left_out"] == 1000 - BURST_OF_ONE
-    clock.now += 1000 * ONE_EVERY
-    assert len(written(floods, (record("%s: gone", "/a") for _ in range(99)))) == BURST_OF_ONE
+    assert json.loads(JsonLines().format(again))["left_out"] == 1000 - SUBJECT_BURST
+    clock.now += 1000 * SUBJECT_INTERVAL
+    assert len(written(floods, (record("%s: gone", "/a") for _ in range(99)))) == SUBJECT_BURST
 
 
 def test_a_node_is_told_of_after_another_one_at_the_same_address(clock: Clock) -> None:
@@ -156,11 +156,11 @@ def test_a_node_is_told_of_after_another_one_at_the_same_address(clock: Clock) -
 
 @pytest.mark.parametrize("level", [logging.INFO, logging.ERROR])
 def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int) -> None:
-    floods, more = LogRateLimit(clock), 3 * MOST_KNOWN
-    names = [record("%s is new", f"/{n}", level=level) for n in range(BURST_OF_ALL + more)]
-    assert len(written(floods, names)) == BURST_OF_ALL
+    floods, more = LogRateLimit(clock), 3 * MOST_BUCKETS
+    names = [record("%s is new", f"/{n}", level=level) for n in range(KIND_BURST + more)]
+    assert len(written(floods, names)) == KIND_BURST
     assert len(written(floods, [record("%s is old", "/a", level=level)])) == 1
-    clock.now += ALL_EVERY
+    clock.now += KIND_INTERVAL
     (later,) = written(floods, (record("%s is new", f"/{n}", level=level) for n in range(9)))
     assert later.__dict__["left_out"] == more
 
@@ -168,12 +168,12 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
 def test_long_names_fill_no_disk_either(clock: Clock) -> None:
     floods = LogRateLimit(clock)
     names = (record("%s is new", f"/{n}" + "x" * LONGEST, level=logging.INFO) for n in range(5000))
-    assert len(written(floods, names)) * LONGEST < 2 * BURST_OF_ALL * USUAL
+    assert len(written(floods, names)) * LONGEST < 2 * KIND_BURST * USUAL
 
 
 def test_what_is_logged_once_and_for_debugging_is_written(clock: Clock) -> None:
     floods = LogRateLimit(clock)
-    debug = [record("look", level=logging.DEBUG) for _ in range(2 * BURST_OF_ALL)]
+    debug = [record("look", level=logging.DEBUG) for _ in range(2 * KIND_BURST)]
     assert written(floods, debug) == debug
     started = [record("%s at %s is %s", f"/{n}", "a", "b", level=logging.INFO) for n in range(1000)]
     assert written(floods, started) == started

@@ -32,7 +32,7 @@ def test_many_sources_are_forgotten() -> None:
     refusals = Refusals(Metrics(), Problems(), lambda: 0.0)
     for number in range(MOST + 10):
         refusals.note(f"reason_{number // LINES}", str(number), "x")
-    assert len(refusals._told) == MOST
+    assert len(refusals._logged_at) == MOST
 
 
 def test_forged_sources_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:

@@ -162,10 +162,10 @@ class Rename(Action, frozen=True):
     """Give a container another name."""
 
     does = "rename container"
-    to: str
+    new_name: str
 
     def _details(self) -> str:
-        return f" to {self.to}"
+        return f" to {self.new_name}"
 
 
 class Connect(Action, frozen=True):

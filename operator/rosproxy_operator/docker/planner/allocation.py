@@ -29,7 +29,7 @@ from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
 from rosproxy_operator.docker.planner.state import DockerMemory, PortRefusal
 
 
-def refused(
+def after_refusals(
     observed: HostState, live: Collection[Key], memory: DockerMemory, now: float
 ) -> DockerMemory:
     """The memory after the engine's refusals to start sandboxes.

@@ -199,7 +199,9 @@ class _Claim:
         return (needed or [d.key for d in self.claimants])[0]
 
 
-def assign(desired: Collection[Desired], observed: HostState) -> tuple[Aliases, list[Problem]]:
+def assign_aliases(
+    desired: Collection[Desired], observed: HostState
+) -> tuple[Aliases, list[Problem]]:
     """The names of the proxies that are wanted, and the containers that won't find theirs.
 
     ``desired`` is sorted by key.
@@ -226,11 +228,11 @@ def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
     return tuple(
         member.container.name
         for member in desired.members
-        if network in member.networks and member.needs == alias
+        if network in member.networks and member.wanted_alias == alias
     )
 
 
-def holds(container: Container, network: str, alias: str) -> bool:
+def answers_to(container: Container, network: str, alias: str) -> bool:
     """Whether a container answers to a name on a network; case does not matter to engines."""
     return any(
         alias.lower() in map(str.lower, attachment.names)
@@ -257,9 +259,9 @@ def _claim(
     containers = [
         container.name
         for container in neighbours
-        if container.state not in _GONE and holds(container, network, alias)
+        if container.state not in _GONE and answers_to(container, network, alias)
     ]
-    holding = [s for s in sandboxes if holds(s.container, network, alias)]
+    holding = [s for s in sandboxes if answers_to(s.container, network, alias)]
     staying = [d.key for d in proxies if d.key in {s.key for s in holding}]
     # One that is restarting can't leave the network: it answers there again in a moment.
     stuck = sorted(s.key for s in holding if s.container.state == "restarting")

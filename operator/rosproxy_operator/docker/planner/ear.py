@@ -22,7 +22,12 @@ from rosproxy_operator.docker.planner.actions import (
 from rosproxy_operator.docker.planner.model import NOWHERE, HostState, Key, PlanSettings
 from rosproxy_operator.docker.planner.selection import free_name
 from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
-from rosproxy_operator.docker.planner.steps import PlanContext, created, former_name, tended
+from rosproxy_operator.docker.planner.steps import (
+    PlanContext,
+    creation_steps,
+    former_name,
+    keep_running_steps,
+)
 
 
 def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:
@@ -97,13 +102,15 @@ def _ensure_ear(context: PlanContext, ear: CreateEar) -> Iterator[Action]:
     selection = context.select(ears, ear.name, expected, lambda _: True)
     if selection.stuck or selection.waiting:
         return
-    yield from (Remove(container.name, "left over") for container in selection.others)
+    yield from (Remove(container.name, "left over") for container in selection.surplus)
     taken = context.taken(ears)
     if selection.kept is None:
         ear = replace(ear, name=free_name(ear.name, taken), fingerprint=expected)
-        yield from created(selection, ear, former_name(selection.old, ear.name, taken))
+        yield from creation_steps(
+            selection, ear, former_name(selection.predecessor, ear.name, taken)
+        )
         return
-    yield from tended(selection, selection.kept)
+    yield from keep_running_steps(selection, selection.kept)
     if ear.name not in (selection.kept.name, *taken):
         yield Rename(selection.kept.name, ear.name)
 

@@ -66,7 +66,7 @@ def label_layers(
 
 def network_owner(container: Container, by_id: Mapping[str, Container]) -> Container:
     """The container in whose network namespace another one is: itself, if it has its own."""
-    return by_id.get(container.shares or container.id, container)
+    return by_id.get(container.network_container or container.id, container)
 
 
 class RecentLayers:

@@ -137,7 +137,7 @@ class Container:
         return self.state in ALIVE
 
     @property
-    def shares(self) -> str | None:
+    def network_container(self) -> str | None:
         """The container whose network namespace it is in, by id or name; None if in its own."""
         _, separator, container = self.network_mode.partition("container:")
         return container if separator else None
@@ -205,7 +205,7 @@ class Sandbox(OwnContainer):
 
 
 class Proxy(OwnContainer):
-    """A proxy runs in it, in the namespace of the sandbox that it `shares`, by id."""
+    """A proxy runs in it, in the namespace of its sandbox, the `network_container`."""
 
 
 class EarContainer(OwnContainer):
@@ -213,10 +213,10 @@ class EarContainer(OwnContainer):
 
 
 class RedirectContainer(OwnContainer):
-    """It has set, or taken away, rules in the network namespace that it `shares`, by id, and ended.
+    """It has set, or taken away, rules in another container's network namespace, and has ended.
 
-    It is kept as the record of them. ``started`` is when the container was started whose namespace
-    that is: each start of it makes another one.
+    It is kept as the record of them. `network_container` is that container's id, ``started`` when
+    it was started: each start of it makes another namespace.
     """
 
     @property
@@ -292,7 +292,7 @@ class HostState:
 
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy is; None if it is there no more."""
-        sandbox_id = proxy.container.shares
+        sandbox_id = proxy.container.network_container
         return next((s for s in self.sandboxes if s.container.id == sandbox_id), None)
 
 
@@ -302,12 +302,12 @@ class Member:
 
     ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label, ``direction`` is
     None if any will do, ``udp`` if the option says. ``networks`` are the names of those on which it
-    wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which it looks
-    for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help it.
-    ``policy`` are rules for its own nodes alone. ``peers`` are hosts outside, for a member of a
+    wants to meet its proxy. ``wanted_alias`` is the host in its ROS_MASTER_URI: the name by which
+    it looks for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help
+    it. ``policy`` are rules for its own nodes alone. ``peers`` are hosts outside, for a member of a
     ROS 2 domain, which has none of the others but ``ports`` and ``networks``. ``redirect`` is what
-    its label says, None without one; ``by_address`` the address and port of its master that are to
-    lead to its proxy, in its network, None if none are. A container that is not alive only
+    its label says, None without one; ``redirected_master`` the address and port of its master that
+    are to lead to its proxy, in its network, None if none are. A container that is not alive only
     keeps networks joined, and what else its labels made its proxy, for a while.
     """
 
@@ -315,7 +315,7 @@ class Member:
     key: Key
     ports: int = 0
     networks: frozenset[str] = frozenset()
-    needs: str = ""
+    wanted_alias: str = ""
     data_plane: DataPlane | None = None
     slave_control: SlaveControl | None = None
     direction: Direction | None = None
@@ -323,7 +323,7 @@ class Member:
     policy: tuple[Rule, ...] = ()
     peers: frozenset[str] = frozenset()
     redirect: bool | None = None
-    by_address: HostPort | None = None
+    redirected_master: HostPort | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,16 +11,21 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.allocation import allocate, refused
-from rosproxy_operator.docker.planner.desired import assign, desire
+from rosproxy_operator.docker.planner.allocation import after_refusals, allocate
+from rosproxy_operator.docker.planner.desired import assign_aliases, desire
 from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
 from rosproxy_operator.docker.planner.label_policy import within_bounds
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.specs import master, unresolved_master
-from rosproxy_operator.docker.planner.state import DockerMemory, looked, noticed
-from rosproxy_operator.docker.planner.steps import PlanContext, leave, retired, wanted_steps
+from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
+from rosproxy_operator.docker.planner.steps import (
+    PlanContext,
+    disconnect_steps,
+    removal_steps,
+    wanted_steps,
+)
 
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""
@@ -30,14 +35,14 @@ SOON = 1.0
 class Group:
     """Actions to be carried out one after the other, for one key (or for the uplink: no key).
 
-    One ``about`` a container alone, for a redirect, and the key's other groups do not wait for each
-    other. When an action fails, the rest of its group is left out, so that a proxy is only removed
-    when its successor was created; but a failed Connect or Disconnect stops nothing else.
+    One ``subject`` a container alone, for a redirect, and the key's other groups do not wait for
+    each other. When an action fails, the rest of its group is left out, so that a proxy is only
+    removed when its successor was created; but a failed Connect or Disconnect stops nothing else.
     """
 
     key: Key | None
     actions: tuple[Action, ...]
-    about: str = ""
+    subject: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,17 +84,19 @@ def plan(
     """
     members, unplaced = find_members(labels, observed, settings)
     members, crowded = within_bounds(members, settings)
-    memory = noticed(memory, members, now)
+    memory = with_exited(memory, members, now)
     desired, bad_networks = desire(observed, settings, members, memory, now)
-    memory = looked(memory, observed, desired, settings.grace, now)
-    aliases, missed = assign(desired, observed)
+    memory = after_look(memory, observed, desired, settings.grace, now)
+    aliases, missed = assign_aliases(desired, observed)
     live = {d.key for d in desired if d.live}
-    memory = refused(observed, live, memory, now)
+    memory = after_refusals(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
     creatable = obstacle is None
     memory, tight = allocate(observed, settings, desired, memory, now, frozen=not creatable)
     expired = {key for key, since in memory.absent.items() if now - since >= settings.grace}
-    planned: dict[Key, list[Action] | None] = {key: [*retired(observed, key)] for key in expired}
+    planned: dict[Key, list[Action] | None] = {
+        key: [*removal_steps(observed, key)] for key in expired
+    }
     for wanted in desired:
         if ports := memory.planned.get(wanted.key):  # else its problem is reported already
             names = aliases.get(wanted.key, {})
@@ -155,7 +162,7 @@ def _groups(
 ) -> Iterator[Group]:
     """First what makes names free, then the uplink, then one key after the other."""
     for wanted in desired:
-        for action in leave(observed, wanted, planned.get(wanted.key) or [], uplink):
+        for action in disconnect_steps(observed, wanted, planned.get(wanted.key) or [], uplink):
             yield Group(wanted.key, (action,))
     all_actions = [action for actions in planned.values() for action in actions or ()]
     joins = (isinstance(a, Connect) and a.network == uplink for a in all_actions)

@@ -1,8 +1,8 @@
 """What a proxy is to be told of the containers on its networks.
 
-`facts` is what one look says to one proxy. `ProxyNews` compares it with what the proxy was told
-before and with the nodes that it has, and says what is new and when something is due again. Nothing
-is forgotten until the proxy has heard it. Times are seconds of a monotonic clock.
+`network_facts` is what one look says to one proxy. `ProxyNews` compares it with what the proxy was
+told before and with the nodes that it has, and says what is new and when something is due again.
+Nothing is forgotten until the proxy has heard it. Times are seconds of a monotonic clock.
 """
 
 import re
@@ -26,7 +26,7 @@ from rosproxy_operator.docker.planner.model import (
     Member,
     Proxy,
 )
-from rosproxy_operator.docker.planner.redirect import in_place
+from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.specs import master
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
@@ -80,7 +80,7 @@ class NetworkFacts:
     policy: tuple[PolicyLayer, ...] = ()
 
 
-class Places:
+class AddressHistory:
     """Where containers are, as far as their proxy knows, and where they were just now.
 
     A container that is disconnected and connected again under another address has moved, and its
@@ -125,12 +125,12 @@ class Places:
                 del self._absent[container, network]
 
     @property
-    def held(self) -> frozenset[str]:
+    def reserved_addresses(self) -> frozenset[str]:
         """The addresses that no container has, but whose containers may come back or have moved."""
         return frozenset(self._at[place] for place in self._absent) | self._moves.keys()
 
     @property
-    def until(self) -> float | None:
+    def next_expiry(self) -> float | None:
         """When the first of them is given up; None if there is none."""
         times = [since + AWAY for since in self._absent.values()]
         times += [since + MOVING for _, since in self._moves.values()]
@@ -149,7 +149,7 @@ class ProxyNews:
         self.policy: tuple[PolicyLayer, ...] = ()
         self._layers = RecentLayers()
         self._subnets: set[IPv4Network] = set()
-        self._places = Places()
+        self._places = AddressHistory()
         self._due: dict[ContainerArrival, list[float]] = {}
         self._moving = False
 
@@ -188,10 +188,10 @@ class ProxyNews:
 
         Only the engine can tell, so it must be in a network that the proxy is on or was on.
         """
-        is_known = node in self.facts.taken or node in self._places.held
+        is_known = node in self.facts.taken or node in self._places.reserved_addresses
         return not is_known and is_inside(node, tuple(self._subnets))
 
-    def told(self, now: float) -> None:
+    def mark_delivered(self, now: float) -> None:
         """Take note that the proxy has been told what was due until then."""
         self._due = {
             arrival: [when for when in times if when > now] for arrival, times in self._due.items()
@@ -200,12 +200,12 @@ class ProxyNews:
     def next_due(self, now: float) -> float | None:
         """Seconds until there is something to be told again; None if there is nothing."""
         times = [when for due in self._due.values() for when in due[:1]]
-        times += [self._places.until] if self._places.until else []
+        times += [self._places.next_expiry] if self._places.next_expiry else []
         times += [now + AGAIN_MOVED] if self._moving else []
         return max(min(times) - now, 0.0) if times else None
 
 
-def facts(
+def network_facts(
     observed: HostState,
     proxy: Proxy,
     members: Collection[Member],
@@ -265,7 +265,7 @@ def _arrivals(
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
-    if member.by_address:  # by name, no node reaches the master before its proxy is there
+    if member.redirected_master:  # by name, no node reaches the master before its proxy is there
         own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
         own = {name for name in own if not is_loopback(name)}
     return [
@@ -275,7 +275,7 @@ def _arrivals(
             attachment.address,
             attachment.endpoint,
             frozenset(name for name in attachment.names | own if _HOST_NAME.fullmatch(name)),
-            in_place(observed, member.key, host),
+            redirect_record_name(observed, member.key, host),
         )
         for attachment in _attachments(host, joined)
     ]

@@ -115,7 +115,9 @@ def redirect_steps(
     wanted = _wanted(observed, settings, desired)
     records: dict[RedirectSite, list[RedirectContainer]] = {}
     for record in observed.redirects:
-        records.setdefault((record.key, record.container.shares or ""), []).append(record)
+        records.setdefault((record.key, record.container.network_container or ""), []).append(
+            record
+        )
     names = {container.id: container.name for container in observed.containers}
     for site in sorted(wanted.keys() | records.keys()):
         existing = records.get(site, [])
@@ -128,7 +130,7 @@ def redirect_steps(
             yield RedirectSteps(site[0], names.get(site[1], site[1][:12]), tuple(steps))
 
 
-def in_place(observed: HostState, key: Key, owner: Container) -> str:
+def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str:
     """The name of the record of a redirect to a proxy, in a container's own network; or empty.
 
     It may lead to where the proxy was a moment ago.
@@ -156,9 +158,12 @@ def _wanted(
     for proxy in desired:
         for member in proxy.members if proxy.live else ():
             owner = network_owner(member.container, by_id)
-            if member.by_address is None or not {owner.state, member.container.state} <= STARTED:
+            if (
+                member.redirected_master is None
+                or not {owner.state, member.container.state} <= STARTED
+            ):
                 continue
-            if owners.setdefault((owner.id, member.by_address), proxy.key) == proxy.key:
+            if owners.setdefault((owner.id, member.redirected_master), proxy.key) == proxy.key:
                 site = proxy.key, owner.id
                 wanted[site] = wanted.get(site) or _redirect_to(member, owner, observed, settings)
     return wanted
@@ -172,8 +177,10 @@ def _redirect_to(
     if meeting is None:
         return None
     proxy, ports = meeting
-    action = CreateRedirect("", key, ports, owner.id, owner.started_at, member.by_address, proxy)
-    return _named(action, observed, settings)
+    action = CreateRedirect(
+        "", key, ports, owner.id, owner.started_at, member.redirected_master, proxy
+    )
+    return _with_fingerprint(action, observed, settings)
 
 
 def _meeting(
@@ -191,7 +198,9 @@ def _meeting(
     return None
 
 
-def _named(action: CreateRedirect, observed: HostState, settings: PlanSettings) -> CreateRedirect:
+def _with_fingerprint(
+    action: CreateRedirect, observed: HostState, settings: PlanSettings
+) -> CreateRedirect:
     """The same with what it is made of, and its name by that."""
     body = redirect_config(replace(action, range=PortRange(1, 1)), settings)
     fingerprint = digest({**body, "Image": observed.image_id})
@@ -232,7 +241,7 @@ def _removal_steps(
     # Also those of a former start: whoever has started the record since has set its rules anew.
     record = next(iter(records))
     action = CreateRedirect("", record.key, record.range, target, owner.started_at)
-    action = _named(action, observed, settings)
+    action = _with_fingerprint(action, observed, settings)
     steps = _set_steps(action, records, observed)
     if not steps and not any(r.fingerprint == action.fingerprint for r in records):
         return []  # without an image they stay
@@ -248,5 +257,5 @@ def _is_busy(records: Iterable[RedirectContainer], observed: HostState) -> bool:
 
 def _is_of(record: RedirectContainer, owner: Container) -> bool:
     """Whether it is about the network that a container has now."""
-    is_same = owner.id == record.container.shares and owner.started_at == record.started
+    is_same = owner.id == record.container.network_container and owner.started_at == record.started
     return is_same and owner.state in STARTED

@@ -17,15 +17,15 @@ IDLE = frozenset({"created", "exited"})
 class Selection:
     """What is to become of the containers for one thing.
 
-    ``kept`` is as it ought to be, running or not; None if one is to be created. ``old`` serves, or
-    has served, until that one takes over. ``others`` are left over. ``waiting``: one is just being
-    removed, so nothing can be created, removed or started. ``stuck``: one ought to be created but
-    can't.
+    ``kept`` is as it ought to be, running or not; None if one is to be created. ``predecessor``
+    serves, or has served, until that one takes over. ``surplus`` are left over. ``waiting``: one is
+    just being removed, so nothing can be created, removed or started. ``stuck``: one ought to be
+    created but can't.
     """
 
     kept: Container | None = None
-    old: Container | None = None
-    others: tuple[Container, ...] = ()
+    predecessor: Container | None = None
+    surplus: tuple[Container, ...] = ()
     waiting: bool = False
     stuck: bool = False
 

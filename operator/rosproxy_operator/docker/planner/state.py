@@ -46,13 +46,13 @@ class DockerMemory:
         return replace(self, refusals={**self.refusals, name: refusal})
 
 
-def noticed(memory: DockerMemory, members: Iterable[Member], now: float) -> DockerMemory:
+def with_exited(memory: DockerMemory, members: Iterable[Member], now: float) -> DockerMemory:
     """The memory with the containers that have exited, and since when."""
     gone = (member.container.id for member in members if not member.container.alive)
     return replace(memory, exited={c: memory.exited.get(c, now) for c in gone})
 
 
-def looked(
+def after_look(
     memory: DockerMemory, observed: HostState, desired: Iterable[Desired], grace: float, now: float
 ) -> DockerMemory:
     """What is remembered after a look at the host, before anything is decided."""

@@ -29,7 +29,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.desired import holds, needed_by
+from rosproxy_operator.docker.planner.desired import answers_to, needed_by
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
     NOWHERE,
@@ -131,7 +131,7 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
     return None if process_actions is None else actions + process_actions
 
 
-def retired(observed: HostState, key: Key) -> Iterator[Action]:
+def removal_steps(observed: HostState, key: Key) -> Iterator[Action]:
     """Remove everything of a key that nobody wants any more."""
     reason = "no running container wants it any more"
     for own in (*observed.ears_of(key), *observed.proxies_of(key), *observed.sandboxes_of(key)):
@@ -142,7 +142,7 @@ def retired(observed: HostState, key: Key) -> Iterator[Action]:
             yield Remove(name, reason, retire=isinstance(own, Proxy) and state in STARTED)
 
 
-def leave(
+def disconnect_steps(
     observed: HostState, desired: Desired, planned: Collection[Action], uplink: str
 ) -> Iterator[Disconnect]:
     """Take sandboxes that stay off the networks on which nobody wants them any more.
@@ -183,12 +183,15 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     kept = selection.kept
     if selection.stuck:
         return None, None
-    actions: list[Action] = [Remove(c.name, "left over") for c in selection.others]
+    actions: list[Action] = [Remove(c.name, "left over") for c in selection.surplus]
     if kept is None and not selection.waiting:
         action = replace(action, name=free_name(action.name, taken), fingerprint=expected)
-        former = former_name(selection.old, action.name, taken)
-        ended = _emptying_steps(context, selection.old) if selection.old else ()
-        actions += [*created(selection, action, former, ended), *_connect(context, action.name)]
+        former = former_name(selection.predecessor, action.name, taken)
+        ended = _emptying_steps(context, selection.predecessor) if selection.predecessor else ()
+        actions += [
+            *creation_steps(selection, action, former, ended),
+            *_connect(context, action.name),
+        ]
         return actions, _Home(action.name, starts=True)
     if kept is None or kept.state == "restarting":
         return actions, None
@@ -240,7 +243,7 @@ def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
     return any(
         needed_by(context.desired, network, alias)
         for alias in context.aliases.get(network, ())
-        if not holds(kept, network, alias)
+        if not answers_to(kept, network, alias)
     )
 
 
@@ -250,9 +253,9 @@ def _start_steps(context: PlanContext, selection: Selection, kept: Container) ->
             yield Disconnect(kept.name, network)
     if context.settings.uplink not in kept.networks:
         yield Connect(kept.name, context.settings.uplink, ())
-    if selection.old:
-        yield from _emptying_steps(context, selection.old)
-        yield Remove(selection.old.name, "another one takes over")
+    if selection.predecessor:
+        yield from _emptying_steps(context, selection.predecessor)
+        yield Remove(selection.predecessor.name, "another one takes over")
     yield Start(kept.name)
     yield from _connect(context, kept.name)
 
@@ -265,7 +268,7 @@ def _connect(context: PlanContext, name: str) -> Iterator[Action]:
 def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
     """End the proxies properly that are in a sandbox, before it goes."""
     for proxy in context.observed.proxies_of(context.desired.key):
-        if proxy.container.shares == old.id and proxy.container.state != "removing":
+        if proxy.container.network_container == old.id and proxy.container.state != "removing":
             yield Remove(proxy.container.name, "its sandbox is made anew", stop=True)
 
 
@@ -294,30 +297,34 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
     observed = context.observed
     expected = proxy_fingerprint(action, context.settings, observed.image_id, observed.secret)
     staying = [p for p in proxies if p.container.name not in gone]
-    selection = context.select(staying, wanted_name, expected, lambda c: c.shares == home.id)
+    selection = context.select(
+        staying, wanted_name, expected, lambda c: c.network_container == home.id
+    )
     kept = selection.kept
-    misplaced = kept and kept.shares != home.id
+    misplaced = kept and kept.network_container != home.id
     if selection.waiting and (misplaced or not kept):
         return []
     if selection.stuck or misplaced:
         return None
-    actions: list[Action] = [Remove(c.name, "left over") for c in selection.others]
+    actions: list[Action] = [Remove(c.name, "left over") for c in selection.surplus]
     if kept:
-        actions += tended(selection, kept, _lost(kept, home))
+        actions += keep_running_steps(selection, kept, _lost(kept, home))
         if wanted_name not in (kept.name, *taken) and not selection.waiting:
             actions.append(Rename(kept.name, wanted_name))
         return actions
-    former = former_name(selection.old, name, taken)
+    former = former_name(selection.predecessor, name, taken)
     removed = [p.container.name for p in proxies if p.container.name in gone]
     replaces = former or next(iter(removed), "")
     action = replace(action, fingerprint=expected, replaces=replaces)
-    return [*actions, *created(selection, action, former)]
+    return [*actions, *creation_steps(selection, action, former)]
 
 
-def tended(selection: Selection, kept: Container, lost: bool = False) -> Iterator[Action]:
+def keep_running_steps(
+    selection: Selection, kept: Container, lost: bool = False
+) -> Iterator[Action]:
     """Have a container run that stays; one that is ``lost`` is to be started anew."""
-    if selection.old:
-        yield Remove(selection.old.name, "another one takes over")
+    if selection.predecessor:
+        yield Remove(selection.predecessor.name, "another one takes over")
     if kept.state == "paused":
         yield Unpause(kept.name)
     if selection.waiting:
@@ -350,7 +357,7 @@ def former_name(old: Container | None, name: str, taken: Collection[str]) -> str
     return free_name(f"{name}-old", taken) if old.name == name else old.name
 
 
-def created(
+def creation_steps(
     selection: Selection,
     action: CreateSandbox | Create | CreateEar,
     former: str,
@@ -360,10 +367,10 @@ def created(
 
     ``ended``: what must go before the old one does.
     """
-    if selection.old and selection.old.name != former:
-        yield Rename(selection.old.name, former)
+    if selection.predecessor and selection.predecessor.name != former:
+        yield Rename(selection.predecessor.name, former)
     yield action
-    if selection.old:
+    if selection.predecessor:
         yield from ended
         yield Remove(former, "made anew")
     yield Start(action.name)

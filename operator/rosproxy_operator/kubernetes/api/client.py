@@ -38,7 +38,7 @@ from rosproxy_operator.kubernetes.api.kubeconfig import NoCluster, configuration
 from rosproxy_operator.kubernetes.api.rbac import missing_rule
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
-from rosproxy_operator.kubernetes.resources.values import part, word
+from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 JsonObject = dict[str, Any]
 Timeout = tuple[float, float]
@@ -85,15 +85,15 @@ class ApiError(Exception):
     """
 
 
-class ApiAway(ApiError):
+class ApiUnavailable(ApiError):
     """The API server can't be reached, or is not ready to answer."""
 
 
-class NotLeading(ApiAway):
+class NotLeading(ApiUnavailable):
     """This operator does not lead: nothing was asked."""
 
 
-class ApiGone(ApiError):
+class ApiNotFound(ApiError):
     """The object is not there, or the namespace is about to go that it is to be in."""
 
 
@@ -105,7 +105,7 @@ class ApiInvalid(ApiError):
     """The object is not one that the API server takes."""
 
 
-class ApiLost(ApiAway):
+class ApiLost(ApiUnavailable):
     """A watch has ended before its time: it goes on where it was."""
 
 
@@ -114,14 +114,14 @@ class ApiExpired(ApiError):
 
 
 class Page(msgspec.Struct, frozen=True):
-    """A part of a list: the next one is asked for with ``more``, empty for the last.
+    """A part of a list: the next one is asked for with ``continue_token``, empty for the last.
 
     ``version`` is that of the whole list: a watch goes on from there.
     """
 
     items: list[JsonObject]
     version: str
-    more: str
+    continue_token: str
 
 
 class Event(msgspec.Struct, frozen=True):
@@ -160,12 +160,12 @@ _EVENT = msgspec.json.Decoder(Event)
 
 _KINDS: Mapping[int, type[ApiError]] = {
     400: ApiInvalid,
-    401: ApiAway,  # the token has just been replaced, or the server does not know it yet
-    404: ApiGone,
+    401: ApiUnavailable,  # the token has just been replaced, or the server does not know it yet
+    404: ApiNotFound,
     409: ApiConflict,
     410: ApiExpired,
     422: ApiInvalid,
-    429: ApiAway,
+    429: ApiUnavailable,
 }
 
 
@@ -181,7 +181,7 @@ class Api:
         try:
             settings = configuration()
         except NoCluster as error:
-            raise ApiAway(str(error)) from error
+            raise ApiUnavailable(str(error)) from error
         self.server = str(settings.host)
         self._client = ApiClient(settings)
         self._client.user_agent = f"rosproxy-operator/{__version__}"
@@ -202,7 +202,7 @@ class Api:
         lists = (self._ask("GET", _path("pods", place), query) for place in self._places)
         return [obj for listing in lists for obj in self._items(listing)]
 
-    def places(self, kind: str) -> tuple[str, ...]:
+    def namespaces_of(self, kind: str) -> tuple[str, ...]:
         """The namespaces in which a kind is watched; an empty one stands for all of them.
 
         Others' pods and Services count as well, so those are watched in all of the cluster.
@@ -213,8 +213,10 @@ class Api:
         """A part of the list of a kind, as it is now. Raises ApiExpired, too."""
         query = {"limit": str(PAGE), **_watched(kind), **({"continue": token} if token else {})}
         listing = self._ask("GET", _path(kind, place), query)
-        meta = part(listing, "metadata")
-        return Page(self._items(listing), word(meta, "resourceVersion"), word(meta, "continue"))
+        meta = submap(listing, "metadata")
+        return Page(
+            self._items(listing), text_at(meta, "resourceVersion"), text_at(meta, "continue")
+        )
 
     def watch(self, kind: str, place: str, version: str) -> Watch:
         """What happens to a kind after a version of its list. Raises ApiExpired, too."""
@@ -225,7 +227,7 @@ class Api:
             raise refusal(int(answer.status), str(answer.reason or ""), self._body(answer))
         return Watch(answer.response)
 
-    def fresh(self, kind: str, namespace: str, selector: str) -> list[JsonObject]:
+    def list_fresh(self, kind: str, namespace: str, selector: str) -> list[JsonObject]:
         """The objects that a field selector fits, as they are now in the API server's store."""
         return self._items(self._ask("GET", _path(kind, namespace), {"fieldSelector": selector}))
 
@@ -262,17 +264,17 @@ class Api:
 
         Raises ApiInvalid or ApiConflict if somebody else was faster, other ApiErrors.
         """
-        version = word(part(secret, "metadata"), "resourceVersion")
+        version = text_at(submap(secret, "metadata"), "resourceVersion")
         operations: list[Json] = [
             {"op": "test", "path": "/metadata/resourceVersion", "value": version},
-            {"op": "add", "path": "/data", "value": {**part(secret, "data"), **entries}},
+            {"op": "add", "path": "/data", "value": {**submap(secret, "data"), **entries}},
         ]
         self.patch("secrets", name, operations)
 
     def _items(self, listing: JsonObject) -> list[JsonObject]:
         items = listing.get("items")
         if not isinstance(items, list):
-            raise ApiAway(f"what answers at {self.server} is no API server")
+            raise ApiUnavailable(f"what answers at {self.server} is no API server")
         return [item for item in items if isinstance(item, dict)]
 
     def _ask(
@@ -290,7 +292,7 @@ class Api:
         try:
             return msgspec.json.decode(data, type=JsonObject)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            raise ApiAway(f"what answers at {self.server}{path} is no API server") from None
+            raise ApiUnavailable(f"what answers at {self.server}{path} is no API server") from None
 
     def _send_with_retries(
         self,
@@ -351,9 +353,9 @@ class Api:
         except (HTTPError, OSError) as error:
             raise self._away(error) from error
 
-    def _away(self, error: Exception) -> ApiAway:
+    def _away(self, error: Exception) -> ApiUnavailable:
         text = " ".join(str(error).split())[:200] or type(error).__name__
-        return ApiAway(f"the API server at {self.server} can't be reached: {text}")
+        return ApiUnavailable(f"the API server at {self.server} can't be reached: {text}")
 
 
 def _watched(kind: str) -> dict[str, str]:
@@ -371,16 +373,16 @@ def _path(kind: str, namespace: str, name: str = "") -> str:
 def refusal(status: int, reason: str, body: bytes) -> ApiError:
     """The error for what the API server answered: HTTP status, reason phrase, body."""
     message = _message(body) or reason
-    kind = _KINDS.get(status, ApiAway if status >= 500 else ApiError)
+    kind = _KINDS.get(status, ApiUnavailable if status >= 500 else ApiError)
     if status == 403:  # by a role, or by an admission plug-in that has looked at the object
         if rule := missing_rule(message):
             return ApiError(f"{rule} ({message})")
-        return ApiGone(message) if _TERMINATING in message else ApiInvalid(message)
+        return ApiNotFound(message) if _TERMINATING in message else ApiInvalid(message)
     if status == 422 and message == _TEST_FAILED:
         return ApiConflict("the object has changed meanwhile")
     if status == 401:
         message = f"the API server does not know the operator's token or certificate ({message})"
-    elif kind is ApiAway:
+    elif kind is ApiUnavailable:
         message = f"the API server answers HTTP {status}: {message}"
     return kind(message)
 

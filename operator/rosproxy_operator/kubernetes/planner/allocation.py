@@ -21,14 +21,14 @@ from rosproxy_operator.common.allocation import (
     within,
 )
 from rosproxy_operator.common.ros2 import well_known_ports
-from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
+from rosproxy_operator.kubernetes.planner.state import ClusterState, host_ports_of
 from rosproxy_operator.kubernetes.planner.view import (
     View,
-    grouped,
+    abbreviated,
+    group_by_key,
     has_ports,
     place_of,
     serves,
-    short,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -60,8 +60,8 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
     A proxy that has its ports keeps them, unless its RosProxy or the settings now forbid them.
     """
     ranges = ClusterRanges()
-    places = grouped((place.node, place) for place in view.wanted)
-    refused = grouped(state.taken)
+    places = group_by_key((place.node, place) for place in view.wanted)
+    refused = group_by_key(state.taken)
     for node, wanted in sorted(places.items()):
         _Allocation(view, settings, state, wanted, {*refused.get(node, ())}, ranges).run()
     return ranges
@@ -82,8 +82,8 @@ class _Allocation:
         self.view, self.state, self.ranges = view, state, ranges
         self.node = node = wanted[0].node
         self.rosproxies = {place: view.rosproxies[place.of] for place in wanted}
-        self.proxies = view.on.get(node, ())
-        self.strangers = view.strangers.get(node, ())
+        self.proxies = view.proxies_by_node.get(node, ())
+        self.strangers = view.other_pods_by_node.get(node, ())
         self.refused = refused
         self.kernel = {
             "NodePorts are": settings.node_ports,
@@ -107,7 +107,7 @@ class _Allocation:
             proxy is not None and has_ports(proxy),
             place in self.state.served,
             proxy is not None,
-            self.rosproxies[place].former.get(self.node) is not None,
+            self.rosproxies[place].former_ranges.get(self.node) is not None,
         )
         return ranks.index(True) if True in ranks else len(ranks), place
 
@@ -130,7 +130,7 @@ class _Allocation:
         remembered = (
             self.state.given.get(place),
             self.state.served.get(place),
-            self.rosproxies[place].former.get(self.node),
+            self.rosproxies[place].former_ranges.get(self.node),
         )
         yield from filter(None, remembered)
 
@@ -148,7 +148,7 @@ class _Allocation:
             counts = has_ports(proxy) or place_of(proxy) not in self.view.wanted
             if counts and place_of(proxy) != place and not (is_waiting and proxy.pod.deleting):
                 pods.append(proxy.pod)
-        pod_ports = ports_held(pods, self.rosproxies[place].spec)
+        pod_ports = host_ports_of(pods, self.rosproxies[place].spec)
         return is_free(ports, pod_ports | self.refused, self._promised_to_others(place))
 
     def _publish(self, place: ProxyPlace) -> None:
@@ -160,7 +160,9 @@ class _Allocation:
             holders = [str(p.id) for p in self._other_pods(place) if port in p.host_ports]
             promised = any(port in ports for ports in self._promised_to_others(place))
             if holders or promised or port in self.refused:
-                holder = short(holders) or "another RosProxy, or something that is about to end"
+                holder = (
+                    abbreviated(holders) or "another RosProxy, or something that is about to end"
+                )
                 text = (
                     f"the master in the cluster is not published on port {port} of node "
                     f"{self.node}, which is held by {holder}: choose another spec.master.publish, "
@@ -173,7 +175,7 @@ class _Allocation:
     def _fill(self, place: ProxyPlace) -> None:
         """Give a proxy more ports if it has too few, or a range if it has none."""
         spec, ranges = self.rosproxies[place].spec, self.ranges.given
-        pod_ports = ports_held(self._other_pods(place), spec)
+        pod_ports = host_ports_of(self._other_pods(place), spec)
         blocked = pod_ports | self.refused | self._reserved(place)
         excluded = [*self.kernel.values(), *self._promised_to_others(place)]
         if kept := ranges.get(place):
@@ -197,7 +199,9 @@ class _Allocation:
         self, spec: RosProxySpec, blocked: Collection[int], excluded: list[PortRange]
     ) -> PortRange:
         """A new range, if possible none that another RosProxy has had on this node."""
-        former = filter(None, (r.former.get(self.node) for r in self.view.rosproxies.values()))
+        former = filter(
+            None, (r.former_ranges.get(self.node) for r in self.view.rosproxies.values())
+        )
         try:
             return negotiate(spec.ports, spec.window, blocked, [*excluded, *former])
         except PortsExhausted:
@@ -213,7 +217,7 @@ class _Allocation:
         holders = [
             str(pod.id) for pod in pods if any(p in error.window for p in pod.ports_of(spec))
         ]
-        reasons += [f"others are held by {short(holders)}"] if holders else []
+        reasons += [f"others are held by {abbreviated(holders)}"] if holders else []
         reason = ", ".join(reasons) or "the others were refused just now"
         return (
             f"{error}; {reason}: enlarge spec.portWindow ({error.window}), lower spec.ports "
@@ -227,7 +231,7 @@ class _Allocation:
 
     def _strangers(self, place: ProxyPlace) -> list[Pod]:
         """Pods that are no proxies, among them the ears of other RosProxies."""
-        ears = (ear for ear in self.view.observed.ears if ear.on == self.node)
+        ears = (ear for ear in self.view.observed.ears if ear.node == self.node)
         return [*self.strangers, *(ear.pod for ear in ears if ear.of != place.of)]
 
     def _promised_to_others(self, place: ProxyPlace) -> Iterator[PortRange]:

@@ -12,11 +12,11 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.planner.view import grouped
+from rosproxy_operator.kubernetes.planner.view import group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import ClusterNode
 
-UNSEEN = 15.0
+UNKNOWN_ADDRESS_GRACE = 15.0
 """Seconds after which an address in a node's pod network counts as gone that no pod was seen with.
 
 A pod's containers run before the API server knows its address.
@@ -28,33 +28,33 @@ A proxy's answer may be older than the look: what has just registered is named i
 """
 LONGEST = 3600.0
 """The same while a proxy does not answer at all."""
-AGAIN = 3.0
+LOOK_AGAIN_AFTER = 3.0
 """Seconds until proxies are looked at again whose pods have just gone."""
 
 
 class Departures(msgspec.Struct, frozen=True):
     """The addresses that are gone, by the uid of the proxy's pod, and what is remembered."""
 
-    gone: Mapping[str, tuple[str, ...]]
+    addresses: Mapping[str, tuple[str, ...]]
     state: ClusterState
 
 
-def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departures:
+def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departures:
     """Compare where the proxies' ROS nodes are with the pods that there are.
 
-    An address counts as gone if a pod was seen with it and none has it now; or if it belongs to
-    the node's pod networks and every pod there has had another one for `UNSEEN` seconds.
+    An address counts as gone if a pod was seen with it and none has it now; or if it belongs to the
+    node's pod networks and every pod there has had another one for `UNKNOWN_ADDRESS_GRACE` seconds.
     """
     pod_by_uid = {pod.uid: pod for pod in (*(p.pod for p in observed.proxies), *observed.pods)}
-    pods = grouped((pod.node, pod) for pod in pod_by_uid.values())
+    pods = group_by_key((pod.node, pod) for pod in pod_by_uid.values())
     last_seen: dict[str, dict[str, float]] = {}
-    for name in {p.on for p in observed.proxies}:
+    for name in {p.node for p in observed.proxies}:
         seen_now = {pod.ip: now for pod in pods.get(name, ()) if pod.ip and not pod.host_network}
         last_seen[name] = {**state.addresses.get(name, {}), **seen_now}
     departed: dict[str, tuple[str, ...]] = {}
     strange: dict[tuple[str, str], float] = {}
     for proxy in observed.proxies:
-        report, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.on)
+        report, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.node)
         if report is None or not report.answered or node is None or not node.ready:
             continue
         living = [pod for pod in pods.get(node.name, ()) if not pod.ended]
@@ -63,10 +63,12 @@ def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departur
         since = {ip: state.strange.get((node.name, ip), now) for ip in unseen}
         strange |= {(node.name, ip): at for ip, at in since.items()}
         has_pending = any(not pod.ip and not pod.host_network for pod in living)
-        late = {ip for ip, at in since.items() if now - at >= UNSEEN and not has_pending}
+        late = {
+            ip for ip, at in since.items() if now - at >= UNKNOWN_ADDRESS_GRACE and not has_pending
+        }
         if addresses := (missing & last_seen[node.name].keys()) | late:
             departed[proxy.pod.uid] = tuple(sorted(addresses))
-    reports = grouped((p.on, observed.reports.get(p.pod.uid)) for p in observed.proxies)
+    reports = group_by_key((p.node, observed.reports.get(p.pod.uid)) for p in observed.proxies)
     kept = {name: _kept(reports[name], times, now) for name, times in last_seen.items()}
     return Departures(departed, replace(state, addresses=kept, strange=strange))
 
@@ -94,10 +96,10 @@ def _kept(
     return {ip: at for ip, at in last_seen.items() if ip in named or now - at < longest}
 
 
-def waits(departed: Departures, now: float) -> Iterator[float]:
+def next_checks(departed: Departures, now: float) -> Iterator[float]:
     """In how many seconds there may be something to tell the proxies."""
     recent = (at for ips in departed.state.addresses.values() for at in ips.values() if at != now)
-    if departed.gone or any(now - at < REMEMBERED for at in recent):
-        yield AGAIN
-    strange = (at + UNSEEN - now for at in departed.state.strange.values())
+    if departed.addresses or any(now - at < REMEMBERED for at in recent):
+        yield LOOK_AGAIN_AFTER
+    strange = (at + UNKNOWN_ADDRESS_GRACE - now for at in departed.state.strange.values())
     yield from (seconds for seconds in strange if seconds > 0)

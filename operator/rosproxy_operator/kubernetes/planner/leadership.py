@@ -46,33 +46,34 @@ class LeaseRecord(msgspec.Struct, frozen=True):
 class Candidate(msgspec.Struct, frozen=True):
     """What one operator knows. ``name`` is like no other's, not even that of its former process.
 
-    ``seen`` is the Lease as it was read last, None if there is none, ``since`` when that version
-    was first seen, or that there is none; None: it was not read yet. It acts until ``until``;
-    ``terms`` are how often it has begun to.
+    ``record`` is the Lease as it was read last, None if there is none, ``seen_since`` when that
+    version was first seen, or that there is none; None: it was not read yet. It acts until
+    ``leads_until``; ``terms`` are how often it has begun to.
     """
 
     name: str
-    seen: LeaseRecord | None = None
-    since: float | None = None
-    until: float = NEVER
+    record: LeaseRecord | None = None
+    seen_since: float | None = None
+    leads_until: float = NEVER
     terms: int = 0
 
     def leads(self, now: float) -> bool:
         """Whether it may act."""
-        return now < self.until
+        return now < self.leads_until
 
 
 def observe(candidate: Candidate, record: LeaseRecord | None, now: float) -> Candidate:
     """What is known after the Lease was read; ``now`` is after the answer."""
-    if record == candidate.seen and candidate.since is not None:
+    if record == candidate.record and candidate.seen_since is not None:
         return candidate
     is_holder = record is not None and record.holder == candidate.name
-    return replace(candidate, seen=record, since=now, until=candidate.until if is_holder else NEVER)
+    until = candidate.leads_until if is_holder else NEVER
+    return replace(candidate, record=record, seen_since=now, leads_until=until)
 
 
-def wanted(candidate: Candidate, now: float) -> LeaseRecord | None:
+def next_record(candidate: Candidate, now: float) -> LeaseRecord | None:
     """What is to be written over what was read; None: nothing, somebody else holds it."""
-    record, since = candidate.seen, now if candidate.since is None else candidate.since
+    record, since = candidate.record, now if candidate.seen_since is None else candidate.seen_since
     if record is None:  # it may have been deleted while an operator acts
         return LeaseRecord("", NOBODY)
     if record.holder == candidate.name:
@@ -82,20 +83,20 @@ def wanted(candidate: Candidate, now: float) -> LeaseRecord | None:
     return LeaseRecord(record.version, candidate.name, transitions=record.transitions + 1)
 
 
-def wrote(candidate: Candidate, record: LeaseRecord, begun: float, now: float) -> Candidate:
+def after_write(candidate: Candidate, record: LeaseRecord, begun: float, now: float) -> Candidate:
     """What is known after a write that was sent at ``begun`` is known at ``now`` to be there."""
     if record.holder != candidate.name:
         return candidate
     terms = candidate.terms if candidate.leads(now) else candidate.terms + 1
-    return replace(candidate, until=begun + DEADLINE, terms=terms)
+    return replace(candidate, leads_until=begun + DEADLINE, terms=terms)
 
 
-def resigned(candidate: Candidate) -> Candidate:
+def after_resignation(candidate: Candidate) -> Candidate:
     """What is known by a candidate that acts no more."""
-    return replace(candidate, until=NEVER)
+    return replace(candidate, leads_until=NEVER)
 
 
-def released(record: LeaseRecord | None, name: str) -> LeaseRecord | None:
+def released_record(record: LeaseRecord | None, name: str) -> LeaseRecord | None:
     """What a candidate that acts no more is to write; None if the Lease is not its own."""
     if record is None or record.holder != name:
         return None

@@ -42,7 +42,7 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 USER = 10001
 """The image's own user."""
-NOBODY: Json = {
+POD_SECURITY_CONTEXT: Json = {
     "runAsNonRoot": True,
     "runAsUser": USER,
     "runAsGroup": USER,
@@ -76,7 +76,7 @@ _FINGERPRINTS: dict[Name, tuple[object, str]] = {}
 _MAX_FINGERPRINTS = 8192
 
 
-class Site(msgspec.Struct, frozen=True):
+class ProxySite(msgspec.Struct, frozen=True):
     """A proxy on a node.
 
     ``master`` is the real master as the proxy is told it: with a ``uri`` even if it is a Service,
@@ -127,11 +127,11 @@ def slave_control_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
     return "master" if "master" in modes else "any"
 
 
-def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
+def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     """A proxy's pod.
 
     The fingerprint says what the pod is made of, except its image, which can be exchanged, its
-    policy and its peers; then under what its nodes know the proxy, see `finds_again`.
+    policy and its peers; then under what its nodes know the proxy, see `keeps_registrations`.
     """
     rosproxy, container = site.rosproxy, _container(site, settings)
     annotations = {
@@ -152,7 +152,7 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
     return {**body, "spec": {**spec, "containers": [container]}}
 
 
-def proxy_fingerprint(site: Site, settings: ClusterSettings) -> str:
+def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
     """The fingerprint of a proxy's pod, worked out anew only if what it is made of has changed.
 
     With a thousand proxies it would take half the time of a look. Peers are no part of it.
@@ -203,7 +203,7 @@ def _domain(rosproxy: RosProxy) -> str:
     return f" domain {rosproxy.spec.ros2.number}" if rosproxy.spec.ros2 else ""
 
 
-def finds_again(old: str, new: str) -> bool:
+def keeps_registrations(old: str, new: str) -> bool:
     """Whether a new proxy finds at its master the former one's nodes, by both fingerprints.
 
     It does if both have the same master, or domain, and the same advertised host.
@@ -257,7 +257,7 @@ def metadata(
     }
 
 
-def _spec(site: Site) -> dict[str, Any]:
+def _spec(site: ProxySite) -> dict[str, Any]:
     """The spec of a proxy's pod but for its container.
 
     The pod is bound to its node through the scheduler, as a DaemonSet's: it checks the ports.
@@ -268,7 +268,7 @@ def _spec(site: Site) -> dict[str, Any]:
     return {
         **bound_to(site.node.name, spec),
         "terminationGracePeriodSeconds": STOPS_WITHIN,
-        "securityContext": {**NOBODY, "sysctls": sysctls},
+        "securityContext": {**POD_SECURITY_CONTEXT, "sysctls": sysctls},
         **({"hostAliases": aliases} if aliases else {}),
     }
 
@@ -293,7 +293,7 @@ def bound_to(node: str, spec: RosProxySpec) -> dict[str, Any]:
     }
 
 
-def _local_ports(site: Site) -> str:
+def _local_ports(site: ProxySite) -> str:
     fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
     ros2 = site.rosproxy.spec.ros2
     ros2_ports = sorted(well_known_ports(ros2.number)) if ros2 else ()
@@ -303,7 +303,7 @@ def _local_ports(site: Site) -> str:
     return f"{ports.first} {ports.last}"
 
 
-def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
+def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     """A proxy's container.
 
     The programs that make rules in the kernel have their capability from their files: Kubernetes
@@ -339,7 +339,7 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
     }
 
 
-def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
+def _environment(site: ProxySite, settings: ClusterSettings) -> Mapping[str, str]:
     spec, policy = site.rosproxy.spec, policy_of(site.rosproxy, settings)
     variables = {
         "ROS_MASTER_URI": site.master.uri,
@@ -364,7 +364,7 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
     return {name: value for name, value in variables.items() if value}
 
 
-def _ros2_variables(site: Site) -> Mapping[str, str]:
+def _ros2_variables(site: ProxySite) -> Mapping[str, str]:
     spec = site.rosproxy.spec
     if spec.ros2 is None:
         return {}

@@ -1,9 +1,9 @@
 """A cluster in parts that have nothing to do with each other, so that each can be planned alone.
 
 RosProxies of one namespace choose among the same pods, and proxies on one node among the same
-ports: so a part is made of namespaces and of the nodes that they use, with all that is connected
-by these. `plan` plans a part as it does a whole cluster: `cut` reduces the snapshot to that part,
-and `joined` puts the part's new state into the state of the whole.
+ports: so a part is made of namespaces and of the nodes that they use, with all that is connected by
+these. `plan` plans a part as it does a whole cluster: `partition_snapshot` reduces the snapshot to
+that part, and `merge_state` puts the part's new state into the state of the whole.
 """
 
 from collections import defaultdict
@@ -17,16 +17,16 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, own_pods
 
 
-class Part(msgspec.Struct, frozen=True):
+class Partition(msgspec.Struct, frozen=True):
     """Namespaces with RosProxies, and the nodes that they use."""
 
     namespaces: frozenset[str] = frozenset()
     nodes: frozenset[str] = frozenset()
 
 
-def part_of(
+def partition_of(
     observed: ClusterSnapshot, namespaces: Iterable[str], nodes: Iterable[str] = ()
-) -> Part:
+) -> Partition:
     """What may have to be planned anew if something of these namespaces or nodes has changed.
 
     A node that nobody uses concerns nobody.
@@ -46,17 +46,17 @@ def part_of(
         new_users = {user for node in new_nodes for user in users[node]} - reached
         reached |= new_users
         pending += new_users
-    return Part(frozenset(reached), frozenset(reached_nodes))
+    return Partition(frozenset(reached), frozenset(reached_nodes))
 
 
-def parts(observed: ClusterSnapshot) -> Iterator[Part]:
+def partitions(observed: ClusterSnapshot) -> Iterator[Partition]:
     """All parts."""
     pending = {r.id.namespace for r in observed.rosproxies}
     pending |= {name.namespace for name in observed.unusable}
     pending |= {namespace for namespace, _ in _uses(observed)}
     pending |= {name.namespace for name in (*observed.services, *observed.policies)}
     while pending:
-        partition = part_of(observed, [min(pending)])
+        partition = partition_of(observed, [min(pending)])
         pending -= partition.namespaces
         yield partition
 
@@ -67,14 +67,14 @@ def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
         if pod.uid in observed.selected:
             yield pod.id.namespace, pod.node
     for own_pod in own_pods(observed.proxies, observed.ears):
-        yield own_pod.of.namespace, own_pod.on
+        yield own_pod.of.namespace, own_pod.node
         yield own_pod.of.namespace, own_pod.pod.node
     for rosproxy in observed.rosproxies:
-        for node in rosproxy.former:
+        for node in rosproxy.former_ranges:
             yield rosproxy.id.namespace, node
 
 
-def cut(observed: ClusterSnapshot, partition: Part) -> ClusterSnapshot:
+def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> ClusterSnapshot:
     """The snapshot of a part alone. What is only looked up by name is left as it is."""
     namespaces = partition.namespaces
     return replace(
@@ -91,12 +91,12 @@ def cut(observed: ClusterSnapshot, partition: Part) -> ClusterSnapshot:
     )
 
 
-def cut_state(state: ClusterState, partition: Part) -> ClusterState:
+def partition_state(state: ClusterState, partition: Partition) -> ClusterState:
     """The state of a part alone."""
     return _filtered(state, partition, True)
 
 
-def joined(state: ClusterState, partition: Part, new: ClusterState) -> ClusterState:
+def merge_state(state: ClusterState, partition: Partition, new: ClusterState) -> ClusterState:
     """The state of the whole cluster, with the new state of a part."""
     outside = _filtered(state, partition, False)
     merged = {
@@ -110,7 +110,7 @@ _BY_PLACE = ("absent", "served", "given", "refused", "moved", "tried", "former")
 _BY_NODE = ("lost", "addresses")
 
 
-def _filtered(state: ClusterState, partition: Part, inside: bool) -> ClusterState:
+def _filtered(state: ClusterState, partition: Partition, inside: bool) -> ClusterState:
     """The state of what is inside a part, or of all outside it."""
     namespaces, nodes = partition.namespaces, partition.nodes
     fields: dict[str, Mapping[Any, Any]] = {

@@ -22,8 +22,8 @@ from rosproxy_operator.kubernetes.planner.access.policies import policies
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
-from rosproxy_operator.kubernetes.planner.pods.injection import unwired
-from rosproxy_operator.kubernetes.planner.pods.ros2_pods import unmet
+from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
+from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.steps.ear import ear_findings, reconcile_ears
@@ -44,7 +44,7 @@ from rosproxy_operator.kubernetes.planner.steps.reconcile import (
 )
 from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
 from rosproxy_operator.kubernetes.planner.view import view
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, NodeState, Obstacle
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
@@ -70,22 +70,22 @@ _STEPS = (
 class ClusterPlan(msgspec.Struct, frozen=True):
     """What to do, in this order, and what to remember.
 
-    One action that fails keeps none of the others from being done. ``gone`` are, by the uid of a
-    proxy's pod, the addresses of pods that are no more, ``callers`` those of pods that may use the
-    proxy, ``policies`` the layers of its policy, ``peers`` its peers of ROS 2, ``former`` the
-    ports of participants at the proxy before it: it is to be told.
-    ``again_in`` is in how many seconds to look again even if nothing happens; None: no need.
+    One action that fails keeps none of the others from being done. ``departed_addresses`` are, by
+    the uid of a proxy's pod, the addresses of pods that are no more, ``callers`` those of pods that
+    may use the proxy, ``policies`` the layers of its policy, ``peers`` its peers of ROS 2,
+    ``former_ports`` the ports of participants at the proxy before it: it is to be told.
+    ``next_look_in`` is in how many seconds to look again even if nothing happens; None: no need.
     """
 
     actions: tuple[Action, ...] = ()
     problems: tuple[ClusterFinding, ...] = ()
     state: ClusterState = ClusterState()
-    gone: Mapping[str, tuple[str, ...]] = {}
+    departed_addresses: Mapping[str, tuple[str, ...]] = {}
     callers: Mapping[str, tuple[str, ...]] = {}
     policies: Mapping[str, tuple[PolicyLayer, ...]] = {}
     peers: Mapping[str, tuple[str, ...]] = {}
-    former: Mapping[str, Leases] = {}
-    again_in: float | None = None
+    former_ports: Mapping[str, Leases] = {}
+    next_look_in: float | None = None
 
 
 def plan(
@@ -124,18 +124,19 @@ def plan(
         actions += _patch(context, invalid, status_of_invalid(invalid, stamp))
     unique = tuple(dict.fromkeys(problems))
     warnings = events.warnings(unique, decided.reported, now)
-    departed = departures.gone(observed, decided, now)
+    departed = departures.find_departures(observed, decided, now)
     soon = (seconds for seconds in ends(context) if seconds > 0)
+    waits = (*soon, *retries.pauses(), *departures.next_checks(departed, now))
     return ClusterPlan(
         actions=(*actions, *warnings.emits),
         problems=unique,
         state=replace(departed.state, attempts=retries.noted, reported=warnings.reported),
-        gone=departed.gone,
+        departed_addresses=departed.addresses,
         callers=callers(full_snapshot),
         policies=policies(full_snapshot, settings),
         peers=peers(context),
-        former=former_ports(cluster_view, decided.former),
-        again_in=min((*soon, *retries.waits(), *departures.waits(departed, now)), default=None),
+        former_ports=former_ports(cluster_view, decided.former),
+        next_look_in=min(waits, default=None),
     )
 
 
@@ -147,22 +148,25 @@ def stand_by(
     That is what can't be seen any more once it is needed: which ports participants had, and which
     addresses pods had. Everything else is learnt from the cluster by the first plan.
     """
-    departed = departures.gone(observed, state, now).state
+    departed = departures.find_departures(observed, state, now).state
     former = remember(view(within_bounds(observed, settings)), state.former)
     return ClusterState(former=former, addresses=departed.addresses, strange=departed.strange)
 
 
-def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[NodeState]:
+def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnNode]:
     """What a RosProxy has on each node that its status names: also where it had a proxy."""
     ears = [ear for ear in context.observed.ears if ear.owner == rosproxy.uid]
-    node_names = {*rosproxy.former, *(p.node for p in context.view.places.get(rosproxy.id, ()))}
+    node_names = {
+        *rosproxy.former_ranges,
+        *(p.node for p in context.view.places.get(rosproxy.id, ())),
+    }
     for node in sorted(node_names & context.observed.nodes.keys()):
         place = ProxyPlace(rosproxy.id, node)
         current, wanted = context.view.current.get(place), place in context.view.wanted
         site = site_of(context, place) if wanted else None
-        former = context.state.given.get(place) or rosproxy.former.get(node)
+        former = context.state.given.get(place) or rosproxy.former_ranges.get(node)
         kept = current.range if current else former
-        yield NodeState(
+        yield RosProxyOnNode(
             name=node,
             advertise_host=advertise_host(rosproxy, context.observed.nodes[node])[0],
             range=context.ranges.given.get(place) if wanted else kept,
@@ -170,28 +174,30 @@ def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[NodeState]:
             pods=context.view.wanted.get(place, ()),
             answer=context.observed.reports.get(current.pod.uid) if current else None,
             obstacle=site if isinstance(site, Obstacle) else None,
-            ear=next((ear for ear in ears if ear.on == node), None),
+            ear=next((ear for ear in ears if ear.node == node), None),
         )
 
 
 def _problems(
     context: ClusterContext,
     rosproxy: RosProxy,
-    states: tuple[NodeState, ...],
+    states: tuple[RosProxyOnNode, ...],
     moved: Iterable[ClusterFinding],
 ) -> tuple[ClusterFinding, ...]:
     """All that is wrong with a RosProxy."""
     address = context.cluster_ip(rosproxy)
-    pods = context.view.taken.get(rosproxy.id, ()) if address else ()
+    pods = context.view.selected_pods.get(rosproxy.id, ()) if address else ()
     shared = (*context.view.findings, *moved, *context.ranges.findings)
-    unlisted = context.observed.no_policies if context.settings.network_policy else ""
+    unlisted = context.observed.policies_error if context.settings.network_policy else ""
     text = f"the NetworkPolicies can't be listed, so none is made for it: {unlisted}"
     return (
         *((finding(rosproxy, "NoNetworkPolicy", text),) if unlisted else ()),
         *findings(rosproxy, states, context.retries.failures(rosproxy.id)),
         *(f for f in shared if f.of == rosproxy.id),
-        *filter(None, (unwired(pod, rosproxy, address) for pod in pods if rosproxy.spec.ros1)),
-        *(f for pod in pods for f in unmet(pod, rosproxy, address)),
+        *filter(
+            None, (wiring_finding(pod, rosproxy, address) for pod in pods if rosproxy.spec.ros1)
+        ),
+        *(f for pod in pods for f in ros2_findings(pod, rosproxy, address)),
         *ear_findings(context, rosproxy),
     )
 
@@ -206,5 +212,5 @@ def _patch(
     if status != rosproxy.status:
         conditions = [{**c, "lastTransitionTime": ""} for c in status.get("conditions", ())]
         content = json.dumps({**status, "conditions": conditions}, sort_keys=True, default=str)
-        if context.retries.ask(Task(rosproxy.id, "status", rosproxy.id, content)):
+        if context.retries.is_due(Task(rosproxy.id, "status", rosproxy.id, content)):
             yield PatchStatus(rosproxy.id, rosproxy.uid, status)

@@ -1,7 +1,7 @@
 """When an action that has had no effect is tried again: soon, then after ever longer pauses.
 
-The planner asks (`Retries.ask`) before each action whether it is to be done now. What was asked for
-is noted, with the time and with the error if the API server refused it, and goes into the next
+The planner asks (`Retries.is_due`) before each action whether it is to be done now. What was asked
+for is noted, with the time and with the error if the API server refused it, and goes into the next
 state; a task that is not asked for any more has had its effect and is forgotten.
 """
 
@@ -18,7 +18,7 @@ FIRST = 1.0
 """Seconds until something that failed is tried again, the first time."""
 LONGEST = 60.0
 """Seconds between tries at most."""
-AT_ONCE = 3
+PROMPT_RECREATIONS = 3
 """How often a pod that never got well is made anew without delay."""
 
 
@@ -37,8 +37,8 @@ class Task(msgspec.Struct, frozen=True):
 class RetryRecord(msgspec.Struct, frozen=True):
     """How often a task was asked for, and when the last time.
 
-    ``effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the API
-    server said of it.
+    ``note_effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the
+    API server said of it.
     """
 
     count: int
@@ -50,7 +50,7 @@ class RetryRecord(msgspec.Struct, frozen=True):
     def pause(self) -> float:
         """Seconds after which it may be tried again."""
         if self.effect and not self.error:
-            excess = self.count - AT_ONCE
+            excess = self.count - PROMPT_RECREATIONS
             return min(FIRST * 2.0 ** min(excess, 10), LONGEST) if excess >= 0 else 0.0
         first = FIRST if self.error else LAG
         return min(first * 2.0 ** min(self.count - 1, 10), LONGEST)
@@ -73,7 +73,7 @@ class Retries:
         self.noted: dict[Task, RetryRecord] = {}
         self._later: list[float] = []
 
-    def ask(self, task: Task) -> bool:
+    def is_due(self, task: Task) -> bool:
         """Whether a task is to be done now; if so, that is noted."""
         record = self._attempts.get(task)
         if record is not None and self._now - record.at < record.pause:
@@ -83,11 +83,11 @@ class Retries:
         self.noted[task] = RetryRecord(count + 1, self._now, error=error)
         return True
 
-    def later(self, seconds: float) -> None:
+    def look_again_in(self, seconds: float) -> None:
         """Note that something else has to come first: look again in that many seconds."""
         self._later.append(seconds)
 
-    def effect(self, task: Task) -> None:
+    def note_effect(self, task: Task) -> None:
         """Note that a task has had its effect, though it may have to be done again."""
         if task in self._attempts:
             self.noted[task] = replace(self._attempts[task], effect=True, error="")
@@ -97,7 +97,7 @@ class Retries:
         noted = self.noted.items()
         return {task.id: record.error for task, record in noted if task.of == of and record.error}
 
-    def waits(self) -> Iterator[float]:
+    def pauses(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""
         yield from self._later
         for record in self.noted.values():

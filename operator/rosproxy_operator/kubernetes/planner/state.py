@@ -24,7 +24,7 @@ from rosproxy_operator.common.allocation import (
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
 from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves
-from rosproxy_operator.kubernetes.resources.cluster import Stuck
+from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Pod,
@@ -74,7 +74,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
     `RETRY_FOR` seconds, since its ports may only be slow to be let go: they count as taken then.
     """
     absent = view.proxies.keys() - view.wanted.keys()
-    lost = {p.on for p in view.observed.proxies} - view.observed.nodes.keys()
+    lost = {p.node for p in view.observed.proxies} - view.observed.nodes.keys()
     served = _served(view, state)
     waiting, refused = _refused(view, served, state.refused, now)
     taken = {port: at for port, at in state.taken.items() if now - at < TAKEN_FOR}
@@ -128,7 +128,9 @@ def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
     served = dict(state.served)
     if not state.begun:
         for name, rosproxy in view.rosproxies.items():
-            served |= {ProxyPlace(name, node): ports for node, ports in rosproxy.former.items()}
+            served |= {
+                ProxyPlace(name, node): ports for node, ports in rosproxy.former_ranges.items()
+            }
     served |= {place_of(p): p.range for p in view.observed.proxies if serves(p)}
     return _possible(view, served)
 
@@ -156,9 +158,9 @@ def _refused(
     waiting = {place: at for place, at in since.items() if _is_waiting(view, place)}
     taken: set[tuple[str, int]] = set()
     for proxy in view.observed.proxies:
-        place, neighbours = place_of(proxy), view.on.get(proxy.on, ())
+        place, neighbours = place_of(proxy), view.proxies_by_node.get(proxy.node, ())
         ends_soon = any(p.pod.deleting and overlap(p.range, proxy.range) for p in neighbours)
-        is_stuck = proxy.stuck is Stuck.PORTS and not proxy.pod.deleting
+        is_stuck = proxy.stuck is PodFailure.PORTS and not proxy.pod.deleting
         if not is_stuck or place not in view.wanted or ends_soon:
             continue
         former, began = served.get(place), waiting.pop(place, now)
@@ -167,11 +169,11 @@ def _refused(
             continue
         other_pods = (p.pod for p in neighbours if place_of(p) != place)
         spec = view.rosproxies[place.of].spec
-        pod_ports = ports_held((*view.strangers.get(proxy.on, ()), *other_pods), spec)
+        pod_ports = host_ports_of((*view.other_pods_by_node.get(proxy.node, ()), *other_pods), spec)
         # If the pods that hold them are seen, only their ports are avoided, else the whole range.
         conflicts = pod_ports & proxy.pod.every_port
         avoided = pod_ports.intersection(proxy.range.ports()) if conflicts else proxy.range.ports()
-        taken |= {(proxy.on, port) for port in avoided}
+        taken |= {(proxy.node, port) for port in avoided}
     return waiting, taken
 
 
@@ -181,7 +183,7 @@ def _is_waiting(view: View, place: ProxyPlace) -> bool:
     return place in view.wanted and (proxy is None or not has_ports(proxy))
 
 
-def ports_held(pods: Iterable[Pod], spec: RosProxySpec) -> set[int]:
+def host_ports_of(pods: Iterable[Pod], spec: RosProxySpec) -> set[int]:
     """The hostPorts of pods that a RosProxy can't have."""
     return {port for pod in pods for port in pod.ports_of(spec)}
 

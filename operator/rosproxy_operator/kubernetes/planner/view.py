@@ -10,8 +10,8 @@ from typing import TypeVar
 import msgspec
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.kubernetes.planner.pods.selection import chosen, on_node
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, Stuck
+from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, PodFailure, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Name,
@@ -34,9 +34,10 @@ class View(msgspec.Struct, frozen=True):
     the name that it is to have, unless it is being deleted. ``on`` are, by the node that they are
     meant for, all proxies that hold ports, of any RosProxy. ``wanted`` are the places where pods
     want a proxy, and those pods; ``places`` those where a proxy is wanted or exists, in order;
-    ``taken`` all pods that a RosProxy has taken, wherever they are. ``strangers`` are, by node, the
-    pods that hold ports and are neither proxies nor ears, ``others`` the names of all such pods,
-    with ports or not, ``names`` those of all proxies. ``findings`` are those about pods.
+    ``selected_pods`` all pods that a RosProxy has taken, wherever they are. ``other_pods_by_node``
+    are, by node, the pods that hold ports and are neither proxies nor ears, ``other_pod_names`` the
+    names of all such pods, with ports or not, ``names`` those of all proxies. ``findings`` are
+    those about pods.
     """
 
     observed: ClusterSnapshot
@@ -44,19 +45,19 @@ class View(msgspec.Struct, frozen=True):
     proxies: Mapping[ProxyPlace, tuple[ProxyPod, ...]]
     current: Mapping[ProxyPlace, ProxyPod]
     orphans: tuple[ProxyPod, ...]
-    on: Mapping[str, tuple[ProxyPod, ...]]
+    proxies_by_node: Mapping[str, tuple[ProxyPod, ...]]
     wanted: Mapping[ProxyPlace, tuple[Pod, ...]]
     places: Mapping[Name, tuple[ProxyPlace, ...]]
-    taken: Mapping[Name, tuple[Pod, ...]]
-    strangers: Mapping[str, tuple[Pod, ...]]
-    others: frozenset[Name]
+    selected_pods: Mapping[Name, tuple[Pod, ...]]
+    other_pods_by_node: Mapping[str, tuple[Pod, ...]]
+    other_pod_names: frozenset[Name]
     names: frozenset[Name]
     findings: tuple[ClusterFinding, ...]
 
 
 def place_of(proxy: ProxyPod) -> ProxyPlace:
     """The place that a proxy is meant for."""
-    return ProxyPlace(proxy.of, proxy.on)
+    return ProxyPlace(proxy.of, proxy.node)
 
 
 def serves(proxy: ProxyPod) -> bool:
@@ -67,13 +68,13 @@ def serves(proxy: ProxyPod) -> bool:
 
 def has_ports(proxy: ProxyPod) -> bool:
     """Whether the scheduler has given a proxy its node, and with it its ports."""
-    return bool(proxy.pod.node) and not proxy.pod.ended and proxy.stuck is not Stuck.PORTS
+    return bool(proxy.pod.node) and not proxy.pod.ended and proxy.stuck is not PodFailure.PORTS
 
 
 def view(observed: ClusterSnapshot) -> View:
     """Put in order what is seen."""
     rosproxies = {r.id: r for r in observed.rosproxies if not r.deleting}
-    proxies = grouped((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
+    proxies = group_by_key((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
     unusable = {r.uid for r in observed.unusable.values()}
     orphans = (p for p in observed.proxies if not _owned(p, rosproxies))
     own_uids = {p.pod.uid for p in observed.proxies} | {ear.pod.uid for ear in observed.ears}
@@ -91,14 +92,14 @@ def view(observed: ClusterSnapshot) -> View:
             if proxy.pod.id == proxy_id(place.of, place.node) and not proxy.pod.deleting
         },
         orphans=tuple(p for p in orphans if p.owner not in unusable),
-        on=grouped((p.on, p) for p in observed.proxies if not p.pod.ended),
+        proxies_by_node=group_by_key((p.node, p) for p in observed.proxies if not p.pod.ended),
         wanted=wanted,
-        places=grouped((place.of, place) for place in sorted({*wanted, *proxies})),
-        taken=taken,
-        strangers=grouped(
+        places=group_by_key((place.of, place) for place in sorted({*wanted, *proxies})),
+        selected_pods=taken,
+        other_pods_by_node=group_by_key(
             (pod.node, pod) for pod in other_pods if pod.node and pod.every_port and not pod.ended
         ),
-        others=frozenset(pod.id for pod in other_pods),
+        other_pod_names=frozenset(pod.id for pod in other_pods),
         names=frozenset(p.pod.id for p in observed.proxies),
         findings=(*findings, *left_out),
     )
@@ -113,8 +114,10 @@ def _taken(
 ) -> tuple[dict[Name, tuple[Pod, ...]], list[ClusterFinding]]:
     """Which RosProxy has taken which pods, and what is wrong with that."""
     pods = [pod for pod in observed.pods if not (pod.ended or pod.deleting or is_own(pod.labels))]
-    choices = [(chosen(pod, rosproxies.values()), pod) for pod in pods]
-    taken = grouped((choice.id, pod) for choice, pod in choices if isinstance(choice, RosProxy))
+    choices = [(select_rosproxy(pod, rosproxies.values()), pod) for pod in pods]
+    taken = group_by_key(
+        (choice.id, pod) for choice, pod in choices if isinstance(choice, RosProxy)
+    )
     return taken, [choice for choice, _ in choices if isinstance(choice, ClusterFinding)]
 
 
@@ -124,7 +127,9 @@ def _wanted(
     taken: Mapping[Name, Iterable[Pod]],
 ) -> tuple[dict[ProxyPlace, tuple[Pod, ...]], list[ClusterFinding]]:
     """The places where pods want a proxy, and findings about pods that get none."""
-    places = grouped((ProxyPlace(n, pod.node), pod) for n, pods in taken.items() for pod in pods)
+    places = group_by_key(
+        (ProxyPlace(n, pod.node), pod) for n, pods in taken.items() for pod in pods
+    )
     wanted: dict[ProxyPlace, tuple[Pod, ...]] = {}
     findings: list[ClusterFinding] = []
     for place, pods in sorted(places.items()):
@@ -136,19 +141,19 @@ def _wanted(
             continue
         text = (
             f"selected pods run on node {place.node}, which spec.nodeSelector leaves out, so they "
-            f"have no proxy: {short(str(pod.id) for pod in pods)}: widen spec.nodeSelector, or "
-            "give the pods the same one"
+            f"have no proxy: {abbreviated(str(pod.id) for pod in pods)}: widen spec.nodeSelector, "
+            "or give the pods the same one"
         )
         findings.append(finding(rosproxy, "NodeLeftOut", text))
     return wanted, findings
 
 
-def short(texts: Iterable[str]) -> str:
+def abbreviated(texts: Iterable[str]) -> str:
     """A few of the texts, and how many more there are."""
     return listed(sorted(set(texts)))
 
 
-def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, tuple[V, ...]]:
+def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, tuple[V, ...]]:
     """The values of each key, in their order."""
     groups: dict[K, list[V]] = defaultdict(list)
     for key, value in pairs:

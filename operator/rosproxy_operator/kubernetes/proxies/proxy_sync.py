@@ -321,7 +321,7 @@ class ClusterProxySync:
         return {uid: p.report for uid, (p, _) in self._pollers.items() if p.report is not None}
 
     @property
-    def ways(self) -> dict[str, tuple[HostPort, str]]:
+    def admin_endpoints(self) -> dict[str, tuple[HostPort, str]]:
         """Each proxy's admin endpoint and the token for it, by the names of their pods."""
         return {poller.name: (poller.target, poller.token) for poller, _ in self._pollers.values()}
 
@@ -391,7 +391,7 @@ def token_for(proxy: ProxyPod, key: bytes) -> str:
 
     A proxy that a former operator has made has the token in its pod.
     """
-    return proxy.token or token_of(key, proxy.pod.id, proxy.on)
+    return proxy.token or token_of(key, proxy.pod.id, proxy.node)
 
 
 def _admin_endpoint(proxy: ProxyPod, key: bytes) -> tuple[HostPort, str]:

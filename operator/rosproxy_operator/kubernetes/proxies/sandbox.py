@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.api.client import Api
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
-from rosproxy_operator.kubernetes.resources.values import part, word
+from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 FAILED = "FailedCreatePodSandBox"
 """The reason of the kubelet's Event, which alone says that a hostPort could not be had."""
@@ -59,9 +59,9 @@ class SandboxFailures:
         return new
 
     def _events(self, namespace: str) -> list[dict[str, Any]]:
-        return self._api.fresh("events", namespace, f"reason={FAILED}")
+        return self._api.list_fresh("events", namespace, f"reason={FAILED}")
 
-    def shown(self, observed: ClusterSnapshot) -> ClusterSnapshot:
+    def with_messages(self, observed: ClusterSnapshot) -> ClusterSnapshot:
         """The snapshot, with the Events' messages at its proxies."""
         if not self._messages:
             return observed
@@ -91,9 +91,9 @@ def _latest(events: Sequence[Json]) -> dict[str, str]:
     """What the last Event about each pod says, by the pod's uid."""
     latest: dict[str, Json] = {}
     for event in sorted(events, key=_timestamp):
-        latest[word(part(event, "involvedObject"), "uid")] = event
-    return {uid: word(event, "message") for uid, event in latest.items()}
+        latest[text_at(submap(event, "involvedObject"), "uid")] = event
+    return {uid: text_at(event, "message") for uid, event in latest.items()}
 
 
 def _timestamp(event: Json) -> str:
-    return word(event, "lastTimestamp") or word(event, "eventTime")
+    return text_at(event, "lastTimestamp") or text_at(event, "eventTime")

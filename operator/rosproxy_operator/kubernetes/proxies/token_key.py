@@ -17,14 +17,14 @@ from collections.abc import Sequence
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.api.client import (
     Api,
-    ApiAway,
     ApiConflict,
     ApiError,
-    ApiGone,
     ApiInvalid,
+    ApiNotFound,
+    ApiUnavailable,
 )
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import part, word
+from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class TokenKey:
             if not key:
                 key = secrets.token_bytes(LENGTH)
                 self._put(self._secret, key, manifest)
-        except ApiAway:
+        except ApiUnavailable:
             raise
         except ApiError as error:
             self._complain(error)
@@ -67,7 +67,7 @@ class TokenKey:
         try:
             self._api.fill_secret(secret, manifest, entries)
         except (ApiInvalid, ApiConflict) as error:
-            raise ApiAway(f"somebody else writes {secret}: {error}") from None
+            raise ApiUnavailable(f"somebody else writes {secret}: {error}") from None
         log.info("made a key for the proxies' tokens in Secret %s", secret)
 
     def _kept_key(self) -> bytes:
@@ -80,7 +80,7 @@ class TokenKey:
             f"Secret {self._secret}: {error}; the key of the proxies' tokens is kept in memory, "
             "and proxies are made anew when the operator starts again"
         )
-        if isinstance(error, ApiGone):
+        if isinstance(error, ApiNotFound):
             text += ": create an empty Secret of this name (the chart does)"
         self.problems = (Problem("proxies' tokens", text),)
 
@@ -88,7 +88,7 @@ class TokenKey:
 def _read(secret: Json) -> bytes:
     """The key in a Secret; empty if there is none that is long enough."""
     try:
-        key = base64.b64decode(word(part(secret, "data"), ENTRY), validate=True)
+        key = base64.b64decode(text_at(submap(secret, "data"), ENTRY), validate=True)
     except binascii.Error:
         return b""
     return key if len(key) >= LENGTH else b""

@@ -16,7 +16,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 
 
-class Stuck(Enum):
+class PodFailure(Enum):
     """Why a proxy's pod does not run."""
 
     PORTS = "ports"  # one of its hostPorts is taken
@@ -39,13 +39,13 @@ class ProxyPod(msgspec.Struct, frozen=True):
     pod: Pod
     of: Name
     owner: str
-    on: str
+    node: str
     range: PortRange
     fingerprint: str
     image: str
     token: str = ""
     ready: bool = False
-    stuck: Stuck | None = None
+    stuck: PodFailure | None = None
     message: str = ""
     restarts: int = 0
 
@@ -56,11 +56,11 @@ class EarPod(msgspec.Struct, frozen=True):
     pod: Pod
     of: Name
     owner: str
-    on: str
+    node: str
     fingerprint: str
     image: str
     ready: bool = False
-    stuck: Stuck | None = None
+    stuck: PodFailure | None = None
     message: str = ""
 
 
@@ -140,7 +140,7 @@ class Obstacle(msgspec.Struct, frozen=True):
     text: str
 
 
-class NodeState(msgspec.Struct, frozen=True):
+class RosProxyOnNode(msgspec.Struct, frozen=True):
     """What one RosProxy has on one node, and what it gets there: a line of its status.
 
     ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
@@ -163,16 +163,15 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     """A cluster at one moment, as far as it matters.
 
     ``pods`` are those that a RosProxy selects; and on the nodes where those, proxies or ears run
-    all others of the namespaces that have such, and any that take ports there.
-    ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
-    wrong; one of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies
-    may name it, besides its own. ``selected`` are the uids of the pods that a RosProxy selects.
-    ``policies`` are the operator's own NetworkPolicies by their names; ``no_policies`` is why they
-    can't be listed. ``key`` is that from which the proxies' tokens are made.
-    ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
-    ``reports`` are what the proxies say of themselves, by the uid of the pod; ``failures`` are, by
-    RosProxy and object, what the API server said of the actions that failed at the last try:
-    neither is listed, the operator puts them here.
+    all others of the namespaces that have such, and any that take ports there. ``masters`` gives,
+    for each Service that a RosProxy names as its master, its address and what is wrong; one of them
+    is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it, besides
+    its own. ``selected`` are the uids of the pods that a RosProxy selects. ``policies`` are the
+    operator's own NetworkPolicies by their names; ``policies_error`` is why they can't be listed.
+    ``key`` is that from which the proxies' tokens are made. ``unusable`` are the RosProxies that
+    can't be read at all: what they have is left as it is. ``reports`` are what the proxies say of
+    themselves, by the uid of the pod; ``failures`` are, by RosProxy and object, what the API server
+    said of the actions that failed at the last try: neither is listed, the operator puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -185,7 +184,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()
     policies: Mapping[Name, ProxyPolicy] = {}
-    no_policies: str = ""
+    policies_error: str = ""
     key: bytes = b""
     reports: Mapping[str, ProxyReport] = {}
     unusable: Mapping[Name, InvalidRosProxy] = {}

@@ -23,13 +23,13 @@ class InvalidField(Exception):
 class Field(msgspec.Struct, frozen=True):
     """A part of an object, None if it is not given; ``path`` names it as Kubernetes does.
 
-    All methods but `refused` raise InvalidField if it is not what they are to give.
+    All methods but `error` raise InvalidField if it is not what they are to give.
     """
 
     path: str
     value: Any
 
-    def refused(self, problem: str, fix: str) -> InvalidField:
+    def error(self, problem: str, fix: str) -> InvalidField:
         """The error to raise for it: what is wrong, and what to do."""
         return InvalidField(f"{self.path}: {quoted(self.value)} {problem}: {fix}")
 
@@ -44,21 +44,21 @@ class Field(msgspec.Struct, frozen=True):
         """A map of texts."""
         return {key: self[key].text() for key in self.map()}
 
-    def each(self) -> list["Field"]:
+    def items(self) -> list["Field"]:
         """The fields of a list."""
         fields = [
             Field(f"{self.path}[{i}]", v) for i, v in enumerate(self._checked(list, [], "a list"))
         ]
         for field in fields:
             if field.value is None:
-                raise field.refused("does not fit", "leave it out")
+                raise field.error("does not fit", "leave it out")
         return fields
 
     def text(self, default: str = "") -> str:
         """A text."""
         return self._checked(str, default, "a text, in quotes")
 
-    def truth(self) -> bool:
+    def boolean(self) -> bool:
         """True or false, which is the default."""
         return self._checked(bool, False, "true or false")
 
@@ -70,7 +70,7 @@ class Field(msgspec.Struct, frozen=True):
         fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
         if not fits or not least <= self.value <= most:
             expected = {int: "an integer", float: "a number"}[kind]
-            raise self.refused("does not fit", f"write {expected} from {least} to {most}")
+            raise self.error("does not fit", f"write {expected} from {least} to {most}")
         return kind(self.value)
 
     def one_of(self, allowed: Mapping[str, V], default: str) -> V:
@@ -78,21 +78,21 @@ class Field(msgspec.Struct, frozen=True):
         text = self.text(default)
         if text not in allowed:
             fix = f"write one of {', '.join(sorted(filter(None, allowed)))}"
-            raise self.refused("is unknown", fix)
+            raise self.error("is unknown", fix)
         return allowed[text]
 
     def _checked(self, type: type[V], default: V, expected: str) -> V:
         if self.value is None:
             return default
         if not isinstance(self.value, type):
-            raise self.refused("does not fit", f"write {expected}")
+            raise self.error("does not fit", f"write {expected}")
         return self.value
 
 
-def bare(obj: Any) -> Any:
+def stripped(obj: Any) -> Any:
     """The same without blanks around its texts; null in a map is as if it were not given."""
     if isinstance(obj, str):
         return obj.strip()
     if isinstance(obj, Mapping):
-        return {key: bare(value) for key, value in obj.items() if value is not None}
-    return [bare(child) for child in obj] if isinstance(obj, list | tuple) else obj
+        return {key: stripped(value) for key, value in obj.items() if value is not None}
+    return [stripped(child) for child in obj] if isinstance(obj, list | tuple) else obj

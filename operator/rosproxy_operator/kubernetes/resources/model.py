@@ -133,16 +133,16 @@ class RosProxySpec(msgspec.Struct, frozen=True):
 class RosProxy(msgspec.Struct, frozen=True):
     """A RosProxy, the custom resource.
 
-    ``former`` are the ranges by node name that its status holds; ``cluster_ip`` is the address
-    that its Service has, or had; ``status`` is its status as it is now. ``remakes``: whether pods
-    that came by unwired are to be made anew.
+    ``former_ranges`` are the ranges by node name that its status holds; ``cluster_ip`` is the
+    address that its Service has, or had; ``status`` is its status as it is now. ``remakes``:
+    whether pods that came by unwired are to be made anew.
     """
 
     id: Name
     uid: str
     generation: int
     spec: RosProxySpec
-    former: Mapping[str, PortRange] = {}
+    former_ranges: Mapping[str, PortRange] = {}
     cluster_ip: str = ""
     status: Json = {}
     deleting: bool = False
@@ -165,7 +165,7 @@ class ClusterNode(msgspec.Struct, frozen=True):
     deleting: bool = False
 
 
-ELSEWHERE = "$()"
+VALUE_AT_RUNTIME = "$()"
 """Stands for a value that is only known once the container runs."""
 
 
@@ -179,11 +179,12 @@ class PodContainer(msgspec.Struct, frozen=True):
 class Pod(msgspec.Struct, frozen=True):
     """A pod. ``node`` and ``ip`` are empty until it has them; ``ips`` are all of its addresses.
 
-    ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are
-    the ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that
-    is not a plain text (from a ConfigMap, for one) is `ELSEWHERE`. ``wired`` is the one that the
-    webhook has set, empty if it has not; ``static_peers`` the same of ROS_STATIC_PEERS.
-    ``udp_ports`` are the UDP ports that it takes, ``controller`` is the kind of what made it.
+    ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are the
+    ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that is
+    not a plain text (from a ConfigMap, for one) is `VALUE_AT_RUNTIME`. ``wired_master_uri`` is the
+    one that the webhook has set, empty if it has not; ``static_peers`` the same of
+    ROS_STATIC_PEERS. ``udp_ports`` are the UDP ports that it takes, ``controller`` is the kind of
+    what made it.
     """
 
     id: Name
@@ -196,7 +197,7 @@ class Pod(msgspec.Struct, frozen=True):
     host_network: bool = False
     deleting: bool = False
     own_masters: tuple[str, ...] = ()
-    wired: str = ""
+    wired_master_uri: str = ""
     ips: tuple[str, ...] = ()
     udp_ports: frozenset[int] = frozenset()
     static_peers: str = ""

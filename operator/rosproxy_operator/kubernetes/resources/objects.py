@@ -15,22 +15,22 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.model import (
-    ELSEWHERE,
+    VALUE_AT_RUNTIME,
     ClusterNode,
     Json,
     Name,
     Pod,
     PodContainer,
 )
-from rosproxy_operator.kubernetes.resources.pod_failures import stuck
+from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
 from rosproxy_operator.kubernetes.resources.values import (
+    int_at,
     is_label,
-    number,
-    part,
-    parts,
     port_range,
-    word,
-    words,
+    submap,
+    submaps,
+    text_at,
+    texts_at,
 )
 
 VARIABLE = "ROS_MASTER_URI"
@@ -49,14 +49,14 @@ ROS2_VARIABLES = frozenset(
 
 def node(obj: Json) -> ClusterNode:
     """A node."""
-    meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
-    networks = spec.get("podCIDRs") or (word(spec, "podCIDR"),)
-    addresses = reversed(parts(status, "addresses"))
+    meta, spec, status = submap(obj, "metadata"), submap(obj, "spec"), submap(obj, "status")
+    networks = spec.get("podCIDRs") or (text_at(spec, "podCIDR"),)
+    addresses = reversed(submaps(status, "addresses"))
     return ClusterNode(
-        name=word(meta, "name"),
-        labels=words(meta, "labels"),
-        addresses={word(address, "type"): word(address, "address") for address in addresses},
-        advertise_host=word(part(meta, "annotations"), names.ADVERTISE_HOST).strip(),
+        name=text_at(meta, "name"),
+        labels=texts_at(meta, "labels"),
+        addresses={text_at(address, "type"): text_at(address, "address") for address in addresses},
+        advertise_host=text_at(submap(meta, "annotations"), names.ADVERTISE_HOST).strip(),
         pod_networks=tuple(network for network in networks if network and isinstance(network, str)),
         ready=_is_ready(status),
         deleting=is_deleted(meta),
@@ -65,33 +65,33 @@ def node(obj: Json) -> ClusterNode:
 
 def pod(obj: Json) -> Pod:
     """A pod. At admission it may have no name, uid, node and address."""
-    meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
-    wired = word(part(meta, "annotations"), names.MASTER_URI)
+    meta, spec, status = submap(obj, "metadata"), submap(obj, "spec"), submap(obj, "status")
+    wired = text_at(submap(meta, "annotations"), names.MASTER_URI)
     return Pod(
         id=name_of(meta),
-        uid=word(meta, "uid"),
-        labels=words(meta, "labels"),
-        node=word(spec, "nodeName"),
-        phase=word(status, "phase") or "Pending",
-        ip=word(status, "podIP"),
+        uid=text_at(meta, "uid"),
+        labels=texts_at(meta, "labels"),
+        node=text_at(spec, "nodeName"),
+        phase=text_at(status, "phase") or "Pending",
+        ip=text_at(status, "podIP"),
         host_ports=frozenset(_host_ports(spec, "TCP")),
         udp_ports=frozenset(_host_ports(spec, "UDP")),
         host_network=spec.get("hostNetwork") is True,
         deleting=is_deleted(meta),
         own_masters=tuple(uri for uri in _masters(spec) if not wired or uri != wired),
-        wired=wired,
-        static_peers=word(part(meta, "annotations"), names.STATIC_PEERS),
-        containers=tuple(map(_container, parts(spec, "containers"))),
-        ips=tuple(filter(None, (word(pod_ip, "ip") for pod_ip in parts(status, "podIPs")))),
+        wired_master_uri=wired,
+        static_peers=text_at(submap(meta, "annotations"), names.STATIC_PEERS),
+        containers=tuple(map(_container, submaps(spec, "containers"))),
+        ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),
         controller=_controller(meta),
     )
 
 
 def proxy_pod(obj: Json) -> ProxyPod | None:
     """A proxy's pod; None if the object is not one that this operator made, or not whole."""
-    meta, status = part(obj, "metadata"), part(obj, "status")
-    labels, notes = words(meta, "labels"), words(meta, "annotations")
-    containers = parts(part(obj, "spec"), "containers")
+    meta, status = submap(obj, "metadata"), submap(obj, "status")
+    labels, notes = texts_at(meta, "labels"), texts_at(meta, "annotations")
+    containers = submaps(submap(obj, "spec"), "containers")
     container = next((c for c in containers if c.get("name") == names.CONTAINER), None)
     ports = port_range(notes, names.PORT_RANGE)
     on, owner = notes.get(names.NODE, ""), _owner(meta)
@@ -99,40 +99,40 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
         return None
     if ports is None or not (on and owner and container):
         return None
-    reason, message = stuck(status)
-    variables = {word(v, "name"): word(v, "value") for v in parts(container, "env")}
+    reason, message = pod_failure(status)
+    variables = {text_at(v, "name"): text_at(v, "value") for v in submaps(container, "env")}
     return ProxyPod(
         pod=pod(obj),
-        of=Name(word(meta, "namespace"), labels[names.PROXY_OF]),
+        of=Name(text_at(meta, "namespace"), labels[names.PROXY_OF]),
         owner=owner,
-        on=on,
+        node=on,
         range=ports,
         fingerprint=notes.get(names.FINGERPRINT, ""),
-        image=word(container, "image"),
+        image=text_at(container, "image"),
         token=variables.get(names.TOKEN_VARIABLE, ""),
         ready=_is_ready(status),
         stuck=reason,
         message=message,
-        restarts=sum(number(c, "restartCount") for c in parts(status, "containerStatuses")),
+        restarts=sum(int_at(c, "restartCount") for c in submaps(status, "containerStatuses")),
     )
 
 
 def ear_pod(obj: Json) -> EarPod | None:
     """An ear's pod; None if the object is not one that this operator made, or not whole."""
-    meta, status = part(obj, "metadata"), part(obj, "status")
-    labels, notes = words(meta, "labels"), words(meta, "annotations")
-    container = next(iter(parts(part(obj, "spec"), "containers")), {})
+    meta, status = submap(obj, "metadata"), submap(obj, "status")
+    labels, notes = texts_at(meta, "labels"), texts_at(meta, "annotations")
+    container = next(iter(submaps(submap(obj, "spec"), "containers")), {})
     on, owner = notes.get(names.NODE, ""), _owner(meta)
     if not names.is_ear(labels) or not (on and owner):
         return None
-    reason, message = stuck(status)
+    reason, message = pod_failure(status)
     return EarPod(
         pod=pod(obj),
-        of=Name(word(meta, "namespace"), labels[names.PROXY_OF]),
+        of=Name(text_at(meta, "namespace"), labels[names.PROXY_OF]),
         owner=owner,
-        on=on,
+        node=on,
         fingerprint=notes.get(names.FINGERPRINT, ""),
-        image=word(container, "image"),
+        image=text_at(container, "image"),
         ready=_is_ready(status),
         stuck=reason,
         message=message,
@@ -141,56 +141,58 @@ def ear_pod(obj: Json) -> EarPod | None:
 
 def service(obj: Json) -> ProxyService | None:
     """A Service; None if the object is not one that this operator made."""
-    meta, address = part(obj, "metadata"), word(part(obj, "spec"), "clusterIP")
-    labels, owner = words(meta, "labels"), _owner(meta)
-    rosproxy = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
+    meta, address = submap(obj, "metadata"), text_at(submap(obj, "spec"), "clusterIP")
+    labels, owner = texts_at(meta, "labels"), _owner(meta)
+    rosproxy = Name(text_at(meta, "namespace"), labels.get(names.PROXY_OF, ""))
     if not names.is_own(labels) or not owner or names.service_id(rosproxy) != name_of(meta):
         return None
     return ProxyService(
         of=rosproxy,
         owner=owner,
-        uid=word(meta, "uid"),
+        uid=text_at(meta, "uid"),
         cluster_ip="" if address == "None" else address,
-        fingerprint=word(part(meta, "annotations"), names.FINGERPRINT),
+        fingerprint=text_at(submap(meta, "annotations"), names.FINGERPRINT),
         deleting=is_deleted(meta),
     )
 
 
 def master_service(obj: Json) -> MasterService:
     """A Service, as far as a master's matters."""
-    spec, ports = part(obj, "spec"), parts(part(obj, "spec"), "ports")
+    spec, ports = submap(obj, "spec"), submaps(submap(obj, "spec"), "ports")
     return MasterService(
-        id=name_of(part(obj, "metadata")),
-        address=word(spec, "clusterIP"),
-        type=word(spec, "type"),
-        ports=frozenset(number(port, "port") for port in ports),
+        id=name_of(submap(obj, "metadata")),
+        address=text_at(spec, "clusterIP"),
+        type=text_at(spec, "type"),
+        ports=frozenset(int_at(port, "port") for port in ports),
         allowed=allowed_from(obj),
     )
 
 
 def policy(obj: Json) -> ProxyPolicy | None:
     """A NetworkPolicy; None if the object is not one that this operator made."""
-    meta = part(obj, "metadata")
-    labels, owner = words(meta, "labels"), _owner(meta)
-    rosproxy = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
+    meta = submap(obj, "metadata")
+    labels, owner = texts_at(meta, "labels"), _owner(meta)
+    rosproxy = Name(text_at(meta, "namespace"), labels.get(names.PROXY_OF, ""))
     id = name_of(meta)
     if not names.is_own(labels) or not owner:
         return None
     if id not in (names.policy_id(rosproxy), names.pods_policy_id(rosproxy)):
         return None
-    return ProxyPolicy(id, rosproxy, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
+    return ProxyPolicy(
+        id, rosproxy, owner, text_at(meta, "uid"), submap(obj, "spec"), is_deleted(meta)
+    )
 
 
 def allowed_from(service: Json) -> frozenset[str]:
     """The namespaces whose RosProxies may name a Service as their master; ``*`` for all."""
-    text = word(part(service, "metadata", "annotations"), names.ALLOW_FROM)
+    text = text_at(submap(service, "metadata", "annotations"), names.ALLOW_FROM)
     namespaces = (namespace.strip() for namespace in text.split(","))
     return frozenset(n for n in namespaces if n == "*" or is_label(n))
 
 
 def name_of(metadata: Json) -> Name:
     """An object's namespace and name."""
-    return Name(word(metadata, "namespace"), word(metadata, "name"))
+    return Name(text_at(metadata, "namespace"), text_at(metadata, "name"))
 
 
 def is_deleted(metadata: Json) -> bool:
@@ -199,18 +201,20 @@ def is_deleted(metadata: Json) -> bool:
 
 
 def _is_ready(status: Json) -> bool:
-    conditions = parts(status, "conditions")
+    conditions = submaps(status, "conditions")
     return any(c.get("type") == "Ready" and c.get("status") == "True" for c in conditions)
 
 
 def _container(obj: Json) -> PodContainer:
     """What a container's own variables and its image say of ROS 2."""
     variables = {
-        name: ELSEWHERE if variable.get("valueFrom") is not None else word(variable, "value")
-        for variable in parts(obj, "env")
-        if (name := word(variable, "name")) in ROS2_VARIABLES
+        name: VALUE_AT_RUNTIME
+        if variable.get("valueFrom") is not None
+        else text_at(variable, "value")
+        for variable in submaps(obj, "env")
+        if (name := text_at(variable, "name")) in ROS2_VARIABLES
     }
-    return PodContainer(word(obj, "image"), variables)
+    return PodContainer(text_at(obj, "image"), variables)
 
 
 def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
@@ -218,33 +222,33 @@ def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
 
     That is ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
     """
-    inits = parts(spec, "initContainers")
+    inits = submaps(spec, "initContainers")
     sidecars = (c for c in inits if c.get("restartPolicy") == "Always")
-    for container in (*parts(spec, "containers"), *sidecars):
-        for port in parts(container, "ports"):
-            if port.get("protocol", "TCP") == protocol and (taken := number(port, "hostPort")):
+    for container in (*submaps(spec, "containers"), *sidecars):
+        for port in submaps(container, "ports"):
+            if port.get("protocol", "TCP") == protocol and (taken := int_at(port, "hostPort")):
                 yield taken
 
 
 def _masters(spec: Json) -> Iterator[str]:
-    for container in (*parts(spec, "initContainers"), *parts(spec, "containers")):
-        for variable in parts(container, "env"):
+    for container in (*submaps(spec, "initContainers"), *submaps(spec, "containers")):
+        for variable in submaps(container, "env"):
             if variable.get("name") == VARIABLE:
-                value = word(variable, "value")
+                value = text_at(variable, "value")
                 is_indirect = variable.get("valueFrom") is not None or "$(" in value
-                yield ELSEWHERE if is_indirect else value
+                yield VALUE_AT_RUNTIME if is_indirect else value
 
 
 def _controller(meta: Json) -> str:
     """The kind of the controller that made an object; empty if none did."""
-    owners = parts(meta, "ownerReferences")
-    return next((word(owner, "kind") for owner in owners if owner.get("controller") is True), "")
+    owners = submaps(meta, "ownerReferences")
+    return next((text_at(owner, "kind") for owner in owners if owner.get("controller") is True), "")
 
 
 def _owner(meta: Json) -> str:
     """The uid of the RosProxy that owns an object, empty if none does."""
-    for owner in parts(meta, "ownerReferences"):
-        group = word(owner, "apiVersion").partition("/")[0]
+    for owner in submaps(meta, "ownerReferences"):
+        group = text_at(owner, "apiVersion").partition("/")[0]
         if group == names.GROUP and owner.get("kind") == names.KIND and owner.get("controller"):
-            return word(owner, "uid")
+            return text_at(owner, "uid")
     return ""

@@ -7,10 +7,10 @@ import re
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.kubernetes.resources.cluster import Stuck
+from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, EAR
-from rosproxy_operator.kubernetes.resources.values import number, part, parts, word
+from rosproxy_operator.kubernetes.resources.values import int_at, submap, submaps, text_at
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 """``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the
@@ -56,35 +56,35 @@ the CNI plugin portmap the port is silently taken over.
 _LONGEST = 300
 
 
-def stuck(status: Json) -> tuple[Stuck | None, str]:
+def pod_failure(status: Json) -> tuple[PodFailure | None, str]:
     """Why a pod does not run, and the same in the words of Kubernetes; None if it does, or may yet.
 
     ``status`` is the pod's. The words don't change while the trouble is the same.
     """
-    if word(status, "phase") == "Failed":
-        return _failed(word(status, "reason"), word(status, "message"))
-    for condition in parts(status, "conditions"):
+    if text_at(status, "phase") == "Failed":
+        return _failed(text_at(status, "reason"), text_at(status, "message"))
+    for condition in submaps(status, "conditions"):
         if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
-            return _unscheduled(word(condition, "reason"), word(condition, "message"))
-    for container in parts(status, "containerStatuses"):
+            return _unscheduled(text_at(condition, "reason"), text_at(condition, "message"))
+    for container in submaps(status, "containerStatuses"):
         if container.get("name") in (CONTAINER, EAR):
             return _waiting(container)
     return None, ""
 
 
-def stuck_by_event(message: str) -> Stuck:
+def stuck_by_event(message: str) -> PodFailure:
     """What the message of a FailedCreatePodSandBox event means: PORTS or SANDBOX."""
     low = message.lower()
-    return Stuck.PORTS if any(text in low for text in _TAKEN) else Stuck.SANDBOX
+    return PodFailure.PORTS if any(text in low for text in _TAKEN) else PodFailure.SANDBOX
 
 
-def _failed(reason: str, message: str) -> tuple[Stuck, str]:
+def _failed(reason: str, message: str) -> tuple[PodFailure, str]:
     """The kubelet did not admit the pod, or ended it (``rejectPod`` in pkg/kubelet/kubelet.go)."""
     ports = reason == "NodePorts" or PORTS_TAKEN in message
-    return Stuck.PORTS if ports else Stuck.SCHEDULING, _text(reason, message)
+    return PodFailure.PORTS if ports else PodFailure.SCHEDULING, _text(reason, message)
 
 
-def _unscheduled(reason: str, message: str) -> tuple[Stuck | None, str]:
+def _unscheduled(reason: str, message: str) -> tuple[PodFailure | None, str]:
     """The scheduler found no place: reason Unschedulable or SchedulingGated.
 
     After a SchedulerError, as when a pod of the same name has just been deleted, it tries again by
@@ -92,41 +92,43 @@ def _unscheduled(reason: str, message: str) -> tuple[Stuck | None, str]:
     """
     if reason in ("", "SchedulerError"):
         return None, ""
-    return Stuck.PORTS if PORTS_TAKEN in message else Stuck.SCHEDULING, _text(reason, message)
+    return PodFailure.PORTS if PORTS_TAKEN in message else PodFailure.SCHEDULING, _text(
+        reason, message
+    )
 
 
-def _waiting(container: Json) -> tuple[Stuck | None, str]:
+def _waiting(container: Json) -> tuple[PodFailure | None, str]:
     """What a container waits for. One that has ended for the second time waits as well.
 
     The kubelet calls that CrashLoopBackOff only when it looks at the pod again.
     """
-    ended, waiting = part(container, "state", "terminated"), part(container, "state", "waiting")
-    reason, message = word(waiting, "reason"), word(waiting, "message")
-    if number(ended, "exitCode") and number(container, "restartCount"):
+    ended, waiting = submap(container, "state", "terminated"), submap(container, "state", "waiting")
+    reason, message = text_at(waiting, "reason"), text_at(waiting, "message")
+    if int_at(ended, "exitCode") and int_at(container, "restartCount"):
         return _crashing(ended)
     if reason == "CrashLoopBackOff":
-        return _crashing(part(container, "lastState", "terminated"))
+        return _crashing(submap(container, "lastState", "terminated"))
     if reason in _IMAGE:
         bare = _REASON.sub("", _BACK_OFF.sub("", message), count=1)
-        return Stuck.IMAGE, _text("", bare) or reason
+        return PodFailure.IMAGE, _text("", bare) or reason
     if reason in _SANDBOX:
-        return Stuck.SANDBOX, _text(reason, message)
+        return PodFailure.SANDBOX, _text(reason, message)
     return None, ""
 
 
-def _crashing(ended: Json) -> tuple[Stuck, str]:
+def _crashing(ended: Json) -> tuple[PodFailure, str]:
     """How the container ended; the kubelet's own words count the seconds until it is started.
 
     Between two tries to start a container that never ran, the kubelet calls that a crash too.
     """
-    reason, message = word(ended, "reason"), word(ended, "message")
+    reason, message = text_at(ended, "reason"), text_at(ended, "message")
     if reason in _NOT_STARTED:
-        return Stuck.SANDBOX, _text("RunContainerError", message)
-    ending = f"exit code {number(ended, 'exitCode')}"
+        return PodFailure.SANDBOX, _text("RunContainerError", message)
+    ending = f"exit code {int_at(ended, 'exitCode')}"
     if reason not in ("", "Error", "Completed"):
         ending = f"{reason}, {ending}"
     lines = message.strip().splitlines() or [""]
-    return Stuck.CRASHING, _text(ending, _STAMP.sub("", lines[-1]))
+    return PodFailure.CRASHING, _text(ending, _STAMP.sub("", lines[-1]))
 
 
 def _text(reason: str, message: str) -> str:

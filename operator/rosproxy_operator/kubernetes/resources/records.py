@@ -28,7 +28,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
-from rosproxy_operator.kubernetes.resources.values import part, word, words
+from rosproxy_operator.kubernetes.resources.values import submap, text_at, texts_at
 
 PodRecord = Pod | ProxyPod | EarPod
 Record = (
@@ -45,12 +45,12 @@ POLICIES = "networkpolicies"
 
 def key_of(obj: Json) -> str:
     """What an object is known by: its uid, which no other has, before or after it."""
-    return word(part(obj, "metadata"), "uid")
+    return text_at(submap(obj, "metadata"), "uid")
 
 
 def pod_record(obj: Json) -> PodRecord:
     """A pod, as one of the operator's if it is one."""
-    if names.is_own(words(part(obj, "metadata"), "labels")):
+    if names.is_own(texts_at(submap(obj, "metadata"), "labels")):
         own_pod = objects.proxy_pod(obj) or objects.ear_pod(obj)
         if own_pod is not None:
             return own_pod

@@ -13,7 +13,7 @@ def versions(field: Field) -> tuple[str, ...]:
     value = "1" if field.value is None else field.value
     text = str(value).replace(" ", "") if type(value) in (int, str) else ""
     if text not in _VERSIONS:
-        raise field.refused("is unknown", "write 1, 2 or '1,2'")
+        raise field.error("is unknown", "write 1, 2 or '1,2'")
     return _VERSIONS[text]
 
 
@@ -23,13 +23,13 @@ def ros2_spec(field: Field, wanted: bool) -> Ros2Spec | None:
         for name in ("domain", "peers", "multicast"):
             if field[name].value not in (None, [], False):
                 fix = "leave it out, or set spec.ros: 2"
-                raise field[name].refused("is for ROS 2, which spec.ros leaves out", fix)
+                raise field[name].error("is for ROS 2, which spec.ros leaves out", fix)
         return None
     domain = field["domain"]
     return Ros2Spec(
         domain=None if domain.value is None else domain.number(0, 0, LAST_DOMAIN),
         peers=_peers(field["peers"]),
-        multicast=field["multicast"].truth(),
+        multicast=field["multicast"].boolean(),
     )
 
 
@@ -38,13 +38,13 @@ def check_ports(field: Field, ports: int, ros2: Ros2Spec | None) -> None:
     least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PER_DOMAIN
     if ros2 and ports < least:
         fix = f"ask for {least} at least: each participant takes three"
-        raise field.refused("are too few for ROS 2", fix)
+        raise field.error("are too few for ROS 2", fix)
 
 
 def _peers(field: Field) -> tuple[str, ...]:
-    listed = field.each()
+    listed = field.items()
     if len(listed) > MOST_PEERS:
-        raise field.refused("are too many", f"name {MOST_PEERS} hosts at most")
+        raise field.error("are too many", f"name {MOST_PEERS} hosts at most")
     return tuple(sorted({_peer(peer) for peer in listed}))
 
 
@@ -53,4 +53,4 @@ def _peer(field: Field) -> str:
         return read_peer_name(field.text())
     except ValueError:
         fix = "write the robot's name or address, or HOST:PORT of another proxy"
-        raise field.refused("is no peer", fix) from None
+        raise field.error("is no peer", fix) from None

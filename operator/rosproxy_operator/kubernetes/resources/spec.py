@@ -16,7 +16,7 @@ from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_addr
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import DataPlane, Direction
 from rosproxy_operator.common.policy import too_much
-from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, bare
+from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, stripped
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
@@ -32,16 +32,16 @@ from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, se
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.kubernetes.resources.ros2_spec import check_ports, ros2_spec, versions
 from rosproxy_operator.kubernetes.resources.values import (
+    int_at,
     is_label,
     is_label_key,
     is_label_value,
     is_subdomain,
-    number,
-    part,
-    parts,
     port_range,
-    word,
-    words,
+    submap,
+    submaps,
+    text_at,
+    texts_at,
 )
 
 MOST_PORTS = 500
@@ -89,7 +89,7 @@ def rosproxies(
     usable: dict[Name, RosProxy] = {}
     unusable: dict[Name, InvalidRosProxy] = {}
     for obj in objs:
-        id = name_of(part(obj, "metadata"))
+        id = name_of(submap(obj, "metadata"))
         try:
             usable[id] = rosproxy(obj)
         except InvalidField as error:
@@ -99,29 +99,29 @@ def rosproxies(
 
 def rosproxy(obj: Json) -> RosProxy:
     """A RosProxy. Raises InvalidField."""
-    meta, status = part(obj, "metadata"), part(obj, "status")
-    id, service = name_of(meta), parse_slave_uri(word(status, "masterURI"))
-    address = service.host if service else word(status, "staticPeers")
+    meta, status = submap(obj, "metadata"), submap(obj, "status")
+    id, service = name_of(meta), parse_slave_uri(text_at(status, "masterURI"))
+    address = service.host if service else text_at(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME:
         fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
-        raise Field("metadata.name", id.name).refused("does not fit", fix)
+        raise Field("metadata.name", id.name).error("does not fit", fix)
     return RosProxy(
         id=id,
-        uid=word(meta, "uid"),
-        generation=number(meta, "generation"),
-        spec=_spec(Field("spec", bare(obj.get("spec"))), id),
-        former=_former(status),
+        uid=text_at(meta, "uid"),
+        generation=int_at(meta, "generation"),
+        spec=_spec(Field("spec", stripped(obj.get("spec"))), id),
+        former_ranges=_former(status),
         cluster_ip=address if is_address(address) else "",
         status=status,
         deleting=is_deleted(meta),
-        remakes=words(meta, "annotations").get(REMAKE) == "true",
+        remakes=texts_at(meta, "annotations").get(REMAKE) == "true",
     )
 
 
 def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
     """What is left of a RosProxy that can't be read. Never raises."""
-    meta, status = part(obj, "metadata"), part(obj, "status")
-    uid, generation = word(meta, "uid"), number(meta, "generation")
+    meta, status = submap(obj, "metadata"), submap(obj, "status")
+    uid, generation = text_at(meta, "uid"), int_at(meta, "generation")
     return InvalidRosProxy(name_of(meta), uid, generation, str(error), status)
 
 
@@ -129,7 +129,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
     ports, for_ros = field["ports"].number(32, 1, MOST_PORTS), versions(field["ros"])
     for name in ("master", "udp"):
         if "1" not in for_ros and field[name].value not in (None, False):
-            raise field[name].refused("is for ROS 1, which spec.ros leaves out", "leave it out")
+            raise field[name].error("is for ROS 1, which spec.ros leaves out", "leave it out")
     ros2 = ros2_spec(field, "2" in for_ros)
     check_ports(field["ports"], ports, ros2)
     return RosProxySpec(
@@ -140,7 +140,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         window=_window(field["portWindow"], ports),
         pod_selector=_selector(field["podSelector"]),
         node_selector=field["nodeSelector"].texts(),
-        tolerations=tuple(toleration.map() for toleration in field["tolerations"].each()),
+        tolerations=tuple(toleration.map() for toleration in field["tolerations"].items()),
         advertise=field["advertise"].one_of(_ADVERTISE, Advertise.INTERNAL_IP.value),
         cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY),
         grace=field["graceSeconds"].number(60.0, 0, _DAY),
@@ -152,9 +152,9 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         udp=_udp(field),
         image=field["image"].text(),
         image_pull_policy=field["imagePullPolicy"].one_of(_PULL_POLICY, ""),
-        image_pull_secrets=tuple(secret.map() for secret in field["imagePullSecrets"].each()),
+        image_pull_secrets=tuple(secret.map() for secret in field["imagePullSecrets"].items()),
         resources=field["resources"].map(RESOURCES),
-        host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].each()),
+        host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].items()),
     )
 
 
@@ -162,22 +162,22 @@ def _pod_egress(field: Field) -> PodEgress:
     egress, direction = field["podEgress"].one_of(_POD_EGRESS, "Any"), field["direction"]
     if egress == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
         fix = "the pods would hear nobody outside: choose spec.direction: Both, too"
-        raise field["podEgress"].refused("does not go with spec.direction: Out", fix)
+        raise field["podEgress"].error("does not go with spec.direction: Out", fix)
     return egress
 
 
 def _udp(field: Field) -> bool:
-    udp = field["udp"].truth()
+    udp = field["udp"].boolean()
     if udp and field["direction"].one_of(_DIRECTION, "Out") == "out":
         fix = "datagrams get in with both directions alone: choose spec.direction: Both, too"
-        raise field["udp"].refused("does not go with spec.direction: Out", fix)
+        raise field["udp"].error("does not go with spec.direction: Out", fix)
     return udp
 
 
 def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
     """The layer of its policy; none if it has no rules."""
     mode = field["mode"].one_of(_POLICY_MODE, "Enforce")
-    rules = tuple(rule for r in field["rules"].each() for rule in _rules(r))
+    rules = tuple(rule for r in field["rules"].items() for rule in _rules(r))
     layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
     if problem := too_much(layers):
         raise InvalidField(f"{field['rules'].path}: {problem}: join names or nodes by globs")
@@ -188,10 +188,10 @@ def _rules(field: Field) -> Iterator[Rule]:
     """A rule for each listed name with each listed node."""
     action = field["action"].one_of(_ACTION, "")
     kind = field["kind"].one_of(RULE_KINDS, "")
-    names = [_glob(name, kind is not RuleKind.SLAVE) for name in field["names"].each()]
-    nodes = [_glob(node, True) for node in field["nodes"].each()]
+    names = [_glob(name, kind is not RuleKind.SLAVE) for name in field["names"].items()]
+    nodes = [_glob(node, True) for node in field["nodes"].items()]
     if not names:
-        raise field["names"].refused("is empty", "name what the rule is about, or write ['*']")
+        raise field["names"].error("is empty", "name what the rule is about, or write ['*']")
     for name in names:
         yield from (Rule(action, kind, name, node) for node in nodes or ["*"])
 
@@ -202,7 +202,7 @@ def _glob(field: Field, ros_name: bool) -> str:
     if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
         begins = ", and begins with / or *" if ros_name else ""
         fix = f"it has 1 to 256 characters without blanks and ;{begins}"
-        raise field.refused("is no glob of names", fix)
+        raise field.error("is no glob of names", fix)
     return glob
 
 
@@ -224,11 +224,11 @@ def _host_alias(field: Field) -> Json:
     ip, names = field["ip"].text(), []
     if not is_address(ip) or "%" in ip:
         fix = "write the host's address, e.g. 192.0.2.7"
-        raise field["ip"].refused("is not an IP address", fix)
-    for hostname in field["hostnames"].each():
+        raise field["ip"].error("is not an IP address", fix)
+    for hostname in field["hostnames"].items():
         names.append(hostname.text().lower())
         if not is_subdomain(names[-1]):
-            raise hostname.refused("is not a host name", "it has letters, digits, - and dots only")
+            raise hostname.error("is not a host name", "it has letters, digits, - and dots only")
     return {"ip": ip, "hostnames": names}
 
 
@@ -243,29 +243,29 @@ def _selector(field: Field) -> Selector | None:
     for key in labels:
         _check_key(field["matchLabels"], key)
         _check_value(field["matchLabels"][key])
-    expressions = field["matchExpressions"].each()
+    expressions = field["matchExpressions"].items()
     return Selector(labels=labels, expressions=tuple(_expression(e) for e in expressions))
 
 
 def _expression(field: Field) -> tuple[str, str, frozenset[str]]:
     key, operator = field["key"].text(), field["operator"].one_of(_OPERATORS, "")
     _check_key(field["key"], key)
-    values = [_check_value(value) for value in field["values"].each()]
+    values = [_check_value(value) for value in field["values"].items()]
     if bool(values) != (operator in ("In", "NotIn")):
         problem = f"{'is not' if values else 'is'} empty, but the operator is {operator}"
         fix = "leave the values out" if values else "name at least one value"
-        raise field["values"].refused(problem, fix)
+        raise field["values"].error(problem, fix)
     return key, operator, frozenset(values)
 
 
 def _check_key(field: Field, key: str) -> None:
     if not is_label_key(key):
-        raise Field(field.path, key).refused("is no label's key", _AS_LABEL)
+        raise Field(field.path, key).error("is no label's key", _AS_LABEL)
 
 
 def _check_value(field: Field) -> str:
     if not is_label_value(field.text()):
-        raise field.refused("is no label's value", _AS_LABEL)
+        raise field.error("is no label's value", _AS_LABEL)
     return field.text()
 
 
@@ -294,16 +294,16 @@ def _uri(field: Field, of: Name) -> str:
     master = parse_slave_uri(text) or parse_slave_uri(_with_port(text))
     path = urlsplit(text).path.rstrip("/") if master else ""
     if master is None or not master.host.isascii() or not _PATH.fullmatch(path):
-        raise field.refused("is not a master's URI", f"write it like {_EXAMPLE}")
+        raise field.error("is not a master's URI", f"write it like {_EXAMPLE}")
     host = master.host.lower()
     if is_loopback(host):
-        raise field.refused(
+        raise field.error(
             "would be the proxy's own pod, where no master runs",
             "give the master's host as the nodes of the cluster reach it, or, for a master in the "
             "cluster, service instead",
         )
     if _is_service(host, service_id(of)):
-        raise field.refused(_OWN_SERVICE, f"give the real master, as {_EXAMPLE}")
+        raise field.error(_OWN_SERVICE, f"give the real master, as {_EXAMPLE}")
     return slave_uri(HostPort(host, master.port), path)
 
 
@@ -330,11 +330,11 @@ def _service(field: Field, of: Name) -> Name:
     name, namespace = field["name"], field["namespace"]
     service = Name(namespace.text() or of.namespace, name.text())
     if not is_label(service.name):
-        raise name.refused("is not a Service's name", "write it as kubectl get service shows it")
+        raise name.error("is not a Service's name", "write it as kubectl get service shows it")
     if not is_label(service.namespace):
-        raise namespace.refused("is not a namespace's name", "leave it out or mend it")
+        raise namespace.error("is not a namespace's name", "leave it out or mend it")
     if service == service_id(of):
-        raise name.refused(_OWN_SERVICE, "name that of the real master")
+        raise name.error(_OWN_SERVICE, "name that of the real master")
     return service
 
 
@@ -342,11 +342,13 @@ def _address(field: Field) -> str:
     address = parse_address(field.text())
     if field.value is not None and (address is None or is_loopback(address)):
         fix = "give that of the master's host, e.g. 192.0.2.7"
-        raise field.refused("is not an IP address", fix)
+        raise field.error("is not an IP address", fix)
     return address or ""
 
 
 def _former(status: Json) -> dict[str, PortRange]:
     """The ranges in a status. What can't be read there is no range that was ever given."""
-    ranges = {word(line, "name"): port_range(line, "ports") for line in parts(status, "perNode")}
+    ranges = {
+        text_at(line, "name"): port_range(line, "ports") for line in submaps(status, "perNode")
+    }
     return {name: ports for name, ports in ranges.items() if ports is not None}

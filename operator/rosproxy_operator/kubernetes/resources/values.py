@@ -49,7 +49,7 @@ def is_label_value(text: str) -> bool:
     return not text or _QUALIFIED.fullmatch(text) is not None
 
 
-def part(obj: Json, *keys: str) -> Json:
+def submap(obj: Json, *keys: str) -> Json:
     """The map that is found down some keys, empty if there is none."""
     for key in keys:
         child = obj.get(key)
@@ -57,19 +57,19 @@ def part(obj: Json, *keys: str) -> Json:
     return obj
 
 
-def parts(obj: Json, key: str) -> list[Json]:
+def submaps(obj: Json, key: str) -> list[Json]:
     """The maps in the list under a key, none if there is no list."""
     array = obj.get(key)
     return [child for child in array if isinstance(child, dict)] if isinstance(array, list) else []
 
 
-def word(obj: Json, key: str) -> str:
+def text_at(obj: Json, key: str) -> str:
     """The text under a key, empty if there is none."""
     text = obj.get(key)
     return text if isinstance(text, str) else ""
 
 
-def number(obj: Json, key: str) -> int:
+def int_at(obj: Json, key: str) -> int:
     """The integer under a key, 0 if there is none."""
     value = obj.get(key)
     return value if type(value) is int else 0
@@ -78,11 +78,11 @@ def number(obj: Json, key: str) -> int:
 def port_range(obj: Json, key: str) -> PortRange | None:
     """The range of ports that is written under a key, None if there is none."""
     try:
-        return parse_range(key, word(obj, key))
+        return parse_range(key, text_at(obj, key))
     except SettingError:
         return None
 
 
-def words(obj: Json, *keys: str) -> dict[str, str]:
+def texts_at(obj: Json, *keys: str) -> dict[str, str]:
     """The texts of a map, by their keys."""
-    return {key: value for key, value in part(obj, *keys).items() if isinstance(value, str)}
+    return {key: value for key, value in submap(obj, *keys).items() if isinstance(value, str)}

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from rosproxy.admin.findings import DoctorFinding, error, ok, warning
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import INJECT
-from rosproxy_operator.kubernetes.resources.values import number, parts, word
+from rosproxy_operator.kubernetes.resources.values import int_at, submaps, text_at
 
 _WRONG = {
     "MasterReachable": "False",
@@ -28,8 +28,8 @@ def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
 def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
     metadata, status = rosproxy["metadata"], rosproxy.get("status", {})
     subject = f"rosproxy {metadata['namespace']}/{metadata['name']}"
-    conditions = {word(c, "type"): c for c in parts(status, "conditions")}
-    if number(status, "observedGeneration") < metadata.get("generation", 0):
+    conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}
+    if int_at(status, "observedGeneration") < metadata.get("generation", 0):
         text = "the operator has not seen it as it is now"
         fix = (
             "does the operator run? kubectl get pods -A -l app.kubernetes.io/name=rosproxy-operator"
@@ -38,15 +38,15 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
     messages: set[str] = set()
     for kind, bad in _WRONG.items():
         condition = conditions.get(kind, {})
-        message = word(condition, "message")
-        if word(condition, "status") == bad and message not in messages:
+        message = text_at(condition, "message")
+        if text_at(condition, "status") == bad and message not in messages:
             messages.add(message)
             fix = f"kubectl -n {metadata['namespace']} describe rosproxy {metadata['name']}"
             yield error("rosproxy", subject, f"{kind} is {bad}: {message}", fix)
     if messages:
         return
-    if number(status, "nodes"):
-        text = f"proxies {word(status, 'proxies')} ready, {number(status, 'rosNodes')} ROS nodes"
+    if int_at(status, "nodes"):
+        text = f"proxies {text_at(status, 'proxies')} ready, {int_at(status, 'rosNodes')} ROS nodes"
         yield ok("rosproxy", subject, text)
     else:
         text = "it selects no pod that runs"

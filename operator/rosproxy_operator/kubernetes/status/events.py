@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
 from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, NODE, PORT_RANGE
-from rosproxy_operator.kubernetes.resources.values import number, word
+from rosproxy_operator.kubernetes.resources.values import int_at, text_at
 
 QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""
@@ -130,16 +130,16 @@ def event_body(event: Emit, now: float) -> Json:
     }
 
 
-def counted(event: Json, now: float) -> list[Json]:
+def count_patch(event: Json, now: float) -> list[Json]:
     """The JSON patch that counts an Event once more; empty if it was counted a moment ago."""
     try:
-        last = datetime.fromisoformat(word(event, "lastTimestamp")).timestamp()
+        last = datetime.fromisoformat(text_at(event, "lastTimestamp")).timestamp()
     except (ValueError, OverflowError):
         last = now - COUNT_EVERY
     if now - last < COUNT_EVERY:
         return []
     return [
-        {"op": "add", "path": "/count", "value": (number(event, "count") or 1) + 1},
+        {"op": "add", "path": "/count", "value": (int_at(event, "count") or 1) + 1},
         {"op": "add", "path": "/lastTimestamp", "value": stamp(now)},
     ]
 

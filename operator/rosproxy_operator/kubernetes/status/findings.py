@@ -7,7 +7,12 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.kubernetes.resources.cluster import EarPod, NodeState, ProxyPod, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import (
+    EarPod,
+    PodFailure,
+    ProxyPod,
+    RosProxyOnNode,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
@@ -31,7 +36,7 @@ _ENFORCE = "pod-security.kubernetes.io/enforce"
 
 
 def findings(
-    rosproxy: RosProxy, states: Iterable[NodeState], failures: Mapping[Name, str]
+    rosproxy: RosProxy, states: Iterable[RosProxyOnNode], failures: Mapping[Name, str]
 ) -> tuple[ClusterFinding, ...]:
     """What is wrong with a RosProxy's nodes and proxies, and with what was to be carried out.
 
@@ -40,11 +45,11 @@ def findings(
     """
     problems = [_refused(rosproxy, id, text) for id, text in failures.items()]
     for state in sorted(states, key=lambda s: s.name):
-        problems.extend(of_node(rosproxy, state))
+        problems.extend(node_findings(rosproxy, state))
     return tuple(dict.fromkeys(problems))
 
 
-def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
+def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[ClusterFinding]:
     """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
     if state.obstacle is not None:
         yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
@@ -80,24 +85,24 @@ def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> Cluste
 
 
 def _subject(proxy: ProxyPod) -> str:
-    return f"proxy {proxy.pod.id.name} on node {proxy.on}"
+    return f"proxy {proxy.pod.id.name} on node {proxy.node}"
 
 
-def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: Stuck) -> ClusterFinding:
+def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFinding:
     id, error = proxy.pod.id, proxy.message
     command = f"kubectl -n {id.namespace} describe pod {id.name}"
     texts = {
-        Stuck.PORTS: f"ports {proxy.range} are not all free there ({error}); others are tried: to "
-        "keep them clear, leave ports that others take out of spec.portWindow",
-        Stuck.SCHEDULING: f"it is not admitted ({error}): make room on the node, or set "
+        PodFailure.PORTS: f"ports {proxy.range} are not all free there ({error}); others are "
+        "tried: to keep them clear, leave ports that others take out of spec.portWindow",
+        PodFailure.SCHEDULING: f"it is not admitted ({error}): make room on the node, or set "
         f"spec.tolerations or spec.resources; {command}",
-        Stuck.IMAGE: f"the node can't get the image {proxy.image} ({error}): load it there, or set "
-        "spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
-        Stuck.CRASHING: f"it ends again and again ({error}): "
+        PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}): load it there, "
+        "or set spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
+        PodFailure.CRASHING: f"it ends again and again ({error}): "
         f"kubectl -n {id.namespace} logs --previous {id.name}",
-        Stuck.SANDBOX: f"the node can't start it ({error}): {command}",
+        PodFailure.SANDBOX: f"the node can't start it ({error}): {command}",
     }
-    reason = CONFLICT if cause is Stuck.PORTS else STUCK
+    reason = CONFLICT if cause is PodFailure.PORTS else STUCK
     return _finding(rosproxy, _subject(proxy), texts[cause], reason)
 
 
@@ -107,11 +112,13 @@ def _deaf(rosproxy: RosProxy, ear: EarPod) -> ClusterFinding:
         f"it does not run ({ear.message}), so that the LAN is not heard: kubectl -n {id.namespace} "
         f"describe pod {id.name}"
     )
-    subject = f"ear {id.name} on node {ear.on}"
+    subject = f"ear {id.name} on node {ear.node}"
     return finding(rosproxy, "EarStuck", bounded(text, _LONGEST), subject=subject)
 
 
-def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator[ClusterFinding]:
+def _answered(
+    rosproxy: RosProxy, state: RosProxyOnNode, proxy: ProxyPod
+) -> Iterator[ClusterFinding]:
     """What follows from a proxy's answer. One that is not asked yet is not to blame."""
     answer, subject = state.answer, _subject(proxy)
     if answer is None:

@@ -10,9 +10,9 @@ from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
-    NodeState,
+    PodFailure,
     ProxyReport,
-    Stuck,
+    RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -21,12 +21,12 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import INJECT, master_uri
-from rosproxy_operator.kubernetes.resources.values import number, parts, word
+from rosproxy_operator.kubernetes.resources.values import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.status.findings import (
     CONFLICT,
     EXHAUSTED,
     NO_MASTER,
-    of_node,
+    node_findings,
 )
 
 READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
@@ -55,7 +55,7 @@ class Condition(msgspec.Struct, frozen=True):
 
 def status_of(
     rosproxy: RosProxy,
-    states: tuple[NodeState, ...],
+    states: tuple[RosProxyOnNode, ...],
     problems: tuple[ClusterFinding, ...],
     cluster_ip: str,
     master: str,
@@ -75,9 +75,9 @@ def status_of(
     shown = _shown_nodes(states)
     names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
     lines = [_line(rosproxy, state, names) for state in shown]
-    nodes = sum(number(line, "rosNodes") for line in lines)
+    nodes = sum(int_at(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
-    spec, members = rosproxy.spec, sum(number(line, "participants") for line in lines)
+    spec, members = rosproxy.spec, sum(int_at(line, "participants") for line in lines)
     served = [plural(nodes, "ROS node")] if spec.ros1 else []
     if spec.ros2:
         served.append(f"{plural(members, 'participant')} of domain {spec.ros2.number}")
@@ -119,7 +119,7 @@ def _addressed(rosproxy: RosProxy, cluster_ip: str, master: str) -> dict[str, ob
     """
     fields: dict[str, object] = {}
     if rosproxy.spec.ros1:
-        uri = master_uri(cluster_ip) if cluster_ip else word(rosproxy.status, "masterURI")
+        uri = master_uri(cluster_ip) if cluster_ip else text_at(rosproxy.status, "masterURI")
         fields = {"master": master, "masterURI": uri}
     if rosproxy.spec.ros2:
         fields["staticPeers"] = cluster_ip or rosproxy.cluster_ip
@@ -132,7 +132,7 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     What it has goes on as it is, so that the other conditions stay.
     """
     former, text = rosproxy.status, rosproxy.text
-    conditions = [_read(condition) for condition in parts(former, "conditions")]
+    conditions = [_read(condition) for condition in submaps(former, "conditions")]
     judged = [
         Condition(READY, "False", rosproxy.reason, text),
         *(c for c in conditions if c.type not in (READY, DEGRADED)),
@@ -145,14 +145,14 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     }
 
 
-def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
+def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
     """The nodes to be told, by name; those without pods are the first to be left out."""
     ranked = sorted(states, key=lambda state: (not state.pods, state.proxy is None, state.name))
     return sorted(ranked[:MOST_NODES], key=lambda state: state.name)
 
 
-def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]:
-    proxy, problem = state.proxy, next(of_node(rosproxy, state), None)
+def _line(rosproxy: RosProxy, state: RosProxyOnNode, names: int) -> dict[str, object]:
+    proxy, problem = state.proxy, next(node_findings(rosproxy, state), None)
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,
@@ -166,7 +166,7 @@ def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]
     return {key: value for key, value in line.items() if value != ""}
 
 
-def _ros(state: NodeState, limit: int, former: Json) -> dict[str, object]:
+def _ros(state: RosProxyOnNode, limit: int, former: Json) -> dict[str, object]:
     """What a proxy tells of its ROS nodes, now or when it was asked last."""
     if _has_answered(state.answer):
         names = sorted({name for group in state.answer.nodes.values() for name in group})
@@ -175,13 +175,13 @@ def _ros(state: NodeState, limit: int, former: Json) -> dict[str, object]:
         members = {"participants": sum(map(len, by_address.values()))} if by_address else {}
         count = len(state.answer.topics)
         return {"rosNodes": len(names), "names": shown, "topics": count, **members}
-    lines = parts(former, "perNode") if state.proxy is not None else ()
+    lines = submaps(former, "perNode") if state.proxy is not None else ()
     last = next((line for line in lines if line.get("name") == state.name), {})
     return {
-        "rosNodes": number(last, "rosNodes"),
+        "rosNodes": int_at(last, "rosNodes"),
         "names": list(last.get("names") or ()),
-        "topics": number(last, "topics"),
-        **({"participants": number(last, "participants")} if "participants" in last else {}),
+        "topics": int_at(last, "topics"),
+        **({"participants": int_at(last, "participants")} if "participants" in last else {}),
     }
 
 
@@ -189,13 +189,13 @@ def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
     return answer is not None and answer.answered
 
 
-def _topics(states: Sequence[NodeState], former: Json) -> int:
+def _topics(states: Sequence[RosProxyOnNode], former: Json) -> int:
     answers = [state.answer for state in states if state.proxy is not None]
     count = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
-    return count if all(map(_has_answered, answers)) else max(count, number(former, "topics"))
+    return count if all(map(_has_answered, answers)) else max(count, int_at(former, "topics"))
 
 
-def _ports(states: Sequence[NodeState]) -> str:
+def _ports(states: Sequence[RosProxyOnNode]) -> str:
     """The one range of all nodes that need one, or each node's."""
     ranges = {s.name: str(s.range) for s in states if s.range and (s.pods or s.proxy)}
     if len(set(ranges.values())) <= 1:
@@ -203,7 +203,7 @@ def _ports(states: Sequence[NodeState]) -> str:
     return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(ranges.items())), _PORTS)
 
 
-def _serving(state: NodeState) -> bool:
+def _serving(state: RosProxyOnNode) -> bool:
     """Whether a node's proxy has its ports and works.
 
     One that has not been asked since the operator started counts if the kubelet finds it ready.
@@ -223,8 +223,10 @@ def _conditions(
     is ``stamp``, in RFC 3339.
     """
     since = {
-        (word(condition, "type"), word(condition, "status")): word(condition, "lastTransitionTime")
-        for condition in parts(former, "conditions")
+        (text_at(condition, "type"), text_at(condition, "status")): text_at(
+            condition, "lastTransitionTime"
+        )
+        for condition in submaps(former, "conditions")
     }
     return [
         {
@@ -240,7 +242,7 @@ def _conditions(
 
 
 def _read(condition: Json) -> Condition:
-    return Condition(*(word(condition, key) for key in ("type", "status", "reason", "message")))
+    return Condition(*(text_at(condition, key) for key in ("type", "status", "reason", "message")))
 
 
 def _one_line(problem: ClusterFinding) -> str:
@@ -248,7 +250,10 @@ def _one_line(problem: ClusterFinding) -> str:
 
 
 def _ready(
-    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[ClusterFinding], served: str
+    rosproxy: RosProxy,
+    wanted: Sequence[RosProxyOnNode],
+    problems: Sequence[ClusterFinding],
+    served: str,
 ) -> Condition:
     if not wanted:
         fix = "give pods the labels that spec.podSelector asks for"
@@ -274,11 +279,11 @@ def _of_pod(problem: ClusterFinding) -> bool:
     return problem.about is not None and problem.about.kind == "Pod"
 
 
-def _allocated(wanted: Sequence[NodeState], problems: Sequence[ClusterFinding]) -> Condition:
+def _allocated(wanted: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding]) -> Condition:
     if not wanted:
         return Condition(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
     lacking = [state for state in wanted if state.range is None]
-    refused = [s for s in wanted if s.proxy is not None and s.proxy.stuck is Stuck.PORTS]
+    refused = [s for s in wanted if s.proxy is not None and s.proxy.stuck is PodFailure.PORTS]
     if not lacking and not refused:
         return Condition(PORTS, "True", "Allocated", "every node with selected pods has its ports")
     reason = CONFLICT if refused else EXHAUSTED
@@ -288,7 +293,7 @@ def _allocated(wanted: Sequence[NodeState], problems: Sequence[ClusterFinding]) 
 
 
 def _reached(
-    states: Sequence[NodeState], problems: Sequence[ClusterFinding], former: Json
+    states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
 ) -> Condition:
     """Proxies that are not asked yet say nothing: for them the former condition stays."""
     proxies = [state for state in states if state.proxy is not None]
@@ -300,7 +305,7 @@ def _reached(
         return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
     if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
-    previous = (c for c in parts(former, "conditions") if c.get("type") == MASTER)
+    previous = (c for c in submaps(former, "conditions") if c.get("type") == MASTER)
     unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
     return next(map(_read, previous), unknown)
 

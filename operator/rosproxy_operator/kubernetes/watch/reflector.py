@@ -20,17 +20,17 @@ from typing import Protocol
 
 from rosproxy_operator.kubernetes.api.client import (
     Api,
-    ApiAway,
     ApiError,
     ApiExpired,
     ApiLost,
+    ApiUnavailable,
     Event,
     Watch,
 )
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import GROUP, PLURAL
 from rosproxy_operator.kubernetes.resources.records import READERS, Record, key_of
-from rosproxy_operator.kubernetes.resources.values import part, word
+from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class Reflector:
         if self._watch is not None:
             self._watch.stop()
 
-    def doubt(self) -> None:
+    def relist(self) -> None:
         """List everything anew soon: the watched state is wrong."""
         if time.monotonic() - self._listed_at > DOUBTED:
             self._listed_at = -CHECKED
@@ -121,7 +121,7 @@ class Reflector:
             except Exception as error:  # a mistake of ours must not blind the operator
                 log.exception("watching %s failed; going on", self._kind)
                 self._version, failures = "", failures + 1
-                self._complain(ApiAway(f"watching {self._kind} failed: {error!r}"))
+                self._complain(ApiUnavailable(f"watching {self._kind} failed: {error!r}"))
                 self._pause(failures)
 
     def _complain(self, error: ApiError) -> None:
@@ -144,7 +144,7 @@ class Reflector:
                 record = self._read(obj)
                 if record is not None:
                     records[key_of(obj)] = record
-            token = page.more
+            token = page.continue_token
             if not token or self._ending.is_set():
                 break
         self._listed_at = time.monotonic()
@@ -193,19 +193,19 @@ class Reflector:
 
 def _version(events: Iterable[Event]) -> str:
     """The last resourceVersion among events, empty if there is none."""
-    versions = (word(part(event.object, "metadata"), "resourceVersion") for event in events)
+    versions = (text_at(submap(event.object, "metadata"), "resourceVersion") for event in events)
     return ([version for version in versions if version] or [""])[-1]
 
 
 def _error(status: Json) -> ApiError:
     """The error with which a watch has ended."""
-    text = word(status, "message") or "a watch has ended"
+    text = text_at(status, "message") or "a watch has ended"
     return ApiExpired(text) if status.get("code") == 410 else ApiLost(text)
 
 
-def every_kind(api: Api) -> list[tuple[str, str]]:
+def watched_collections(api: Api) -> list[tuple[str, str]]:
     """The kinds to be followed, each with a namespace (empty for all); RosProxies first."""
-    return [(kind, place) for kind in READERS for place in api.places(kind)]
+    return [(kind, place) for kind in READERS for place in api.namespaces_of(kind)]
 
 
 def crd_missing(kind: str) -> str:

@@ -1,8 +1,8 @@
 """The cluster as its watches tell it: what a look sees, and what has changed since the last one.
 
 All of it lives in the event loop: reflectors write (`changed`, `listed`, `failed`), the controller
-reads (`snapshot`, `touched`). It may lag behind, and be wrong where a watch has lost something: a
-later look corrects the consequences, and nothing is deleted by it alone (`confirm`).
+reads (`snapshot`, `take_changes`). It may lag behind, and be wrong where a watch has lost
+something: a later look corrects the consequences, and nothing is deleted by it alone (`confirm`).
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
-from rosproxy_operator.kubernetes.api.client import ApiAway, ApiError, ApiGone
+from rosproxy_operator.kubernetes.api.client import ApiError, ApiNotFound, ApiUnavailable
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
@@ -45,7 +45,7 @@ Collection = tuple[str, str]
 
 
 @dataclass(slots=True)
-class Touched:
+class StoreChanges:
     """What has changed: something of these namespaces, or on these nodes."""
 
     namespaces: set[str] = field(default_factory=set)
@@ -77,7 +77,7 @@ class ClusterStore:
         self._ears: dict[str, dict[str, EarPod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
-        self._touched = Touched()
+        self._touched = StoreChanges()
 
     # what reflectors call
 
@@ -104,8 +104,8 @@ class ClusterStore:
 
     def failed(self, kind: str, place: str, error: ApiError) -> None:
         """A kind can't be listed or watched for now."""
-        if isinstance(error, ApiGone) and (text := crd_missing(kind)):
-            error = ApiGone(text)
+        if isinstance(error, ApiNotFound) and (text := crd_missing(kind)):
+            error = ApiNotFound(text)
         fresh = (kind, place) not in self._errors
         self._errors[kind, place] = error
         self._note_heard((kind, place))
@@ -126,12 +126,12 @@ class ClusterStore:
         """
         await self._all_heard.wait()
         for (kind, _), error in sorted(self._errors.items(), key=lambda pair: pair[0][0] != PLURAL):
-            if kind != POLICIES or isinstance(error, ApiAway):
+            if kind != POLICIES or isinstance(error, ApiUnavailable):
                 raise error
 
-    def touched(self) -> Touched:
+    def take_changes(self) -> StoreChanges:
         """What has changed since the last call."""
-        touched, self._touched = self._touched, Touched()
+        touched, self._touched = self._touched, StoreChanges()
         return touched
 
     def snapshot(self, key: bytes = b"") -> ClusterSnapshot:
@@ -146,7 +146,7 @@ class ClusterStore:
             masters={id: read_master(s, id, ports) for id, (s, ports) in masters.items()},
             consents={id: s.allowed if s else frozenset() for id, (s, _) in masters.items()},
             policies={policy.id: policy for policy in self._records_of(POLICIES, ProxyPolicy)},
-            no_policies=next((str(error) for error in self._errors_of(POLICIES)), ""),
+            policies_error=next((str(error) for error in self._errors_of(POLICIES)), ""),
             key=key,
         )
         return self._with_pods(snapshot)
@@ -158,7 +158,7 @@ class ClusterStore:
         namespaces |= {id.namespace for id in snapshot.unusable}
         candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
         selected, own = [p for p in candidates if self._is_selected(p)], own_pods(proxies, ears)
-        nodes = {p.node for p in selected} | {node for p in own for node in (p.on, p.pod.node)}
+        nodes = {p.node for p in selected} | {node for p in own for node in (p.node, p.pod.node)}
         pods = {p.uid: p for p in candidates if p.node in nodes}
         pods |= {pod.uid: pod for pod in selected}
         for node in nodes & self._pods_with_ports.keys():
@@ -255,7 +255,7 @@ class ClusterStore:
             case _:
                 self._touched.namespaces.add(record.of.namespace)
                 if counterpart is None and isinstance(record, ProxyPod | EarPod):
-                    self._touched.nodes.add(record.on)  # others may wait for its ports
+                    self._touched.nodes.add(record.node)  # others may wait for its ports
         self._wake()
 
     def _touch_pod(self, pod: Pod) -> None:

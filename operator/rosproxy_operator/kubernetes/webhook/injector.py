@@ -16,10 +16,10 @@ from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import SOON, Api, ApiAway, ApiError, ApiGone
-from rosproxy_operator.kubernetes.planner.access.bounds import Consents, objection
+from rosproxy_operator.kubernetes.api.client import SOON, Api, ApiError, ApiNotFound, ApiUnavailable
+from rosproxy_operator.kubernetes.planner.access.bounds import Consents, bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.injection import Wiring, target_of, wire
-from rosproxy_operator.kubernetes.planner.pods.selection import chosen, nobody
+from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
@@ -91,7 +91,7 @@ class Injector:
             try:
                 async with asyncio.timeout(deadline - time.monotonic()):
                     return await in_thread(self._wiring, body, dry_run)
-            except ApiAway as error:
+            except ApiUnavailable as error:
                 log.debug("a pod at admission: %s; trying again", error)
             except NoService as error:
                 if dry_run:
@@ -106,13 +106,13 @@ class Injector:
         pod = objects.pod(body)
         readable, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
         usable = [r for r in readable.values() if not r.deleting]
-        rosproxy = chosen(pod, usable)
+        rosproxy = select_rosproxy(pod, usable)
         if isinstance(rosproxy, RosProxy):
             address, hold = self._address(rosproxy, dry_run)
             return wire(body, target_of(rosproxy, address), rosproxy.spec.host_aliases), hold
         if rosproxy is not None:
             return Wiring(warnings=(NOT_WIRED + rosproxy.text,)), 0.0
-        text = nobody(pod, usable)
+        text = why_not_selected(pod, usable)
         reasons = [f"RosProxy {r.id.name}: {r.text}" for r in unusable.values()]
         return Wiring(warnings=("; ".join([NOT_WIRED + text, *reasons]),) if text else ()), 0.0
 
@@ -124,7 +124,7 @@ class Injector:
         id = service_id(rosproxy.id)
         try:
             manifest = self._api.get("services", id, SOON)
-        except ApiGone:
+        except ApiNotFound:
             if dry_run and rosproxy.cluster_ip:
                 return rosproxy.cluster_ip, 0.0
             raise self._missing(rosproxy) from None
@@ -143,7 +143,7 @@ class Injector:
 
         Pods wait for the latter alone (NoService).
         """
-        if refused := objection(rosproxy, self._consents(rosproxy), self._settings):
+        if refused := bounds_violation(rosproxy, self._consents(rosproxy), self._settings):
             return NotWired(f"RosProxy {rosproxy.id.name}: {refused}; create the pod anew then")
         id = service_id(rosproxy.id)
         return NoService(
@@ -158,5 +158,5 @@ class Injector:
             return {}
         try:
             return {service: objects.allowed_from(self._api.get("services", service, SOON))}
-        except ApiGone:
+        except ApiNotFound:
             return {}

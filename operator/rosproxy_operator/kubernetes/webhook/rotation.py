@@ -13,15 +13,15 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.client import (
     WEBHOOKS,
     Api,
-    ApiAway,
     ApiConflict,
     ApiError,
-    ApiGone,
     ApiInvalid,
+    ApiNotFound,
+    ApiUnavailable,
     NotLeading,
 )
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import part, parts, words
+from rosproxy_operator.kubernetes.resources.values import submap, submaps, texts_at
 from rosproxy_operator.kubernetes.settings import WebhookSettings
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
@@ -116,9 +116,9 @@ class SelfSigned:
         try:
             manifest = self._api.get("secrets", self._secret) if self._secret else None
         except ApiError as error:
-            if self._pair is None and isinstance(error, ApiAway):
+            if self._pair is None and isinstance(error, ApiUnavailable):
                 raise
-            if not isinstance(error, ApiAway):  # which the operator's looks report
+            if not isinstance(error, ApiUnavailable):  # which the operator's looks report
                 self._complain(error)
         kept = self._pair if manifest is None else self._read(manifest)
         if kept and self._is_usable(kept):
@@ -155,7 +155,7 @@ class SelfSigned:
             self._api.fill_secret(secret, manifest, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
             self._unsaved = None
-            raise ApiAway(f"somebody else writes {secret}: {error}") from None
+            raise ApiUnavailable(f"somebody else writes {secret}: {error}") from None
         except NotLeading:
             raise
         except ApiError as error:
@@ -164,12 +164,12 @@ class SelfSigned:
     def _complain(self, error: ApiError) -> None:
         """Report that the Secret can't be used: the certificate is then in this process alone."""
         text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
-        if isinstance(error, ApiGone):
+        if isinstance(error, ApiNotFound):
             text += "; create an empty Secret of this name (the chart does)"
         self.problems.append(Problem(_SUBJECT, text))
 
     def _read(self, secret: Json) -> KeyPair | None:
-        data = words(secret, "data")
+        data = texts_at(secret, "data")
         if not data.get(certificates.KEY):
             return None
         try:
@@ -192,9 +192,9 @@ class SelfSigned:
                 log.info("webhook: its CA is now in %s", self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
-            if isinstance(error, ApiGone):
+            if isinstance(error, ApiNotFound):
                 text += "; without it no pod is wired: install it anew (the chart has it)"
-            if not isinstance(error, ApiAway):
+            if not isinstance(error, ApiUnavailable):
                 self.problems.append(Problem(_SUBJECT, text))
             return False
         return True
@@ -204,8 +204,8 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
     """The JSON patch that makes a configuration's webhooks trust these CAs; empty if they do."""
     bundle = base64.b64encode(authorities).decode()
     operations: list[Json] = []
-    for index, webhook in enumerate(parts(configuration, "webhooks")):
-        if part(webhook, "clientConfig").get("caBundle") != bundle:
+    for index, webhook in enumerate(submaps(configuration, "webhooks")):
+        if submap(webhook, "clientConfig").get("caBundle") != bundle:
             path = f"/webhooks/{index}"
             operations += [
                 {"op": "test", "path": f"{path}/name", "value": webhook.get("name")},
@@ -255,7 +255,7 @@ class CertificateRotation:
         self._log.update(problems)
 
 
-def source(
+def certificate_source(
     api: Api, settings: WebhookSettings, leads: Callable[[], bool]
 ) -> CertificateDirectory | SelfSigned:
     """Where the certificate comes from, by the settings."""

@@ -108,12 +108,12 @@ def _namesakes(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[
 
 def _registered(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     for node in facts.nodes.values():
-        yield from (_leased if facts.ours(node.where) else _elsewhere)(facts, node)
+        yield from (_leased if facts.is_ours(node.slave) else _elsewhere)(facts, node)
 
 
 def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     """A node whose address is in this proxy's range."""
-    lease = facts.lease(node.where)
+    lease = facts.lease(node.slave)
     if lease is None and _is_of_another_proxy(facts, node):
         text = (
             f"lives, registered as {node.uri}, and this proxy knows no such node: another rosproxy "
@@ -136,11 +136,11 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
 def _is_of_another_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
     """Whether a node answers at a port of this proxy that no node here holds."""
     answered = node.attempt.reach is Reach.ANSWERED
-    return answered and facts.ours(node.where) and facts.lease(node.where) is None
+    return answered and facts.is_ours(node.slave) and facts.lease(node.slave) is None
 
 
 def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
-    slave, reach = node.where, node.attempt.reach
+    slave, reach = node.slave, node.attempt.reach
     if slave is None:
         text = f"the master gives no usable address for it: {node.uri!r}"
         yield error(OUTSIDE, node.name, text, "restart it")
@@ -217,7 +217,7 @@ def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """Services that are registered with a port of this proxy which nobody holds."""
     for service, uri in facts.service_uris.items():
         provider = parse_service_uri(uri)
-        if facts.ours(provider) and not facts.lease(provider):
+        if facts.is_ours(provider) and not facts.lease(provider):
             subject = next(iter(facts.system.services.get(service, ())), service)
             if subject in facts.nodes and _is_of_another_proxy(facts, facts.nodes[subject]):
                 continue
@@ -226,7 +226,7 @@ def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _clock(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    if facts.clock and facts.graph and not facts.graph.publishers.get("/clock"):
+    if facts.uses_simulated_time and facts.graph and not facts.graph.publishers.get("/clock"):
         text = "/use_sim_time is true and nobody publishes /clock: nodes wait for the time"
         fix = "rosparam set /use_sim_time false and restart them; or start what gives the clock"
         yield warning("time", "", text, fix)

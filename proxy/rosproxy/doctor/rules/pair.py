@@ -22,11 +22,11 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         return
     scope = facts.scope
     yield from (_unknown(facts, name) for name in scope.unknown)
-    yield from (_lonely(facts, topic) for topic in scope.lonely)
+    yield from (_lonely(facts, topic) for topic in scope.one_sided_topics)
     yield from (judge_pair(facts, *pair) for pair in scope.pairs)
     yield from (_service(facts, service) for service in scope.services)
     together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
-    if scope.named and len(together) > 1 and not scope.pairs:
+    if scope.named_nodes and len(together) > 1 and not scope.pairs:
         text = "none publishes what another of them subscribes to"
         fix = f"compare: rosnode info {' '.join(together)}; look for namespaces and remappings"
         yield error(PAIR, " and ".join(together), text, fix)
@@ -59,7 +59,7 @@ def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) 
     """Whether a publisher and a subscriber are connected, else why not."""
     publisher_node, subscriber_node = facts.nodes[publisher], facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
-    if connected(topic, publisher_node, subscriber_node):
+    if is_connected(topic, publisher_node, subscriber_node):
         return ok(
             PAIR, label, "connected" + _traffic(facts, topic, publisher_node, subscriber_node)
         )
@@ -67,7 +67,7 @@ def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) 
     return error(PAIR, label, f"not connected: {text}", fix)
 
 
-def connected(topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> bool:
+def is_connected(topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> bool:
     """Whether a publisher says that a subscriber is connected.
 
     The publisher knows best: a subscriber lists connections that it only tries to make. Where the
@@ -79,7 +79,7 @@ def connected(topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> bool:
 
 
 def _traffic(facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: NodeFacts) -> str:
-    lease = facts.lease(publisher.where)
+    lease = facts.lease(publisher.slave)
     for connection in lease.connections if lease else ():
         if (connection.name, connection.caller_id) == (topic, subscriber.name):
             sent, rate = size(connection.sent), size(connection.sent_rate)
@@ -109,10 +109,10 @@ def _why(
 
 
 def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
-    if facts.ours(node.where):
-        lease = facts.lease(node.where)
+    if facts.is_ours(node.slave):
+        lease = facts.lease(node.slave)
         return lease is None or lease.state not in ("ok", "new")
-    return node.attempt.failed or node.where is None
+    return node.attempt.failed or node.slave is None
 
 
 def _why_no_transport(
@@ -127,19 +127,19 @@ def _why_no_transport(
         )
         set_ip = f"where {publisher.name} runs: ROS_IP=ADDRESS and no firewall, then restart it"
         return f"{description} ({attempt.reason})" if attempt.reason else description, set_ip
-    elsewhere = not facts.ours(publisher.where) and not local_master(facts)
+    elsewhere = not facts.is_ours(publisher.slave) and not local_master(facts)
     if target and is_loopback(target.host) and elsewhere:
         text = f"{publisher.name} gives {address} as its data port, which is loopback"
         return text, f"where {publisher.name} runs: ROS_IP=ADDRESS, then restart it"
-    if facts.ours(publisher.where) and not facts.ours(subscriber.where) and publisher.where:
-        slave = publisher.where
+    if facts.is_ours(publisher.slave) and not facts.is_ours(subscriber.slave) and publisher.slave:
+        slave = publisher.slave
         return (
             f"{publisher.name} is behind the proxy and fine; "
             f"{subscriber.name} has not come to {slave}",
             f"on the machine of {subscriber.name}: "
             f"nc -vz {slave.host} {slave.port}; then {restart}",
         )
-    if facts.ours(subscriber.where) and not facts.ours(publisher.where):
+    if facts.is_ours(subscriber.slave) and not facts.is_ours(publisher.slave):
         return _why_not_from_inside(facts, address, publisher, subscriber)
     text = "both answer and their types fit; perhaps their message definitions differ (md5sum)"
     return text, f"look into the log of {subscriber.name}; {restart}"

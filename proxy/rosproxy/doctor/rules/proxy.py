@@ -49,7 +49,7 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if master is None:
         text = "not checked: no address is known"
         yield note("master", "master", text, "give --master-uri (ROS_MASTER_URI)")
-    elif master.looped:
+    elif master.is_this_proxy:
         text = f"{master.uri} leads back to this proxy itself"
         yield error("master", "master", text, _OTHER_URI)
     elif master.attempt.reach is not Reach.ANSWERED:
@@ -108,7 +108,7 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
         return  # others find this host by it, whatever it means here
     if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
-        all_here = facts.all_here or local_master(facts)
+        all_here = facts.is_all_local or local_master(facts)
         yield from advertised_host(host, facts.advertised_addresses, all_here)
 
 

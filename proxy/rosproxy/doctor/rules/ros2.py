@@ -6,7 +6,7 @@ is on the networks inside but not heard by the proxy, and which topics and servi
 
 from collections.abc import Iterator
 
-from rosproxy.admin.domain_problems import DomainProblem, domain_problems, named
+from rosproxy.admin.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.admin.findings import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
@@ -33,7 +33,9 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
     domains = facts.proxy.domains
     findings = [finding for domain in domains for finding in _domain(domain)]
     if facts.proxy.uptime >= SETTLED:
-        findings += [finding for heard in facts.heard for finding in _heard(heard, domains)]
+        findings += [
+            finding for heard in facts.heard_participants for finding in _heard(heard, domains)
+        ]
     findings += [
         warning("refused", problem.subject, problem.text, _REFUSED[problem.subject])
         for problem in facts.proxy.problems
@@ -118,7 +120,7 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
             yield ok(
                 "service",
                 name,
-                f"served by {participant.guid_prefix} {named(participant, is_inside)}",
+                f"served by {participant.guid_prefix} {participant_label(participant, is_inside)}",
             )
     for own_side, other_side, lacks in (
         (publishers, subscribers, "subscribes to"),
@@ -136,8 +138,8 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
         guids = participant.guid_prefix, peer.guid_prefix
         if from_inside is not to_inside and guids not in mismatched and not troubled & {*guids}:
             text = (
-                f"{guids[0]} {named(participant, from_inside)} to "
-                f"{guids[1]} {named(peer, to_inside)}: they match"
+                f"{guids[0]} {participant_label(participant, from_inside)} to "
+                f"{guids[1]} {participant_label(peer, to_inside)}: they match"
             )
             yield ok("topic", name, text)
 

@@ -37,32 +37,33 @@ def read(text: str, marks: Marks) -> list[Flow]:
     return [Flow(e.state, e.peer, port, e.reply_source) for e, port in marked if port is not None]
 
 
-class Astray(NamedTuple):
+class StrayDatagrams(NamedTuple):
     """Where datagrams arrive that do not go where they ought to.
 
-    ``unled``: at these ports somebody is not forwarded who had begun to send before; some may be of
-    another machine. ``misled`` are ports that still lead somebody where they led formerly.
+    ``unforwarded``: at these ports somebody is not forwarded who had begun to send before; some may
+    be of another machine. ``misdirected`` are ports that still lead somebody where they led
+    formerly.
     """
 
-    unled: set[HostPort]
-    misled: set[int]
+    unforwarded: set[HostPort]
+    misdirected: set[int]
 
 
-def astray(text: str, forwards: Forwards, marks: Marks) -> Astray:
+def find_stray_datagrams(text: str, forwards: Forwards, marks: Marks) -> StrayDatagrams:
     """The ports whose datagrams the kernel leads as it did when their first one came.
 
     It notes where each sender's first datagram went, and asks no rule again, as long as no pause
     between datagrams is longer than half a minute.
     """
-    stray = Astray(set(), set())
+    stray = StrayDatagrams(set(), set())
     for entry in _entries(text):
         port = marks.port(entry.mark)
         if entry.transport != Transport.UDP:
             continue
         if port is not None and forwards.get(port) != entry.reply_source:
-            stray.misled.add(port)
+            stray.misdirected.add(port)
         elif port is None and entry.target.port in forwards and entry.reply_source == entry.target:
-            stray.unled.add(entry.target)
+            stray.unforwarded.add(entry.target)
     return stray
 
 

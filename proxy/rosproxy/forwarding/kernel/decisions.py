@@ -26,7 +26,7 @@ class HostForwarding(msgspec.Struct, frozen=True):
 
     ipv4: bool = True
     ipv6: bool = True
-    own: Collection[str] = ()
+    own_addresses: Collection[str] = ()
 
 
 def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
@@ -42,7 +42,7 @@ def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
         return "nobody has asked for a topic of it yet"
     if len(ports) > 1:
         return "its topics are on several TCPROS ports"
-    if is_loopback(address) or address in host.own:
+    if is_loopback(address) or address in host.own_addresses:
         return "the node runs in the network namespace of the proxy itself"
     if not (host.ipv6 if ":" in address else host.ipv4):
         missing = "net.ipv6.conf.all.forwarding" if ":" in address else "net.ipv4.ip_forward"
@@ -50,7 +50,7 @@ def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
     return HostPort(address, next(iter(ports)))
 
 
-def kept(
+def forwards_to_keep(
     current: Forwards, endpoints: Iterable[LeaseHolder], recovered: bool
 ) -> dict[int, HostPort]:
     """The forwards from before a restart that nothing is known against yet.
@@ -64,7 +64,7 @@ def kept(
     return {port: target for port, target in current.items() if waiting.get(port) == target.host}
 
 
-def unchanged(
+def unchanged_forwards(
     current: Forwards, owners: Mapping[int, LeaseHolder], changed: Collection[LeaseHolder]
 ) -> dict[int, HostPort]:
     """The forwards of all endpoints that still have them, without those that have changed."""

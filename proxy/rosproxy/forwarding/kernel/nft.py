@@ -126,11 +126,11 @@ class Marks(msgspec.Struct, frozen=True):
         return mark & 0xFFFF if mark >> 16 == self.number else None
 
     @property
-    def all(self) -> str:
+    def table_selector(self) -> str:
         """All marks of the table, as conntrack's ``--mark`` takes it."""
         return f"{self.of(0):#x}/0xffff0000"
 
-    def one(self, port: int) -> str:
+    def port_selector(self, port: int) -> str:
         """The mark of one port, as conntrack's ``--mark`` takes it."""
         return f"{self.of(port):#x}/0xffffffff"
 

@@ -19,7 +19,7 @@ from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Counts, Near
-from rosproxy.forwarding.kernel.preflight import why_not
+from rosproxy.forwarding.kernel.preflight import find_obstacle
 from rosproxy.forwarding.kernel.syncer import OPTION, Clock, ForwardSyncer
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.leases import fast_ports
@@ -77,13 +77,13 @@ class KernelPlane:
         if not self._is_wanted:
             self.syncer.why_not = f"{OPTION} {mode}"
             return
-        if why := await why_not(mode, self._table.tools):
+        if why := await find_obstacle(mode, self._table.tools):
             self.syncer.why_not = why
         else:
             await self.syncer.begin()
         self._report()
         if self.syncer.usable:
-            self._tasks.repeat(self.syncer.run_once, 0, f"forwarding {self.syncer.what}")
+            self._tasks.repeat(self.syncer.run_once, 0, f"forwarding {self.syncer.traffic}")
             self._tasks.repeat(self.look, LOOK_INTERVAL, "looking at the kernel's counters")
 
     async def stop(self) -> None:
@@ -169,7 +169,7 @@ class KernelPlane:
         )
 
     def _report(self) -> None:
-        plane, reason, traffic = self.user_plane, self.syncer.why_not, self.syncer.what
+        plane, reason, traffic = self.user_plane, self.syncer.why_not, self.syncer.traffic
         if reason is None:
             log.info("the kernel forwards %s: nftables table %s", traffic, self._table.table.name)
             self._problems.solved(self.syncer.subject)

@@ -20,7 +20,7 @@ def read_forwarding() -> HostForwarding:
     return HostForwarding(ipv4=_read(_IPV4) == "1", ipv6=_read(_IPV6) == "1")
 
 
-async def why_not(mode: DataPlane, tools: Tools) -> str | None:
+async def find_obstacle(mode: DataPlane, tools: Tools) -> str | None:
     """What is in the way of the kernel plane, and what to do about it; None if nothing is seen.
 
     ``auto`` stays away from what looks like a host's own network: there a table of the proxy

@@ -52,7 +52,7 @@ class ForwardSyncer:
 
     ``why_not`` tells why the kernel may forward nothing at all; None while it may. ``recovered``
     is False until the registry is rebuilt: what a former process left then stays. ``near`` tells
-    who may use the forwards that lead outside. ``what`` is forwarded, in a word; ``subject`` is
+    who may use the forwards that lead outside. ``traffic`` is what is forwarded; ``subject`` is
     that of the problems with it.
     """
 
@@ -75,7 +75,7 @@ class ForwardSyncer:
         self._own_until, self._retry_at = 0.0, float("inf")
         self._logged: dict[LeaseHolder, str] = {}
         has_connections = table.table.has_connections
-        self.what = "topics" if has_connections else "datagrams"
+        self.traffic = "topics" if has_connections else "datagrams"
         self.subject = OPTION if has_connections else f"{OPTION} for UDP"
         self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
@@ -136,7 +136,7 @@ class ForwardSyncer:
         if isinstance(target, str):
             return target
         if endpoint.fast_port is None:
-            return fast_ports.why_none(self._endpoints.pool, endpoint)
+            return fast_ports.why_no_fast_port(self._endpoints.pool, endpoint)
         is_forwarded = self._table.forwards.get(endpoint.fast_port) == target
         return "" if is_forwarded else "about to be forwarded"
 
@@ -202,7 +202,7 @@ class ForwardSyncer:
         if address not in self._own:
             self._own[address] = address_towards(address) == address
         own = {address} if self._own[address] else ()
-        target = decisions.destination(endpoint, replace(self._host, own=own))
+        target = decisions.destination(endpoint, replace(self._host, own_addresses=own))
         if isinstance(target, str) or endpoint.fast_port is None:
             return target
         return self._pauses.why(endpoint.fast_port, target, self._clock()) or target
@@ -239,7 +239,7 @@ class ForwardSyncer:
             self._all_changed, self.why_not = True, str(error)
             self._retry_at = self._clock() + RETRY_LOST
             self._accounts.note_peers([])
-            text = f"{self.what} are no longer forwarded by the kernel: {error}"
+            text = f"{self.traffic} are no longer forwarded by the kernel: {error}"
             log.error("%s", text)
             self._problems.add(self.subject, text)
 
@@ -248,9 +248,9 @@ class ForwardSyncer:
         changed, self._changed = self._changed, set()
         if self._all_changed or not self.recovered:
             self._all_changed, changed = False, set(self._endpoints)
-            wanted = decisions.kept(current, changed, self.recovered)
+            wanted = decisions.forwards_to_keep(current, changed, self.recovered)
         else:
-            wanted = decisions.unchanged(current, self._accounts.owners, changed)
+            wanted = decisions.unchanged_forwards(current, self._accounts.owners, changed)
         by_port = self._endpoints.by_port
         for endpoint in changed:
             if endpoint.fast_port and by_port.get(endpoint.port) is endpoint:

@@ -42,7 +42,7 @@ class KernelTable:
             log.debug("no table of a former process: %s", error)
             former = TableState()
         self.counted = set(former.counters)
-        await self._list_flows(False, "--mark", self.table.marks.all)
+        await self._list_flows(False, "--mark", self.table.marks.table_selector)
         await self.make(former.forwards)
 
     async def make(self, wanted: Forwards) -> None:
@@ -69,14 +69,14 @@ class KernelTable:
         if not self.table.has_connections:
             await self._forget_stray(ipv6)
             return state.counters, []
-        text = await self._list_flows(ipv6, "--mark", marks.all)
+        text = await self._list_flows(ipv6, "--mark", marks.table_selector)
         return state.counters, conntrack.read(text, marks)
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
         """Forget connections through ports, each of IPv6 or not; those of one state if given."""
         state_options = ("--state", state) if state else ()
         for port, ipv6 in ports:
-            await self._forget(ipv6, "--mark", self.table.marks.one(port), *state_options)
+            await self._forget(ipv6, "--mark", self.table.marks.port_selector(port), *state_options)
 
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
         """End the connections through ports, each of IPv6 or not, so that both ends learn of it.
@@ -104,7 +104,7 @@ class KernelTable:
         except ToolError as error:
             log.warning("table %s can't be removed: %s", self.table.name, error)
         for ipv6 in (False, True):
-            await self._forget(ipv6, "--mark", self.table.marks.all)
+            await self._forget(ipv6, "--mark", self.table.marks.table_selector)
         self.forwards = {}
 
     async def _apply(self, document: str, forwards: Forwards) -> None:
@@ -118,7 +118,7 @@ class KernelTable:
     async def _forget_stray(self, ipv6: bool) -> None:
         """Forget where stray datagrams go, so that they go by the rules. Raises ToolError."""
         text = await self._list_flows(ipv6)
-        unled, misled = conntrack.astray(text, self.forwards, self.table.marks)
+        unled, misled = conntrack.find_stray_datagrams(text, self.forwards, self.table.marks)
         for dst in unled:
             if address_towards(dst.host) == dst.host:
                 port = str(dst.port)

@@ -38,7 +38,7 @@ from rosproxy.ros1.rewriting.master_calls import (
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.long_calls import LongCall
-from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, count_reply
 from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
@@ -70,13 +70,15 @@ class MasterApi:
         metrics, upstream = self._context.metrics, self._context.upstream
         judges_params = self._access.judges_parameters(call.source)
         if not judges_params and await _is_long_and_passes(call.body):
-            return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
+            return await count_reply(
+                metrics, "master", MULTICALL, upstream.pass_to_master(call.body)
+            )
         try:
             request = master_calls.read_request(call.body, caller, self._context.master_call)
         except xmlrpc.XmlRpcError:
             metrics.count("master", "other", "malformed")
             raise
-        return await counted(metrics, "master", request.method, self._answer(request, call))
+        return await count_reply(metrics, "master", request.method, self._answer(request, call))
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
@@ -92,7 +94,7 @@ class MasterApi:
             self._context.metrics.count("master", long_call.method, "refused")
             return xmlrpc.dump_reply(local_reply.triple())
         reply = self._context.upstream.pass_to_master(long_call)
-        return await counted(self._context.metrics, "master", long_call.method, reply)
+        return await count_reply(self._context.metrics, "master", long_call.method, reply)
 
     def _refuse_loop(self, call: IncomingCall) -> None:
         """Refuse a call that the proxy itself has made. Raises XmlRpcError."""
@@ -120,19 +122,19 @@ class MasterApi:
         async with self._admitted(request, replies, call) as admitted:
             admissions = self._judge_registrations(request, admitted)
             exported = master_api.export_request(request, admissions, addressing)
-            self._note(exported.facts(), request.caller.address)
+            self._note(exported.registry_changes(), request.caller.address)
             if exported.body is None:
                 return exported.local_reply()
             await self._memory.write()
             limits = request.reply_limits
             answer = await self._context.upstream.post_to_master(exported.body, limits)
             reply = master_calls.read_reply(exported, answer)
-            self._note(reply.facts(self._context.now()), request.caller.address)
+            self._note(reply.registry_changes(self._context.now()), request.caller.address)
             await self._memory.write()
             await self._stand_ins.listen_for(reply.uris(), request.caller)
             if self._context.policy.version != version:
                 self._enforcer.look_again()
-            return master_api.import_reply(reply, addressing, self._access.unseen(reply))
+            return master_api.import_reply(reply, addressing, self._access.reply_changes(reply))
 
     def _judge_registrations(
         self, request: Request, admissions: Sequence[CallOutcome]
@@ -177,7 +179,7 @@ class MasterApi:
         if may_be_long and (text := too_long_to_register(call)):
             return self._refuse("long_name", call, caller, text)
         admission = await self._admission.admit(call, caller)
-        if isinstance(admission, Endpoint) and (text := admission.full):
+        if isinstance(admission, Endpoint) and (text := admission.reason_full):
             return self._refuse("too_many_names", call, caller, text)
         return admission
 
@@ -204,7 +206,7 @@ class MasterApi:
                 registry.register(
                     fact.endpoint, registration if own else replace(registration, service_api=None)
                 )
-            self._publisher_updates.note(registration)
+            self._publisher_updates.note_registration(registration)
 
     def _keep_shown(self, endpoint: Endpoint, registration: Registration) -> Registration:
         """A registration to note: one that the master has stays shown until it is taken back.

@@ -26,7 +26,7 @@ from rosproxy.ros1.rewriting import policing, slave_api
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.tcpros import InsideNodes, TcprosServer
-from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
 from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 
@@ -82,12 +82,12 @@ class SlaveApi:
             if call.gone:
                 raise Unreachable("the caller has gone")
             results.append(await self._multicall_result(endpoint, inner, call))
-            call.hold(len(results[-1]))
+            call.charge(len(results[-1]))
         return multicall.results_reply(results)
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        return passing.CallWatch() if slave_api.passes(method) else None
+        return passing.CallWatch() if slave_api.passes_unread(method) else None
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
@@ -101,7 +101,7 @@ class SlaveApi:
         if reason is not None:
             return self._refuse(method, reason)
         reply = self._pass(endpoint, long_call)
-        return await counted(self._context.metrics, "slave", method, reply)
+        return await count_reply(self._context.metrics, "slave", method, reply)
 
     def _endpoint(self, call: IncomingCall) -> Endpoint:
         """The endpoint that a call is for. Raises Unreachable."""
@@ -156,7 +156,7 @@ class SlaveApi:
                 self._context.metrics.count("slave", parsed.method, "refused")
                 return xmlrpc.dump_reply(denied)
         reply = self._forward(endpoint, parsed, body, call)
-        return await counted(self._context.metrics, "slave", parsed.method, reply)
+        return await count_reply(self._context.metrics, "slave", parsed.method, reply)
 
     def _refuse(self, method: str, reason: str) -> bytes:
         """The reply to a call that its caller may not make."""
@@ -168,10 +168,10 @@ class SlaveApi:
     ) -> bytes | LongReply:
         if await self._is_absorbed(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
-        if not slave_api.rewritten(parsed.method):
+        if not slave_api.is_rewritten(parsed.method):
             return await self._pass(endpoint, body)
         if parsed.method == "publisherUpdate":
-            await self._context.after_registration(endpoint)
+            await self._context.wait_for_registration(endpoint)
             topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
             node = self._context.caller_at(endpoint)
             await self._stand_ins.listen_for_announced(topic, announced, node)
@@ -182,7 +182,7 @@ class SlaveApi:
         addressing, is_local = self._context.addressing, call.reached_locally
         node = self._context.caller_at(endpoint)
         view = slave_api.from_outside(node, self._context.settings.master_uri, addressing)
-        if self._context.stand_ins.both:
+        if self._context.stand_ins.is_bidirectional:
             body = await self._stand_ins.udpros.lead_outwards(endpoint, parsed, body, call.source)
         else:
             body = self._stand_ins.with_address(body, parsed)
@@ -256,7 +256,7 @@ class SlaveApi:
         them behind (rosrust, to every parameter), so it calls who has the port by now. rosnodejs
         never answers that, and rosmaster tells it of no publishers meanwhile.
         """
-        await self._context.after_registration(endpoint)
+        await self._context.wait_for_registration(endpoint)
         if parameter is None or endpoint.may_hear_of(parameter):
             return None
         return f"{endpoint.label} has not subscribed to {parameter}"

@@ -130,7 +130,7 @@ class KeptConnections(Generic[_K]):
         conn = self._connections.pop(key)
         del self._waiting[key], self._key_by_fd[conn.sock.fileno()]
         self._epoll.unregister(conn.sock)
-        self._nodes.leave(conn.sock)
+        self._nodes.close_after_answer(conn.sock)
 
     def close_all(self) -> None:
         """Close all connections, for good."""

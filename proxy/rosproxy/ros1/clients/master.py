@@ -105,7 +105,7 @@ class MasterClient:
     def reached_at(self) -> str | None:
         """The address at which the master is looked for; None before its name was resolved."""
         host = self._master_host_port.host
-        return self.master_address or (host if is_address(host) else self._master.last)
+        return self.master_address or (host if is_address(host) else self._master.last_address)
 
     async def master_addresses(self) -> list[str]:
         """The addresses of the master's host; empty if its name can't be resolved."""
@@ -158,7 +158,7 @@ class MasterClient:
             batch = calls[start : start + MULTICALL_SIZE]
             body = [{"methodName": method, "params": params} for method, params in batch]
             call = xmlrpc.dump_call("system.multicall", body)
-            results = parsed(await self.post_to_master(call, OWN_REPLY))
+            results = parse_value(await self.post_to_master(call, OWN_REPLY))
             if not isinstance(results, list) or len(results) != len(batch):
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_result_of(result) for result in results]
@@ -220,7 +220,7 @@ class MasterClient:
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         return read_value(method, await self.post_to_node(slave, body, within))
 
-    def leave_node(self, sock: socket.socket) -> None:
+    def close_after_answer(self, sock: socket.socket) -> None:
         """Close a connection to a node on which an answer is due, once that has come."""
         self._nodes.leave(sock)
 
@@ -258,7 +258,7 @@ def _unreachable(peer: str, error: BaseException) -> Unreachable:
     return Unreachable(f"{peer}: {reason}", probe)
 
 
-def parsed(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
+def parse_value(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
     """A reply's value, a fault's too. Raises Unreachable."""
     try:
         return xmlrpc.read_response(reply, limits)
@@ -268,7 +268,7 @@ def parsed(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
 
 def read_value(method: str, reply: bytes, limits: Limits = REPLY) -> Any:
     """The value in a reply of the master's or a node's. Raises Unreachable, MasterError."""
-    match parsed(reply, limits):
+    match parse_value(reply, limits):
         case [list(), list()] as value if method == "getBusStats":
             return value  # roscpp gives the value alone (TopicManager::getBusStatsCallback)
         case [1, _, value]:

@@ -22,7 +22,7 @@ from rosproxy.ros1.clients.master import (
     MasterClient,
     MasterError,
     Unreachable,
-    parsed,
+    parse_value,
 )
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
@@ -66,9 +66,9 @@ class NodeClient:
         """A connection to the slave API at an address that is about to be made. Raises OSError."""
         return sockets.begin_to_dial(self._upstream.reach(slave))
 
-    def leave(self, sock: socket.socket) -> None:
+    def close_after_answer(self, sock: socket.socket) -> None:
         """Close such a connection once the answer that is due on it has come."""
-        self._upstream.leave_node(sock)
+        self._upstream.close_after_answer(sock)
 
     def pid_question(self, slave: HostPort) -> bytes:
         """The HTTP request by which the node at an address is asked for its pid."""
@@ -79,7 +79,7 @@ class NodeClient:
 
         Raises Unreachable if it is no XML-RPC.
         """
-        match parsed(body):
+        match parse_value(body):
             case [_, _, int(pid)]:
                 return pid
         return None

@@ -47,7 +47,7 @@ def parse_service_uri(uri: str) -> HostPort | None:
     return parse_authority(uri) if uri.startswith("rosrpc://") and _fits(uri) else None
 
 
-def placed(uri: str, address: str) -> str:
+def with_caller_address(uri: str, address: str) -> str:
     """A URI with the address that it came from where it names no host, as ``http://:41063``.
 
     roslisp says so where ROS_HOSTNAME is set to nothing, and rosmaster takes it.

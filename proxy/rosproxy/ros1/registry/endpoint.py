@@ -250,13 +250,13 @@ class Endpoint:
     @property
     def proven(self) -> bool:
         """Whether its node has ever answered here, as itself."""
-        return self.trusted and self.health.answered is not None
+        return self.trusted and self.health.answered_at is not None
 
     @property
     def never_found(self) -> bool:
         """Whether its node registered and has never answered here: it may be elsewhere."""
         health = self.health
-        return self.trusted and health.answered is None and health.failures > 0
+        return self.trusted and health.answered_at is None and health.failures > 0
 
     @property
     def expendable(self) -> bool:
@@ -269,7 +269,7 @@ class Endpoint:
             return False
         if self.proven:
             return self.health.down
-        return self.health.failures > 0 or not (self.trusted or self.health.answered is None)
+        return self.health.failures > 0 or not (self.trusted or self.health.answered_at is None)
 
     @property
     def node_ports(self) -> set[int]:
@@ -277,7 +277,7 @@ class Endpoint:
         return set(self.topic_ports.values())
 
     @property
-    def direct(self) -> bool:
+    def has_registered_directly(self) -> bool:
         """Whether the node registered around the proxy, so that it may do so again."""
         return any(parse_slave_uri(uri) == self.node for uri in self.former_uris)
 
@@ -311,7 +311,7 @@ class Endpoint:
         """The topics, services or parameters registered as ``kind``."""
         return sorted(r.name for r in self.registrations.values() if r.kind is kind)
 
-    def shown(self, kind: Kind) -> list[str]:
+    def names_at_master(self, kind: Kind) -> list[str]:
         """The topics, services or parameters of a ``kind`` that the master knows of."""
         registrations = self.registrations.values()
         return sorted(r.name for r in registrations if r.kind is kind and not r.hidden)
@@ -353,7 +353,7 @@ class Endpoint:
         return sum(self.fast_peers.values())
 
     @property
-    def full(self) -> str | None:
+    def reason_full(self) -> str | None:
         """Why nothing more is registered here; None if something may be."""
         for count, most, label in (
             (len(self.registrations), MOST_REGISTRATIONS, "registrations"),

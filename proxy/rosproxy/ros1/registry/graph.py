@@ -23,13 +23,13 @@ _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 class Graph(msgspec.Struct, frozen=True):
     """What each node has registered, and each node's slave URI as far as known."""
 
-    held: Mapping[str, Sequence[Registration]]
+    registrations: Mapping[str, Sequence[Registration]]
     uris: Mapping[str, str]
 
     def by_topic(self, kind: Kind) -> dict[str, list[str]]:
         """The slave URIs of each topic's publishers or subscribers."""
         topics: dict[str, list[str]] = {}
-        for node, registrations in self.held.items():
+        for node, registrations in self.registrations.items():
             for registration in registrations:
                 if registration.kind is kind and node in self.uris:
                     topics.setdefault(registration.name, []).append(self.uris[node])

@@ -29,20 +29,20 @@ class Health:
     ``refused`` tells whether the last failure was a refused connection, which only a node that
     has ended gives; one that hangs or is cut off is silent. ``cleaned``: its registrations were
     taken back at the master, at ``cleaned_at``, and are kept only for the case that it answers
-    again. ``over``: it is known to have ended for good, even if its address is just silent.
-    ``hung_up`` is the process that ended the last connection that was to be kept.
+    again. ``has_ended``: it is known to have ended for good, even if its address is just silent.
+    ``hung_up_pid`` is the process that ended the last connection that was to be kept.
     """
 
-    answered: float | None = None
+    answered_at: float | None = None
     failing_since: float | None = None
     failures: int = 0
     refused: bool = False
     cleaned: bool = False
     cleaned_at: float = 0.0
-    over: bool = False
+    has_ended: bool = False
     pid: int | None = None
-    checked: float | None = None
-    hung_up: int | None = None
+    checked_at: float | None = None
+    hung_up_pid: int | None = None
 
     @property
     def down(self) -> bool:
@@ -58,26 +58,28 @@ class Health:
             return "refused" if self.refused else "silent"
         if self.failures:
             return "failing"
-        return "new" if self.answered is None else "ok"
+        return "new" if self.answered_at is None else "ok"
 
     def probe_soon(self) -> None:
         """Have the node probed at once."""
-        self.checked = None
+        self.checked_at = None
 
     def note_hung_up(self) -> None:
         """Have the node probed at once: it has ended a connection that was to be kept."""
-        self.checked, self.hung_up = None, self.pid
+        self.checked_at, self.hung_up_pid = None, self.pid
 
     @property
     def steady(self) -> bool:
         """Whether it has answered whenever it was asked of late, always as the same process."""
-        is_well = self.answered is not None and not (self.failures or self.cleaned or self.over)
-        return is_well and self.checked is not None and self.pid not in UNKNOWN_PID
+        is_well = self.answered_at is not None and not (
+            self.failures or self.cleaned or self.has_ended
+        )
+        return is_well and self.checked_at is not None and self.pid not in UNKNOWN_PID
 
     @property
     def hangs_up(self) -> bool:
         """Whether the process that answers has ended a connection that was to be kept."""
-        return self.hung_up is not None and self.hung_up == self.pid
+        return self.hung_up_pid is not None and self.hung_up_pid == self.pid
 
     def note_cleaned(self, at: float) -> None:
         """Note that its registrations were taken back at the master, as they were at a time."""
@@ -89,15 +91,15 @@ class Health:
 
     def suspect(self) -> None:
         """Have the node probed at once, as if another process could be there by now."""
-        self.checked, self.pid = None, -1
+        self.checked_at, self.pid = None, -1
 
     def note(self, probe: ProbeResult, now: float) -> bool:
         """Take in a probe result; whether the node went down by it."""
         was_down = self.down
-        self.checked = now
+        self.checked_at = now
         if probe is ProbeResult.ANSWERED:
-            self.answered, self.failing_since, self.failures = now, None, 0
-            self.refused = self.over = False
+            self.answered_at, self.failing_since, self.failures = now, None, 0
+            self.refused = self.has_ended = False
             return False
         self.failures += 1
         self.refused = probe is ProbeResult.REFUSED
@@ -107,15 +109,15 @@ class Health:
     def end(self, now: float) -> None:
         """Note that the node has ended, whatever it is that its address answers."""
         self.failures = max(self.failures, FAILURES_TO_CLOSE)
-        self.checked, self.failing_since, self.over = now, float("-inf"), True
+        self.checked_at, self.failing_since, self.has_ended = now, float("-inf"), True
 
     def due(self, now: float, interval: float) -> bool:
         """Whether to probe: idle for ``interval`` seconds, or under suspicion."""
-        if self.checked is None or 0 < self.failures < FAILURES_TO_CLOSE:
+        if self.checked_at is None or 0 < self.failures < FAILURES_TO_CLOSE:
             return True
         if self.down:
-            return now - self.checked >= min(RETRY, interval)
-        return now - self.checked >= interval
+            return now - self.checked_at >= min(RETRY, interval)
+        return now - self.checked_at >= interval
 
     def clean_up(self, now: float, after: float) -> bool:
         """Whether to unregister the node at the master: down for ``after`` seconds (0: never)."""

@@ -29,7 +29,7 @@ _NO_NAME = re.compile(r"[^A-Za-z0-9]")
 _LINE = re.compile(r"(\d{1,5}) (/\S{1,4096}/)((?: \d{1,5})*)")
 
 
-class Remembered(msgspec.Struct, frozen=True):
+class RememberedLease(msgspec.Struct, frozen=True):
     """Where the node of a lease was, and on which TCPROS ports it had services."""
 
     node: InsidePath
@@ -45,18 +45,18 @@ def parameter_of(host: str, ports: PortMap) -> str:
     return f"{NAMESPACE}/{_name_of(host)}{ports.advertise.first}"
 
 
-def to_remember(endpoints: Iterable[Endpoint], ports: PortMap) -> str:
+def leases_text(endpoints: Iterable[Endpoint], ports: PortMap) -> str:
     """The parameter's value; empty if there is nothing to remember."""
     return "".join(f"{_line(endpoint, ports)}\n" for endpoint in endpoints)
 
 
-def remembered(value: object, ports: PortMap) -> Mapping[int, Remembered]:
+def read_leases(value: object, ports: PortMap) -> Mapping[int, RememberedLease]:
     """What a value tells of the ports of the range, by the port that listens; never an error."""
     leases = {ports.listening(port): lease for port, lease in _read(value)}
     return {port: lease for port, lease in leases.items() if port is not None}
 
 
-def lease_at(parameters: object, advertised: HostPort) -> Remembered | None:
+def lease_at(parameters: object, advertised: HostPort) -> RememberedLease | None:
     """What any proxy has at an advertised host and port, given the parameters in NAMESPACE."""
     name = _name_of(advertised.host)
     items = parameters.items() if isinstance(parameters, dict) else ()
@@ -68,14 +68,14 @@ def _name_of(host: str) -> str:
     return f"leases_{_NO_NAME.sub('_', host)}_"
 
 
-def _read(value: object) -> Iterator[tuple[int, Remembered]]:
+def _read(value: object) -> Iterator[tuple[int, RememberedLease]]:
     """The advertised ports in a value, with what it tells of each."""
     for line in value.splitlines() if isinstance(value, str) else ():
         match = _LINE.fullmatch(line)
         node = parse_inside_path(f"http://h:1{match[2]}") if match else None
         if match and node:
             services = [int(text) for text in match[3].split()][:MOST_SERVICE_PORTS]
-            yield int(match[1]), Remembered(node, tuple(p for p in services if 0 < p < 65536))
+            yield int(match[1]), RememberedLease(node, tuple(p for p in services if 0 < p < 65536))
 
 
 def _line(endpoint: Endpoint, ports: PortMap) -> str:

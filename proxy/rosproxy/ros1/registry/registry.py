@@ -141,7 +141,7 @@ class Registry:
             self._admit(endpoint, node, endpoint.location.address)
         return moved
 
-    def reclaimable(self) -> Endpoint | None:
+    def longest_idle(self) -> Endpoint | None:
         """The endpoint to give up first when the range is short: idle for the longest time.
 
         One that has just been admitted is not idle: the master's reply is still on its way.
@@ -149,7 +149,7 @@ class Registry:
         idle = [e for e in self if e.unused and e.idle_since is not None]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
 
-    def dead(self) -> Endpoint | None:
+    def dead_endpoint(self) -> Endpoint | None:
         """The endpoint to give up first for a node that lives; None if no node is dead.
 
         Those that never answered go first, of the source that has most of them; then those that
@@ -188,7 +188,9 @@ class Registry:
         """
         self.changes += 1
         former = endpoint.registrations.get(registration.key)
-        if registration.characters > LONGEST_REGISTRATION or (endpoint.full and former is None):
+        if registration.characters > LONGEST_REGISTRATION or (
+            endpoint.reason_full and former is None
+        ):
             return
         owner = self.by_caller.get(registration.caller_id)
         if owner and owner is not endpoint:

@@ -51,24 +51,24 @@ MOST_FORMER = 2048
 class StandIn:
     """A port that stands in for a node outside, or for a service there.
 
-    ``local`` is where it listens, ``uri`` what the master has. ``kept``: inside is told the URI as
-    it is, which leads to ``local``. ``topic_ports`` are the TCPROS ports by topic that the node has
-    named. ``address`` is where the node was reached, empty before.
+    ``local`` is where it listens, ``uri`` what the master has. ``is_uri_kept``: inside is told the
+    URI as it is, which leads to ``local``. ``topic_ports`` are the TCPROS ports by topic that the
+    node has named. ``address`` is where the node was reached, empty before.
 
     ``fast_port`` is a second port, for topics alone, which the kernel forwards where it may (None:
     it has none). ``fast_peers`` tells how many connections it forwards now, by the inside address.
-    ``fast_try`` counts the candidates for it that other stand-ins had.
+    ``fast_attempts`` counts the candidates for it that other stand-ins had.
     """
 
     local: HostPort
     uri: str
-    where: HostPort
-    kept: bool
+    target: HostPort
+    is_uri_kept: bool
     topic_ports: dict[str, int] = field(default_factory=dict)
     address: str = ""
     fast_port: int | None = None
     fast_peers: Mapping[str, int] = field(default_factory=dict)
-    fast_try: int = 0
+    fast_attempts: int = 0
     inside: bool = False
     trusted: bool = True
     is_down: bool = False
@@ -96,7 +96,7 @@ class StandIn:
     @property
     def caller_ids(self) -> list[str]:
         """What metrics call the node: by its host, since its URI is another at each start."""
-        return [self.where.host]
+        return [self.target.host]
 
     @property
     def fast_candidate(self) -> HostPort | None:
@@ -104,9 +104,9 @@ class StandIn:
 
         The kernel tells ports apart and no addresses: one of each of the proxy's addresses.
         """
-        if self.kept or parse_service_uri(self.uri):
+        if self.is_uri_kept or parse_service_uri(self.uri):
             return None
-        number = _number(f"{self.local.host} {self.uri}") + self.fast_try**2
+        number = _number(f"{self.local.host} {self.uri}") + self.fast_attempts**2
         return HostPort(self.local.host, PORTS[_HALF + number % _HALF])
 
     def note_topic_port(self, topic: str, port: int) -> None:
@@ -122,7 +122,7 @@ class StandIn:
     @property
     def inside_uri(self) -> str:
         """What inside is told instead of the URI."""
-        if self.kept:
+        if self.is_uri_kept:
             return self.uri
         if parse_service_uri(self.uri):
             return service_uri(self.local)
@@ -137,7 +137,7 @@ class StandIns:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.both = settings.direction == "both"
+        self.is_bidirectional = settings.direction == "both"
         self.aliased = aliased_host(settings.master_uri) or ""
         self.by_local: dict[HostPort, StandIn] = {}
         """By where they listen, the one that was unused for longest first."""
@@ -153,26 +153,26 @@ class StandIns:
         The caller makes sure that it is no URI of this proxy's own, and none of inside.
         """
         host_port = parse_slave_uri(uri) or parse_service_uri(uri)
-        if host_port is None or self.both:
+        if host_port is None or self.is_bidirectional:
             return host_port
         return host_port if self.aliased and host_port.host.lower() == self.aliased else None
 
     def candidates(self, uri: str, target: HostPort, address: str) -> Iterator[StandIn]:
         """The stand-ins to try for a URI at an address, one after the other; always the same."""
-        if not self.both:
-            yield StandIn(HostPort(address, target.port), uri, target, kept=True)
+        if not self.is_bidirectional:
+            yield StandIn(HostPort(address, target.port), uri, target, is_uri_kept=True)
             return
         seed = _number(uri)
         for number in range(TRIES):
             port = PORTS[(seed + number * number) % _HALF]
-            yield StandIn(HostPort(address, port), uri, target, kept=False)
+            yield StandIn(HostPort(address, port), uri, target, is_uri_kept=False)
 
     def address(self, proxy: str) -> str:
         """Where stand-ins listen for a node inside that sees the proxy at an address.
 
         At that address alone; but at all where the URIs are kept, since a name may lead to any.
         """
-        return proxy if self.both else self._settings.bind
+        return proxy if self.is_bidirectional else self._settings.bind
 
     def at(self, local: HostPort) -> StandIn | None:
         """The stand-in at which a connection arrived."""
@@ -189,12 +189,12 @@ class StandIns:
         """
         if stand_in.fast_port is not None or stand_in.fast_candidate is None:
             return None
-        for stand_in.fast_try in range(TRIES):
+        for stand_in.fast_attempts in range(TRIES):
             if stand_in.port not in self.by_port:
                 return stand_in.fast_candidate
         return None
 
-    def is_proxys(self, port: int) -> bool:
+    def is_own_port(self, port: int) -> bool:
         """Whether the proxy itself listens at a port, or may."""
         stands_in = port in self.by_port or any(port == local.port for local in self.by_local)
         return stands_in or obstacle(port, self._settings) is not None
@@ -231,7 +231,7 @@ class StandIns:
 
     def advice(self, target: HostPort, reason: str, address: str) -> str:
         """What is wrong where no port can stand in, and the cure; ``address`` is the master's."""
-        if self.both:
+        if self.is_bidirectional:
             return f"inside nodes can't reach it: no port stands in for {target}; the last {reason}"
         return (
             f"inside nodes can't reach it: port {target.port} {reason}. Start that node with "
@@ -245,7 +245,7 @@ class StandIns:
 
     def export_uri(self, uri: str) -> str | None:
         """The URI of outside that inside nodes were once told this one for; None if it is none."""
-        if not self.both or len(uri) > LONGEST_URI:
+        if not self.is_bidirectional or len(uri) > LONGEST_URI:
             return None
         service = parse_service_uri(uri)
         local = service or parse_slave_uri(uri)

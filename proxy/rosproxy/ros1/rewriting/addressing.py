@@ -15,9 +15,9 @@ from rosproxy.ros1.protocol.uris import (
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
-    placed,
     service_uri,
     slave_uri,
+    with_caller_address,
 )
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
@@ -78,7 +78,7 @@ class Addressing:
 
     def export_slave(self, uri: str, caller: Caller) -> str:
         """The outside form of a slave URI that an inside node gave."""
-        uri = placed(uri, caller.address)
+        uri = with_caller_address(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
         slave = parse_slave_uri(uri)
@@ -91,7 +91,7 @@ class Addressing:
 
     def export_service(self, uri: str, service: str, caller: Caller) -> str:
         """The outside form of the URI of a service that an inside node gave."""
-        uri = placed(uri, caller.address)
+        uri = with_caller_address(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
         host_port = parse_service_uri(uri)
@@ -106,7 +106,7 @@ class Addressing:
 
     def import_slave(self, uri: str, caller: Caller) -> str:
         """The form of a slave URI from outside that an inside node can use."""
-        endpoint = self.stands_for(uri)
+        endpoint = self.endpoint_of(uri)
         return self._import(endpoint, caller) if endpoint else self._import_foreign(uri, caller)
 
     def import_service(self, uri: str, service: str, caller: Caller) -> str:
@@ -119,19 +119,19 @@ class Addressing:
             return own_uri
         return service_uri(HostPort(caller.proxy, endpoint.port))
 
-    def foreign(self, uri: str) -> HostPort | None:
+    def stand_in_target(self, uri: str) -> HostPort | None:
         """Where a stand-in for a URI at the master is to lead; None if it needs no stand-in."""
         target = self.stand_ins.target(uri)
         if target is None or self.advertises(target) or is_inside(target.host, self.networks):
             return None
         return target
 
-    def handed_out(self, uri: str, caller: Caller) -> bool:
+    def is_own_uri(self, uri: str, caller: Caller) -> bool:
         """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
         slave = parse_slave_uri(uri)
         if slave is None:
             return False
-        return self._is_relayed(slave, caller) or self.stands_for(uri) is not None
+        return self._is_relayed(slave, caller) or self.endpoint_of(uri) is not None
 
     def advertises(self, host_port: HostPort) -> bool:
         """Whether outside finds one of this proxy's own ports at a host and port."""
@@ -142,7 +142,7 @@ class Addressing:
         return self._listening(parse_slave_uri(uri))
 
     def _import_foreign(self, uri: str, caller: Caller) -> str:
-        return self.stand_ins.import_uri(uri, caller.proxy) if self.foreign(uri) else uri
+        return self.stand_ins.import_uri(uri, caller.proxy) if self.stand_in_target(uri) else uri
 
     def _import(self, endpoint: Endpoint, caller: Caller) -> str:
         if self._is_direct(endpoint, caller) and self._meant_by(endpoint.node, caller) is endpoint:
@@ -157,7 +157,7 @@ class Addressing:
         shared = [n for n in self.networks if is_inside(caller.address, [n])]
         return endpoint.location.named and is_inside(endpoint.location.address, shared)
 
-    def stands_for(self, uri: str) -> Endpoint | None:
+    def endpoint_of(self, uri: str) -> Endpoint | None:
         """The endpoint that an advertised slave URI stands for.
 
         Those of former versions carry the inside address in their path: another one means another

@@ -16,7 +16,7 @@ METHODS = frozenset({"getPublishedTopics", "getTopicTypes", "getSystemState"})
 _TABLES = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
-def completed(call: Call, listing: Any, registry: Registry) -> Any:
+def with_hidden(call: Call, listing: Any, registry: Registry) -> Any:
     """What the master has said of the graph, with what is hidden; as it is if it is malformed."""
     if not isinstance(listing, list):
         return listing

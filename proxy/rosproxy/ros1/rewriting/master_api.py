@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from msgspec.structs import replace
 
 from rosproxy.ros1.protocol.master_methods import Kind, Reply, method_spec, resolve_name
-from rosproxy.ros1.protocol.uris import parse_service_uri, placed
+from rosproxy.ros1.protocol.uris import parse_service_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
 from rosproxy.ros1.protocol.xmlrpc.multicall import insert_items
@@ -22,22 +22,22 @@ from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
     NO_REPLY_CHANGES,
     CallOutcome,
-    Exported,
+    CallResult,
+    ExportedRequest,
     LocalReply,
     MasterReply,
     ReplyChanges,
     Request,
-    Result,
     caller_id_of,
     read_reply,
-    second_name,
+    second_parameter_name,
 )
-from rosproxy.ros1.rewriting.slave_api import replace_held
+from rosproxy.ros1.rewriting.slave_api import replace_value
 
 
 def export_request(
     request: Request, admissions: Sequence[CallOutcome], addressing: Addressing
-) -> Exported:
+) -> ExportedRequest:
     """The request for the master: URIs exported, calls that the proxy answers left out.
 
     ``admissions`` has one for each call. A call that unregisters concerns the endpoint of its
@@ -47,15 +47,15 @@ def export_request(
     for call, admission in zip(request.calls, admissions, strict=True):
         outcome = admission
         if call and outcome is None and method_spec(call.method).unregisters:
-            outcome = holder(call, caller, addressing)
+            outcome = unregistering_endpoint(call, caller, addressing)
         if call and not isinstance(outcome, LocalReply):
             edits += _export_call(call, outcome, caller, addressing)
         outcomes.append(outcome)
     local = [isinstance(outcome, LocalReply) for outcome in outcomes]
     if local and all(local):
-        return Exported(request, tuple(outcomes), None)
+        return ExportedRequest(request, tuple(outcomes), None)
     edits += [xmlrpc.remove(item) for item, out in zip(request.items, local, strict=False) if out]
-    return Exported(request, tuple(outcomes), xmlrpc.apply(request.body, edits))
+    return ExportedRequest(request, tuple(outcomes), xmlrpc.apply(request.body, edits))
 
 
 def import_reply(
@@ -85,23 +85,25 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
     if not any(call and call.method == "getUri" for call in request.calls):
         return reply
     edits: list[Edit] = []
-    for result in read_reply(Exported(request, (None,) * len(request.calls), None), reply).results:
+    for result in read_reply(
+        ExportedRequest(request, (None,) * len(request.calls), None), reply
+    ).results:
         if not (result.triple and result.value):
             continue
         text = result.value.string()
         if method_spec(result.call.method).reply is Reply.MASTER_URI and text:
-            edits += replace_held(result.triple, f"http://{master}/")
+            edits += replace_value(result.triple, f"http://{master}/")
     return xmlrpc.apply(reply, edits)
 
 
-def holder(call: Call, caller: Caller, addressing: Addressing) -> Endpoint | None:
+def unregistering_endpoint(call: Call, caller: Caller, addressing: Addressing) -> Endpoint | None:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
     spec, endpoint = method_spec(call.method), addressing.registry.by_caller.get(caller_id_of(call))
     if endpoint is None:
         return None
     if spec.caller_api is None:
         uri = addressing.export_service(
-            call.string(spec.service_api) or "", second_name(call), caller
+            call.string(spec.service_api) or "", second_parameter_name(call), caller
         )
         return endpoint if uri == addressing.advertised_service(endpoint) else None
     uri = addressing.export_slave(call.string(spec.caller_api) or "", caller)
@@ -116,18 +118,18 @@ def _export_call(
     if isinstance(admission, Endpoint):
         if caller_api:
             yield xmlrpc.replace(caller_api, addressing.advertised_uri(admission))
-        if service_api and parse_service_uri(placed(service_api.text, caller.address)):
+        if service_api and parse_service_uri(with_caller_address(service_api.text, caller.address)):
             yield xmlrpc.replace(service_api, addressing.advertised_service(admission))
         return
     if caller_api:
         yield xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, caller))
     if service_api:
-        text = addressing.export_service(service_api.text, second_name(call), caller)
+        text = addressing.export_service(service_api.text, second_parameter_name(call), caller)
         yield xmlrpc.replace(service_api, text)
 
 
 def _import_result(
-    result: Result, caller: Caller, addressing: Addressing, changes: ReplyChanges
+    result: CallResult, caller: Caller, addressing: Addressing, changes: ReplyChanges
 ) -> list[Edit]:
     triple = result.triple
     if triple is None or not result.accepted:
@@ -139,7 +141,7 @@ def _import_result(
         return [xmlrpc.remove(item) for item in value.items if item.text in changes.params]
     if changes.graph and result.call.method in hidden_graph.METHODS:
         listing = xmlrpc.python_value(value)
-        completed = hidden_graph.completed(result.call, listing, addressing.registry)
+        completed = hidden_graph.with_hidden(result.call, listing, addressing.registry)
         return [Edit(*value.outer, xmlrpc.dump_value(completed))]
     return _import_uri(result.call, triple, caller, addressing)
 
@@ -147,12 +149,12 @@ def _import_result(
 def _import_uri(call: Call, triple: Value, caller: Caller, addressing: Addressing) -> list[Edit]:
     text, kind = triple.items[2].string(), method_spec(call.method).reply
     if text and kind is Reply.SLAVE_URI:
-        return replace_held(triple, addressing.import_slave(text, caller))
+        return replace_value(triple, addressing.import_slave(text, caller))
     if text and kind is Reply.SERVICE_URI:
-        uri = addressing.import_service(text, second_name(call), caller)
-        return replace_held(triple, uri)
+        uri = addressing.import_service(text, second_parameter_name(call), caller)
+        return replace_value(triple, uri)
     if text and kind is Reply.MASTER_URI and caller.master:
-        return replace_held(triple, f"http://{caller.master}/")
+        return replace_value(triple, f"http://{caller.master}/")
     return []
 
 
@@ -162,7 +164,7 @@ def _import_uris(
     """The publishers that a subscriber is told of, or the subscribers that a publisher is."""
     extra: Sequence[str] = ()
     if method_spec(call.method).registers is Kind.SUBSCRIBER:
-        extra = changes.publishers.get(second_name(call), ())
+        extra = changes.publishers.get(second_parameter_name(call), ())
     if extra:
         uris = [*(item.text for item in array.items), *extra]
         imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
@@ -183,5 +185,5 @@ def registration(call: Call, now: float, source: str) -> Registration | None:
     name, type_ = resolve_name(name, caller_id), call.string(spec.type) or "*"
     service_api = call.string(spec.service_api)
     if service_api is not None:
-        service_api = placed(service_api, source)
+        service_api = with_caller_address(service_api, source)
     return Registration(kind, name, caller_id, type_, service_api, now)

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.ros1.protocol.master_methods import NO_SPEC, Reply, method_spec, resolve_name
-from rosproxy.ros1.protocol.uris import placed
+from rosproxy.ros1.protocol.uris import with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
@@ -33,8 +33,8 @@ class Refusal(msgspec.Struct, frozen=True):
         return [-1, self.reason, 0]
 
 
-class Answered(msgspec.Struct, frozen=True):
-    """A call that the proxy answers itself, in the master's place; ``fact`` follows from it.
+class LocalAnswer(msgspec.Struct, frozen=True):
+    """A call that the proxy answers itself, in the master's place; ``change`` follows from it.
 
     ``value`` is the third element of the triple, whose status is ``code``.
     """
@@ -42,7 +42,7 @@ class Answered(msgspec.Struct, frozen=True):
     code: int
     text: str
     value: object
-    fact: "RegistryChange | None" = None
+    change: "RegistryChange | None" = None
 
     def triple(self) -> list[object]:
         """The ROS status triple."""
@@ -64,7 +64,7 @@ class ReplyChanges(msgspec.Struct, frozen=True):
 
 NO_REPLY_CHANGES = ReplyChanges()
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
-LocalReply = Refusal | Answered
+LocalReply = Refusal | LocalAnswer
 """The reply to a call that the master does not get."""
 CallOutcome = Endpoint | LocalReply | None
 """What became of a call: the endpoint that it registers, or the proxy's own reply to it."""
@@ -113,7 +113,7 @@ class Request(msgspec.Struct, frozen=True):
         return all(call is None or method_spec(call.method) == NO_SPEC for call in self.calls)
 
 
-class Exported(msgspec.Struct, frozen=True):
+class ExportedRequest(msgspec.Struct, frozen=True):
     """A request made ready for the master, and what became of each of its calls.
 
     ``body`` is what the master gets; None if it gets nothing, since the proxy answers all calls.
@@ -130,13 +130,13 @@ class Exported(msgspec.Struct, frozen=True):
         triples = [o.triple() for o in self.outcomes if isinstance(o, LocalReply)]
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
-    def facts(self) -> "list[RegistryChange]":
+    def registry_changes(self) -> "list[RegistryChange]":
         """What the registry has to learn from the calls that the proxy answers."""
-        local = (o for o in self.outcomes if isinstance(o, Answered))
-        return [o.fact for o in local if o.fact]
+        local = (o for o in self.outcomes if isinstance(o, LocalAnswer))
+        return [o.change for o in local if o.change]
 
 
-class Result(msgspec.Struct, frozen=True):
+class CallResult(msgspec.Struct, frozen=True):
     """A call that the master has answered: its ROS status and value, and the endpoint it registers.
 
     ``triple`` is None where the reply holds nothing that is rewritten, and was not read.
@@ -174,10 +174,10 @@ class MasterReply(msgspec.Struct, frozen=True):
     ``results`` leaves out faults and malformed triples.
     """
 
-    exported: Exported
+    exported: ExportedRequest
     body: bytes
     value: Value | None
-    results: tuple[Result, ...]
+    results: tuple[CallResult, ...]
 
     def param_names(self) -> Iterator[str]:
         """The names of parameters that it lists."""
@@ -185,7 +185,7 @@ class MasterReply(msgspec.Struct, frozen=True):
             if result.call.method == "getParamNames" and result.value:
                 yield from (item.text for item in result.value.items)
 
-    def facts(self, now: float) -> list[RegistryChange]:
+    def registry_changes(self, now: float) -> list[RegistryChange]:
         """What the registry has to learn from the calls that the master accepted.
 
         The master also accepts what changes nothing: a node that makes room for another of its
@@ -193,7 +193,7 @@ class MasterReply(msgspec.Struct, frozen=True):
         """
         changes = []
         for result in self.results:
-            affected = registration(result.call, now, self.exported.request.caller.address)
+            affected = registration_of(result.call, now, self.exported.request.caller.address)
             if affected and result.accepted and result.endpoint:
                 registers = method_spec(result.call.method).registers is not None
                 changes.append(RegistryChange(affected, result.endpoint if registers else None))
@@ -218,7 +218,7 @@ def read_request(body: bytes, caller: Caller, limits: Limits = OWN_REPLY) -> Req
     return Request(body, calls, True, replace(caller, caller_id=caller_id), inner_items(call))
 
 
-def read_reply(exported: Exported, reply: bytes) -> MasterReply:
+def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
     """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response.
 
     Of one that holds no address only the status is read: the value of a parameter that a node
@@ -227,7 +227,7 @@ def read_reply(exported: Exported, reply: bytes) -> MasterReply:
     if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
         call, endpoint = exported.request.calls[0], exported.outcomes[0]
         if call and not isinstance(endpoint, LocalReply):
-            return MasterReply(exported, reply, None, (Result(call, status, None, endpoint),))
+            return MasterReply(exported, reply, None, (CallResult(call, status, None, endpoint),))
     value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
@@ -239,7 +239,7 @@ def registering_uri(call: Call | None) -> str | None:
     return call.string(method_spec(call.method).caller_api)
 
 
-def registration(call: Call, now: float, source: str) -> Registration | None:
+def registration_of(call: Call, now: float, source: str) -> Registration | None:
     """What a call from an address registers or unregisters; None for any other call."""
     spec, caller_id = method_spec(call.method), caller_id_of(call)
     kind, name = spec.registers or spec.unregisters, call.string(spec.name)
@@ -248,11 +248,11 @@ def registration(call: Call, now: float, source: str) -> Registration | None:
     name, type_ = resolve_name(name, caller_id), call.string(spec.type) or "*"
     service_api = call.string(spec.service_api)
     if service_api is not None:
-        service_api = placed(service_api, source)
+        service_api = with_caller_address(service_api, source)
     return Registration(kind, name, caller_id, type_, service_api, now)
 
 
-def second_name(call: Call) -> str:
+def second_parameter_name(call: Call) -> str:
     """The topic, service or node that a call's second parameter names."""
     return resolve_name(call.string(1) or "", caller_id_of(call))
 
@@ -262,7 +262,7 @@ def caller_id_of(call: Call) -> str:
     return call.string(0) or ""
 
 
-def _results(exported: Exported, value: Value) -> Iterator[Result]:
+def _results(exported: ExportedRequest, value: Value) -> Iterator[CallResult]:
     """The calls that went to the master with their ROS triples; faults are left out."""
     triples: Sequence[Value | None] = [value]
     if exported.request.multicall:
@@ -271,4 +271,4 @@ def _results(exported: Exported, value: Value) -> Iterator[Result]:
     sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalReply)]
     for (call, endpoint), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):
-            yield Result(call, triple.items[0].integer(), triple, endpoint)
+            yield CallResult(call, triple.items[0].integer(), triple, endpoint)

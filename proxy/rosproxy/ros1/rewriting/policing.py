@@ -17,7 +17,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry import hidden
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from rosproxy.ros1.rewriting.master_calls import Answered, RegistryChange, second_name
+from rosproxy.ros1.rewriting.master_calls import LocalAnswer, RegistryChange, second_parameter_name
 
 KINDS = {
     Kind.PUBLISHER: RuleKind.PUBLISH,
@@ -61,13 +61,13 @@ def param_use_of(call: Call) -> ParamUse | None:
 
 def hidden_registration(
     registration: Registration, endpoint: Endpoint, caller: Caller, addressing: Addressing
-) -> Answered:
+) -> LocalAnswer:
     """The answer to a registration that the master is not told of."""
     caller, registry = replace(caller, endpoint=endpoint), addressing.registry
     fact = RegistryChange(registration, endpoint)
     if registration.kind is Kind.SERVICE:
         text = f"Registered [{registration.caller_id}] as provider of [{registration.name}]"
-        return Answered(1, text, 1, fact)
+        return LocalAnswer(1, text, 1, fact)
     if registration.kind is Kind.PUBLISHER:
         endpoints: Iterable[Endpoint] = (
             e for e, _ in hidden.subscribers_inside(registry, registration.name)
@@ -76,37 +76,37 @@ def hidden_registration(
     else:
         endpoints = hidden.publishers_inside(registry, registration.name)
         text = f"Subscribed to [{registration.name}]"
-    return Answered(1, text, _imported(dict.fromkeys(endpoints), caller, addressing), fact)
+    return LocalAnswer(1, text, _imported(dict.fromkeys(endpoints), caller, addressing), fact)
 
 
-def hidden_end(registration: Registration) -> Answered:
+def hidden_unregistration(registration: Registration) -> LocalAnswer:
     """The answer to a call that ends a registration of which the master knows nothing."""
     text = f"Unregistered [{registration.caller_id}] as provider of [{registration.name}]"
-    return Answered(1, text, 1, RegistryChange(registration, None))
+    return LocalAnswer(1, text, 1, RegistryChange(registration, None))
 
 
-def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> Answered | None:
+def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> LocalAnswer | None:
     """The answer to lookupService, if the master does not know of the service."""
-    endpoint = hidden.service(addressing.registry, second_name(call))
+    endpoint = hidden.service(addressing.registry, second_parameter_name(call))
     if endpoint is None:
         return None
     uri = addressing.advertised_service(endpoint)
-    imported = addressing.import_service(uri, second_name(call), caller)
-    return Answered(1, f"rosrpc URI: [{imported}]", imported)
+    imported = addressing.import_service(uri, second_parameter_name(call), caller)
+    return LocalAnswer(1, f"rosrpc URI: [{imported}]", imported)
 
 
-def hidden_node(call: Call, caller: Caller, addressing: Addressing) -> Answered | None:
+def hidden_node(call: Call, caller: Caller, addressing: Addressing) -> LocalAnswer | None:
     """The answer to lookupNode, if the master knows nothing of that node."""
-    endpoint = hidden.node(addressing.registry, second_name(call))
+    endpoint = hidden.node(addressing.registry, second_parameter_name(call))
     if endpoint is None:
         return None
     uri = addressing.import_slave(addressing.advertised_uri(endpoint), caller)
-    return Answered(1, "node api", uri)
+    return LocalAnswer(1, "node api", uri)
 
 
-def no_provider(reason: str) -> Answered:
+def no_provider(reason: str) -> LocalAnswer:
     """The answer to lookupService for a service that the node is not to find."""
-    return Answered(-1, f"no provider (rosproxy: {reason})", "")
+    return LocalAnswer(-1, f"no provider (rosproxy: {reason})", "")
 
 
 def no_publisher(topic: str, reason: str) -> list[object]:

@@ -52,17 +52,17 @@ def from_inside(caller: Caller, master_uri: str, addressing: Addressing) -> Call
     return CallView(exported, partial(addressing.import_slave, caller=caller), master_uri)
 
 
-def rewritten(method: str) -> bool:
+def is_rewritten(method: str) -> bool:
     """Whether anything in a call or its reply is rewritten."""
     return method in _REWRITTEN
 
 
-def passes(method: str) -> bool:
+def passes_unread(method: str) -> bool:
     """Whether a call passes unread: it holds no address, and nothing in it is looked at.
 
     A multicall is taken apart, and a ``shutdown`` may be kept from the node.
     """
-    return not (rewritten(method) or method in ("shutdown", MULTICALL))
+    return not (is_rewritten(method) or method in ("shutdown", MULTICALL))
 
 
 def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
@@ -100,7 +100,7 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
     return xmlrpc.apply(reply, edits)
 
 
-def sent_directly(call: Call, reply: bytes, host: str, address: str) -> bytes:
+def with_address_in_reply(call: Call, reply: bytes, host: str, address: str) -> bytes:
     """A node's reply with an address in place of a host's name where a topic is to be had.
 
     So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
@@ -126,7 +126,7 @@ def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
     )
 
 
-def told_uris(call: Call, reply: bytes) -> list[str]:
+def peer_uris(call: Call, reply: bytes) -> list[str]:
     """The slave URIs of other nodes in a reply."""
     triple = ros_triple(xmlrpc.parse_reply(reply))
     if triple is None or call.method != "getBusInfo":
@@ -147,7 +147,7 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
     topic, listed = call.string(1) or "", set(announced_publishers(call))
     return any(
         endpoint.settles_at > now
-        and topic in endpoint.shown(Kind.PUBLISHER)
+        and topic in endpoint.names_at_master(Kind.PUBLISHER)
         and addressing.advertised_uri(endpoint) not in listed
         for endpoint in addressing.registry
     )
@@ -181,7 +181,7 @@ def send_to(triple: Value, target: HostPort) -> list[Edit]:
     return edits + _in_message(triple, f"{host.text}:{port.text}", str(target))
 
 
-def replace_held(triple: Value, text: str) -> list[Edit]:
+def replace_value(triple: Value, text: str) -> list[Edit]:
     """Edits by which a reply gives another text, also where its status message quotes it."""
     value = triple.items[2]
     return [xmlrpc.replace(value, text), *_in_message(triple, value.text, text)]
@@ -220,4 +220,4 @@ def _rewrite_uri(method: str, triple: Value, view: CallView) -> list[Edit]:
     if not text:
         return []
     uri = view.master_uri if method == "getMasterUri" else view.rewrite_in_reply(text)
-    return replace_held(triple, uri)
+    return replace_value(triple, uri)

@@ -20,12 +20,12 @@ PROTOCOL = "UDPROS"
 class UdprosOffer(msgspec.Struct, frozen=True):
     """Where a subscriber wants its datagrams, and the topic that its connection header names.
 
-    ``topic`` is empty and ``where`` None if that can't be read.
+    ``topic`` is empty and ``receiver`` None if that can't be read.
     """
 
     value: Value
     topic: str
-    where: HostPort | None
+    receiver: HostPort | None
 
 
 def read_offers(call: Call) -> list[UdprosOffer]:
@@ -39,9 +39,9 @@ def read_offers(call: Call) -> list[UdprosOffer]:
     ]
 
 
-def lead_to(offer: UdprosOffer, target: HostPort | None) -> list[Edit]:
+def redirect_offer(offer: UdprosOffer, target: HostPort | None) -> list[Edit]:
     """The edits by which an offer leads elsewhere; None takes it out of the call."""
-    if target is None or offer.where is None:
+    if target is None or offer.receiver is None:
         return [xmlrpc.remove(offer.value)]
     _, _, host, port, *_ = offer.value.items
     return [xmlrpc.replace(host, target.host), xmlrpc.replace(port, str(target.port))]

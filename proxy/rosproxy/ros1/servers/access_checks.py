@@ -21,18 +21,18 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from rosproxy.ros1.rewriting.master_api import holder
+from rosproxy.ros1.rewriting.master_api import unregistering_endpoint
 from rosproxy.ros1.rewriting.master_calls import (
     NO_REPLY_CHANGES,
-    Answered,
     CallOutcome,
+    LocalAnswer,
     LocalReply,
     MasterReply,
     Refusal,
     ReplyChanges,
     Request,
-    registration,
-    second_name,
+    registration_of,
+    second_parameter_name,
 )
 from rosproxy.ros1.rewriting.policing import ParamUse
 from rosproxy.ros1.rewriting.slave_api import MASTER_ONLY
@@ -93,7 +93,7 @@ class AccessChecks:
         if use is None:
             return None
         verdict = self._judge_use(use, caller_id or "", source)
-        return _refusal(self._policy.tell(verdict, use.kind, f"of {caller_id}", source))
+        return _refusal(self._policy.report(verdict, use.kind, f"of {caller_id}", source))
 
     def judge_registration(
         self, call: Call, admission: CallOutcome, caller: Caller, now: float
@@ -101,7 +101,7 @@ class AccessChecks:
         """What becomes of a call that registers or unregisters, once it is admitted."""
         if self.idle or isinstance(admission, LocalReply):
             return admission
-        affected, spec = registration(call, now, caller.address), method_spec(call.method)
+        affected, spec = registration_of(call, now, caller.address), method_spec(call.method)
         if affected is None or affected.kind is Kind.PARAM:  # parameters were judged before
             return admission
         if spec.unregisters:
@@ -116,14 +116,14 @@ class AccessChecks:
         concealed = replace(affected, hidden=True)
         return policing.hidden_registration(concealed, admission, caller, self._addressing)
 
-    def unseen(self, reply: MasterReply) -> ReplyChanges:
+    def reply_changes(self, reply: MasterReply) -> ReplyChanges:
         """What the policy changes in the master's reply."""
         if self.idle:
             return NO_REPLY_CHANGES
         publishers, caller = dict[str, list[str]](), reply.exported.request.caller
         for result in reply.results:
             if method_spec(result.call.method).registers is Kind.SUBSCRIBER and result.endpoint:
-                topic = second_name(result.call)
+                topic = second_parameter_name(result.call)
                 publishers[topic] = policing.publishers_for(
                     result.endpoint, topic, [], self._addressing
                 )
@@ -148,7 +148,7 @@ class AccessChecks:
         for resolved in policing.topic_names(name, caller_id):
             verdict = self._policy.judge(kind, resolved, callers, endpoint.address)
             if verdict.rule is not None and not self._is_inside(source):
-                self._policy.tell(verdict, kind, f"{resolved} of {endpoint.label}", source)
+                self._policy.report(verdict, kind, f"{resolved} of {endpoint.label}", source)
                 if not verdict.allowed:
                     return verdict.reason
         return None
@@ -225,7 +225,9 @@ class AccessChecks:
         if is_from_master and source in await self._upstream.master_addresses():
             return None
         subject = f"{method} at {endpoint.label}"
-        return None if self._policy.tell(verdict, kind, subject, source).allowed else verdict.reason
+        return (
+            None if self._policy.report(verdict, kind, subject, source).allowed else verdict.reason
+        )
 
     def may_bypass(self, endpoint: Endpoint) -> bool:
         """Whether a node's topics may go where no header is read: forwarded by the kernel."""
@@ -250,10 +252,10 @@ class AccessChecks:
         if not verdict.allowed and use.below and call.method != "subscribeParam":
             verdict = await self._judge_names(use, call, caller.address, params)
         subject = f"{use.names[0]} of {caller_id}"
-        return _refusal(self._policy.tell(verdict, use.kind, subject, caller.address))
+        return _refusal(self._policy.report(verdict, use.kind, subject, caller.address))
 
     def _judge_lookup(self, call: Call, caller: Caller, caller_id: str) -> LocalReply | None:
-        name = second_name(call)
+        name = second_parameter_name(call)
         provider = self._registry.services.get(name)
         if provider and not provider[0].health.cleaned:
             return policing.hidden_service(call, caller, self._addressing)
@@ -289,11 +291,11 @@ class AccessChecks:
         verdicts = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
         return strictest([*exact, *verdicts])
 
-    def _judge_end(self, ended: Registration, call: Call, caller: Caller) -> Answered | None:
+    def _judge_end(self, ended: Registration, call: Call, caller: Caller) -> LocalAnswer | None:
         """The answer to a call that ends what the master does not know of."""
-        endpoint = holder(call, caller, self._addressing)
+        endpoint = unregistering_endpoint(call, caller, self._addressing)
         current = endpoint.registrations.get(ended.key) if endpoint else None
-        return policing.hidden_end(current) if current and current.hidden else None
+        return policing.hidden_unregistration(current) if current and current.hidden else None
 
 
 class _KnownParams:

@@ -26,7 +26,7 @@ from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import method_spec
-from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, placed
+from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.health import ProbeResult
@@ -56,7 +56,7 @@ class Cleanup(Protocol):
 class Verification(Protocol):
     """Asks nodes that only the master tells of; see `rosproxy.ros1.upkeep.recovery`."""
 
-    async def hasten(self) -> None:
+    async def wait_for_dead_claim(self) -> None:
         """Wait a moment until one of them turns out dead."""
 
 
@@ -85,7 +85,7 @@ class NodeAdmission:
             return None
         if self._context.retired:
             return Refusal(RETIRED)
-        uri = placed(uri, caller.address)
+        uri = with_caller_address(uri, caller.address)
         node = parse_slave_uri(uri)
         endpoint = self._context.registry.admitted(node, caller.address)
         if endpoint is not None and not endpoint.never_found:
@@ -94,7 +94,7 @@ class NodeAdmission:
             return Refusal(
                 f"rosproxy: caller_api {uri[:200]!r} is not of the form http://host:port/"
             )
-        if self._context.addressing.handed_out(uri, caller):
+        if self._context.addressing.is_own_uri(uri, caller):
             return None
         return await self._admit_new(uri, node, call, caller)
 
@@ -182,7 +182,7 @@ class NodeAdmission:
             return True
         if not answers:
             return False
-        await self._verification.hasten()
+        await self._verification.wait_for_dead_claim()
         return self._context.registry.pool.free > 0 or await self._give_up_dead()
 
     async def _give_up_dead(self) -> bool:
@@ -191,7 +191,7 @@ class NodeAdmission:
         It may have come back while the master was told: then it keeps its port.
         """
         registry = self._context.registry
-        endpoint = registry.dead()
+        endpoint = registry.dead_endpoint()
         if endpoint is None:
             return False
         label, port, fields = endpoint.label, endpoint.port, endpoint.log_fields
@@ -303,7 +303,9 @@ class NodeAdmission:
 def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
     """The service that a call registers, and its port; None if it registers another thing."""
     spec = method_spec(call.method)
-    service = parse_service_uri(placed(call.string(spec.service_api) or "", caller.address))
+    service = parse_service_uri(
+        with_caller_address(call.string(spec.service_api) or "", caller.address)
+    )
     return (call.string(spec.name) or "", service.port) if service else None
 
 

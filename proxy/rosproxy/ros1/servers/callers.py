@@ -7,7 +7,7 @@ An operator tells of a container some tenths of a second after its start, and th
 call may be faster. So a call from an address that is not selected waits for news, up to
 NEWS_TIMEOUT. Right after a start nobody is known to be selected yet: where an operator runs, all
 calls wait for its first word, up to NEWS_TIMEOUT, and are let in if none comes, so that an operator
-that is away stops nobody (`Callers.hold`).
+that is away stops nobody (`Callers.await_operator`).
 
 What is refused gets HTTP 403 with the reason, not an XML-RPC fault: roscpp takes a fault for the
 master's last word and never asks again (master.cpp, execute), but goes on trying after anything
@@ -61,7 +61,7 @@ class Callers:
         news, self._news = self._news, asyncio.Event()
         news.set()
 
-    async def hold(self) -> None:
+    async def await_operator(self) -> None:
         """Have callers wait for an operator's first word, for NEWS_TIMEOUT at most from now on.
 
         None is waited for without the hash of a token, by which operators start their proxies.
@@ -73,14 +73,14 @@ class Callers:
             log.info("no operator has told whom it selects: all of the inside networks are let in")
             self._begun.set()
 
-    async def begin(self) -> None:
-        """Wait as long as callers are to wait after a start; see `hold`."""
+    async def wait_until_begun(self) -> None:
+        """Wait as long as callers are to wait after a start; see `await_operator`."""
         await self._begun.wait()
 
     async def refusal(self, source: str) -> str | None:
         """Why a caller is refused, in one line; None if it is let in."""
         if not self._begun.is_set() and not is_own(source):
-            await self.begin()
+            await self.wait_until_begun()
         if self._client_kind(source) is ClientKind.ADMITTED:
             return None
         await self._wait_for_news(source)

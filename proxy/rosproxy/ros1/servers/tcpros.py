@@ -42,7 +42,7 @@ class NotOffered(Exception):
     """A node says that it does not have the topic or service that somebody connects for."""
 
 
-class Target(Protocol):
+class TcprosTarget(Protocol):
     """The node that a connection to one of the proxy's ports leads to."""
 
     inside: bool
@@ -52,7 +52,7 @@ class Target(Protocol):
     def port(self) -> int:
         """The proxy's port."""
 
-    def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
+    def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why somebody may not have a topic or service; None if he may."""
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
@@ -98,7 +98,7 @@ class TcprosServer:
         for relay in self.relays:
             relay.sample(now)
 
-    async def serve(self, target: Target, peer: str, conn: socket.socket) -> None:
+    async def serve(self, target: TcprosTarget, peer: str, conn: socket.socket) -> None:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
             header = await read_header(self._context, peer, conn)
@@ -107,7 +107,7 @@ class TcprosServer:
             await self._refuse(conn, str(error), "bad header")
             return
         version = self._context.policy.version
-        if denial := target.why_not(kind, name, peer, caller_id):
+        if denial := target.denial_reason(kind, name, peer, caller_id):
             await self._refuse(conn, denial, "denied")
             return
         try:
@@ -125,7 +125,7 @@ class TcprosServer:
             self._fail(target, conn, name)
             return
         changed = self._context.policy.version != version
-        if changed and target.why_not(kind, name, peer, caller_id):
+        if changed and target.denial_reason(kind, name, peer, caller_id):
             node.close()
             self._fail(target, conn, name)
             return
@@ -151,12 +151,12 @@ class TcprosServer:
         conn.close()
         self._context.metrics.relay_errors.labels(reason).inc()
 
-    def _finished(self, target: Target, relay: Relay) -> None:
+    def _finished(self, target: TcprosTarget, relay: Relay) -> None:
         target.note_disconnection()
         self._context.gate.leave(relay.peer, relay.port)
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
-    def _fail(self, target: Target, conn: socket.socket, name: str) -> None:
+    def _fail(self, target: TcprosTarget, conn: socket.socket, name: str) -> None:
         """Reset, as a node that is gone would: roscpp and rospy try again."""
         self._context.metrics.relay_errors.labels("node unreachable").inc()
         sockets.reset_on_close(conn)
@@ -236,7 +236,7 @@ class InsideNode:
         """The lease."""
         return self._endpoint.port
 
-    def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
+    def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why somebody outside may not have a topic or service; None if he may."""
         rule_kind = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
         return self._access.outside_may_not(rule_kind, name, self._endpoint, peer)

@@ -56,13 +56,13 @@ _Answer = TypeVar("_Answer")
 class IncomingCall:
     """One XML-RPC request: its body, who sent it and where it arrived.
 
-    ``hold`` is told how many bytes more the call takes in memory until it is answered; it raises
+    ``charge`` is told how many bytes more the call takes in memory until it is answered; it raises
     OverBudget.
     """
 
     def __init__(self, request: web.BaseRequest, hold: Callable[[int], None]) -> None:
         protocol = request.protocol
-        self.body, self.hold, self._request = b"", hold, request
+        self.body, self.charge, self._request = b"", hold, request
         self.source = _source(request)
         self.local = _address(protocol.sockname)
         self.host_header = request.headers.get("Host", "")
@@ -100,7 +100,9 @@ Guard = Callable[[str], Awaitable[str | None]]
 """Why a source's calls are refused, in one line, before they are read; None if they are not."""
 
 
-async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[_Answer]) -> _Answer:
+async def count_reply(
+    metrics: Metrics, api: str, method: str, reply: Awaitable[_Answer]
+) -> _Answer:
     """A forwarded call's reply, once it is counted whether there was one. Raises Unreachable."""
     try:
         answer = await reply
@@ -261,7 +263,7 @@ class XmlRpcServer(web.Server):
         if isinstance(reply, LongReply):
             return await self._send_long(request, call, reply)
         if len(reply) > passing.SHORT:
-            call.hold(len(reply))
+            call.charge(len(reply))
         return await _send(request, DocumentReply(reply))
 
     async def _read(
@@ -318,7 +320,7 @@ class XmlRpcServer(web.Server):
         """
         while len(call.body) < passing.HEAD and not request.content.at_eof():
             chunk = await request.content.readany()
-            call.hold(len(chunk))
+            call.charge(len(chunk))
             call.body += chunk
         method = passing.method_of(call.body)
         watch = service.watch(method, size) if method else None
@@ -330,7 +332,7 @@ class XmlRpcServer(web.Server):
         return LongCall(method, size, call.body, request.content, watch)
 
     async def _read_rest(self, request: web.BaseRequest, call: IncomingCall) -> None:
-        rest = await read_bounded(request.content, self._limits.size - len(call.body), call.hold)
+        rest = await read_bounded(request.content, self._limits.size - len(call.body), call.charge)
         await self._take_in(call, call.body + rest, len(call.body) + len(rest))
 
     async def _take_in(self, call: IncomingCall, body: bytes, charged: int = 0) -> None:
@@ -338,14 +340,14 @@ class XmlRpcServer(web.Server):
         if len(body) > self._limits.size:
             raise TooLong(self._limits.size)
         call.body, values = body, body.count(b"<value")
-        call.hold(len(body) - charged + VALUE * values)
+        call.charge(len(body) - charged + VALUE * values)
         if values > MANY_VALUES:
             await self._context.yield_to_others()
 
     async def _pass_on(
         self, service: LongCalls, call: IncomingCall, long_call: LongCall
     ) -> bytes | LongReply:
-        with Charge(self._context.passing, call.source) as charge:
+        with Charge(self._context.unread_calls, call.source) as charge:
             charge.add(1)
             return await service.pass_on(call, long_call)
 
@@ -355,7 +357,7 @@ class XmlRpcServer(web.Server):
         """Send a reply on, piece by piece. Raises OverBudget."""
         response = DocumentReply(b"", reply.size)
         try:
-            with Charge(self._context.passing, call.source) as charge:
+            with Charge(self._context.unread_calls, call.source) as charge:
                 charge.add(1)
                 await response.prepare(request)
                 async for piece in reply.pieces():

@@ -54,14 +54,14 @@ class Outside:
 
     async def ask(self, stand_in: StandIn, body: bytes, path: str) -> bytes:
         """Forward a slave API call to a node outside; its answer. Raises Unreachable."""
-        path = path if stand_in.kept else path_of(stand_in.uri)
+        path = path if stand_in.is_uri_kept else path_of(stand_in.uri)
         try:
-            await self.reach(stand_in.where)
-            return await self._context.upstream.post_to_node(stand_in.where, body, path=path)
+            await self.reach(stand_in.target)
+            return await self._context.upstream.post_to_node(stand_in.target, body, path=path)
         except OSError as error:
             if isinstance(error, ConnectionRefusedError):
                 self._note_refused(stand_in)
-            raise Unreachable(f"node at {stand_in.where}: {error}") from None
+            raise Unreachable(f"node at {stand_in.target}: {error}") from None
         except Unreachable as error:
             if error.refused:
                 self._note_refused(stand_in)
@@ -70,7 +70,7 @@ class Outside:
     async def ask_topic_port(self, stand_in: StandIn, topic: str) -> int | None:
         """The TCPROS port that a node outside names for a topic; None if it names none."""
         try:
-            slave = await self.reach(stand_in.where)
+            slave = await self.reach(stand_in.target)
             port = await self._context.nodes.topic_port(slave, topic)
         except (OSError, Unreachable, MasterError) as error:
             log.debug("%s gives no TCPROS port for %s: %s", stand_in.uri, topic, error)
@@ -83,12 +83,12 @@ class Outside:
         """A connection to a TCPROS port of a node outside; None if there is none."""
         if port is None:
             return None
-        target = HostPort(stand_in.where.host, port)
+        target = HostPort(stand_in.target.host, port)
         try:
             return await self._dial(target, CONNECT_TIMEOUT)
         except OSError as error:  # a time-out is one, too
             log.debug("%s: %s", target, error)
-            if isinstance(error, ConnectionRefusedError) and target == stand_in.where:
+            if isinstance(error, ConnectionRefusedError) and target == stand_in.target:
                 self._note_refused(stand_in)
             return None
 
@@ -110,10 +110,12 @@ class Outside:
     def _leads_back(self, target: HostPort) -> bool:
         """Whether an address and port are inside, or the proxy's own."""
         stand_ins, address = self._context.stand_ins, target.host
-        inside = stand_ins.both and is_inside(address, self._context.addressing.networks)
+        inside = stand_ins.is_bidirectional and is_inside(
+            address, self._context.addressing.networks
+        )
         if inside or is_loopback(address):
             return True
-        return is_own(address) and stand_ins.is_proxys(target.port)
+        return is_own(address) and stand_ins.is_own_port(target.port)
 
 
 @dataclass(slots=True)
@@ -131,7 +133,7 @@ class OutsideNode:
         """The port that stands in for it."""
         return self._stand_in.local.port
 
-    def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
+    def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why a node inside may not have a topic or service; None if it may."""
         rule_kind = RuleKind.CALL if kind == "service" else RuleKind.SUBSCRIBE
         return self._access.inside_may_not(rule_kind, name, peer, caller_id)
@@ -140,8 +142,8 @@ class OutsideNode:
         """A connection to the node, which is asked for its port again if the known one refuses."""
         outside, stand_in = self._outside, self._stand_in
         is_service = parse_service_uri(stand_in.uri) is not None
-        if stand_in.kept or (is_service and kind == "service"):
-            return await outside.connect(stand_in, stand_in.where.port)
+        if stand_in.is_uri_kept or (is_service and kind == "service"):
+            return await outside.connect(stand_in, stand_in.target.port)
         if is_service or kind == "service":
             return None
         node = await outside.connect(stand_in, stand_in.topic_ports.get(name))

@@ -40,7 +40,7 @@ from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
 from rosproxy.ros1.standins.outside import Outside, OutsideNode
 from rosproxy.ros1.standins.udpros import UdprosRelays
 
@@ -166,7 +166,7 @@ class StandInPorts:
             )
         return ports
 
-    def take_fast_ports(self) -> int:
+    def close_fast_ports(self) -> int:
         """Close all fast ports, as no header is read there; how many connections that has cut."""
         count = 0
         for stand_in in self._stand_ins.by_local.values():
@@ -186,13 +186,13 @@ class StandInPorts:
     @property
     def _active(self) -> bool:
         """Whether any URI may need a stand-in now."""
-        return self._stand_ins.both or self._context.upstream.master_address is not None
+        return self._stand_ins.is_bidirectional or self._context.upstream.master_address is not None
 
     def _targets(self, uris: Iterable[str]) -> dict[str, HostPort]:
         """The URIs that need a stand-in, each with the host and port that it has to lead to."""
         if not self._active or self._closed:
             return {}
-        pairs = ((uri, self._context.addressing.foreign(uri)) for uri in uris)
+        pairs = ((uri, self._context.addressing.stand_in_target(uri)) for uri in uris)
         return {uri: target for uri, target in pairs if target}
 
     async def _publishers_of(self, topic: str) -> set[str]:
@@ -305,9 +305,9 @@ class StandInPorts:
         if fast_port is None:
             return stand_in.local
         try:
-            stand_in.address = (await self._outside.reach(stand_in.where)).host
+            stand_in.address = (await self._outside.reach(stand_in.target)).host
         except OSError as error:
-            log.debug("%s: %s", stand_in.where, error)
+            log.debug("%s: %s", stand_in.target, error)
             return stand_in.local
         if syncer.may_forward(stand_in) and await syncer.forwards(stand_in, tcpros_port):
             return HostPort(stand_in.local.host, fast_port)
@@ -345,7 +345,7 @@ class StandInPorts:
 
     async def _serve(self, stand_in: StandIn, conn: socket.socket, peer: str) -> None:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
-        await self._callers.begin()
+        await self._callers.wait_until_begun()
         self._context.refresh_networks()
         if self._context.client_kind(peer) is not ClientKind.ADMITTED:
             log.debug("%s may not use the proxy: refused at %s", peer, stand_in.local)
@@ -364,7 +364,7 @@ class StandInPorts:
             raise Unreachable(f"{call.local} stands in for nobody any more")
         parsed = xmlrpc.parse_call(call.body, self._context.master_call)
         answer = self._answer(stand_in, parsed, call)
-        return await counted(self._context.metrics, "stand_in", parsed.method, answer)
+        return await count_reply(self._context.metrics, "stand_in", parsed.method, answer)
 
     async def _answer(self, stand_in: StandIn, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
         denied = self._access.inside_may_not_ask(parsed, call.source)
@@ -374,17 +374,19 @@ class StandInPorts:
         master = slave_uri(HostPort(caller.proxy, self._context.settings.master_port))
         view = slave_api.from_inside(caller, master, self._context.addressing)
         body = slave_api.rewrite_call(call.body, parsed, view)
-        if not stand_in.kept:
+        if not stand_in.is_uri_kept:
             body = await self.udpros.lead_inwards(stand_in, parsed, body, call.source)
         reply = await self._outside.ask(stand_in, body, call.path)
-        if not slave_api.rewritten(parsed.method):
+        if not slave_api.is_rewritten(parsed.method):
             return reply
-        if stand_in.kept:
-            address = self._context.upstream.master_address or stand_in.where.host
-            return slave_api.sent_directly(parsed, reply, stand_in.where.host.lower(), address)
+        if stand_in.is_uri_kept:
+            address = self._context.upstream.master_address or stand_in.target.host
+            return slave_api.with_address_in_reply(
+                parsed, reply, stand_in.target.host.lower(), address
+            )
         listener, tcpros_port = stand_in.local, slave_api.topic_port(parsed, reply)
         if tcpros_port is not None:
             stand_in.note_topic_port(parsed.string(1) or "", tcpros_port)
             listener = await self._topic_listener(stand_in, tcpros_port)
-        await self.listen_for(slave_api.told_uris(parsed, reply), caller)
+        await self.listen_for(slave_api.peer_uris(parsed, reply), caller)
         return slave_api.rewrite_reply(parsed, reply, listener, view)

@@ -38,7 +38,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
-from rosproxy.ros1.rewriting.udpros import lead_to, read_offers
+from rosproxy.ros1.rewriting.udpros import read_offers, redirect_offer
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.standins.outside import Outside
 
@@ -147,7 +147,7 @@ class UdprosRelays:
         async def redirect(offered: HostPort) -> HostPort | None:
             target, port = HostPort(source, offered.port), stand_in.local.port
             subscription = UdprosSubscription(port, topic, caller_id, source, target, True)
-            publisher = self._context.upstream.reach(stand_in.where).host
+            publisher = self._context.upstream.reach(stand_in.target).host
             sources = await resolve(publisher, NODES)
             ports = _candidates(subscription, settings.ports.listen.ports())
             relay_port = self._relay_port(subscription, condition, settings.bind, ports, sources)
@@ -254,7 +254,7 @@ async def _rewritten(
     topic, edits = call.string(1) or "", list[Edit]()
     for offer in read_offers(call):
         target = None
-        if offer.where and offer.topic == topic and condition.holds():
-            target = await redirect(offer.where)
-        edits += lead_to(offer, target)
+        if offer.receiver and offer.topic == topic and condition.holds():
+            target = await redirect(offer.receiver)
+        edits += redirect_offer(offer, target)
     return xmlrpc.apply(body, edits)

@@ -23,7 +23,7 @@ from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.upkeep.decisions import adoption as decisions
 from rosproxy.ros1.upkeep.decisions.adoption import Container, DirectNode
-from rosproxy.ros1.upkeep.decisions.registration import known_as
+from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 from rosproxy.ros1.upkeep.registrar import FormerUris, Registrar
 from rosproxy.ros1.upkeep.verifier import Verifier
 
@@ -64,7 +64,7 @@ class Adopter:
         async with self._lock:
             graph = await context.upstream.read_graph()
             nodes = decisions.find_direct(graph, inside, context.addressing)
-            infos = await self._inspect({slave for node in nodes for slave in node.places})
+            infos = await self._inspect({slave for node in nodes for slave in node.slaves})
             verified = await self._verify(nodes, infos)
             located, doubts = decisions.locate(nodes, infos, verified)
             for name, reason in doubts.items():
@@ -76,11 +76,11 @@ class Adopter:
 
         The master would else call shutdown at the node's own URI. Raises Unreachable.
         """
-        if caller_id in endpoint.caller_ids and not endpoint.direct:
+        if caller_id in endpoint.caller_ids and not endpoint.has_registered_directly:
             return
         uri = await self._look_up(caller_id)
         advertised = self._context.addressing.advertised_uri(endpoint)
-        if uri and uri != advertised and known_as(endpoint, uri):
+        if uri and uri != advertised and is_known_as(endpoint, uri):
             log.info("%s was registered as %s around the proxy; taken over", caller_id, uri)
             try:
                 async with self._lock:
@@ -131,7 +131,7 @@ class Adopter:
     ) -> set[tuple[str, HostPort]]:
         """The names with the slave addresses at which their nodes bear out what is registered."""
         judge = Verifier(self._context.nodes).judge
-        tried = [(node, slave) for node in nodes for slave in node.places if slave in infos]
+        tried = [(node, slave) for node in nodes for slave in node.slaves if slave in infos]
         borne_out = await asyncio.gather(
             *(judge(slave, node.registrations, infos[slave]) for node, slave in tried)
         )

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 GONE_TIMEOUT = 0.5
 """Seconds that a node has to answer at an address that is said to be gone."""
-YOUNG = 3.0
+YOUNG_NODE_AGE = 3.0
 """Seconds since its last registration in which a silent node gets a second chance."""
 SECOND_CHANCE = 1.0
 """Seconds after which a silent node gets its second chance."""
@@ -104,14 +104,14 @@ class ContainerEvents:
     async def _remove(self, addresses: Collection[str]) -> int:
         """Unregister the nodes at addresses that are gone; those that answer live on."""
         endpoints = [e for e in self.context.registry if e.location.address in addresses]
-        return await self._remove_dead(endpoints, self.context.now() - YOUNG)
+        return await self._remove_dead(endpoints, self.context.now() - YOUNG_NODE_AGE)
 
     async def _remove_dead(self, endpoints: Sequence[Endpoint], since: float) -> int:
         """Unregister nodes that don't answer; silent ones that registered ``since`` then, later."""
         probe = self.context.nodes.probe
         answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in endpoints))
         outcomes = {e: answer.probe for e, answer in zip(endpoints, answers, strict=True)}
-        dead = liveness.dead(outcomes, since)
+        dead = liveness.dead_endpoints(outcomes, since)
         for endpoint in dead:
             self._close(endpoint)
         alive = [endpoint for endpoint in endpoints if endpoint not in dead]
@@ -137,7 +137,7 @@ class ContainerEvents:
         answers = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
         infos = {e: info for e, info in zip(candidates, answers, strict=True) if info}
         former_uris = {endpoint: addressing.advertised_uri(endpoint) for endpoint in infos}
-        locations = {e: liveness.new_place(e, candidates[e]) for e in infos}
+        locations = {e: liveness.moved_location(e, candidates[e]) for e in infos}
         relocated = registry.move(locations)
         for endpoint in relocated:
             self._settle(endpoint, former_uris[endpoint], infos[endpoint])

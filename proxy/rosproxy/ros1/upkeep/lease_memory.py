@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from rosproxy.ros1.clients.master import MasterError
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry import memory
-from rosproxy.ros1.registry.memory import Remembered
+from rosproxy.ros1.registry.memory import RememberedLease
 
 REFUSED = (
     "the master does not keep this parameter ({}): nodes have to be restarted after a restart of "
@@ -31,10 +31,10 @@ class LeaseMemory:
         self._stored: object = None
         """What the master has, as far as is known."""
 
-    async def read(self) -> Mapping[int, Remembered]:
+    async def read(self) -> Mapping[int, RememberedLease]:
         """What a former process has left, by port. Raises Unreachable."""
         self._stored = await self._read()
-        return memory.remembered(self._stored, self._context.settings.ports)
+        return memory.read_leases(self._stored, self._context.settings.ports)
 
     async def write(self) -> None:
         """Have the master keep what is known of all leases, unless it does. Raises Unreachable."""
@@ -43,7 +43,7 @@ class LeaseMemory:
             async with self._lock:
                 changes = registry.lease_changes
                 if self._written_changes != changes:
-                    await self._write(memory.to_remember(registry, self._context.settings.ports))
+                    await self._write(memory.leases_text(registry, self._context.settings.ports))
                     self._written_changes = changes
 
     async def look(self) -> None:

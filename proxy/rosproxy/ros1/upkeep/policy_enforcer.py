@@ -32,7 +32,7 @@ ENFORCE_TICK = 0.5
 """Seconds between looks whether the policy has changed."""
 
 
-class Enforced(msgspec.Struct, frozen=True):
+class EnforcementCounts(msgspec.Struct, frozen=True):
     """What a change has led to: registrations hidden and shown, connections cut."""
 
     hidden: int = 0
@@ -68,7 +68,7 @@ class PolicyEnforcer:
             except (Unreachable, MasterError) as error:
                 log.debug("the policy is enforced later: %s", error)
 
-    async def enforce(self) -> Enforced:
+    async def enforce(self) -> EnforcementCounts:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._lock:
             version, self._must_enforce = self._context.policy.version, False
@@ -80,8 +80,8 @@ class PolicyEnforcer:
                 self._must_enforce = True
                 raise
             self._enforced_version = version
-        enforced = Enforced(hidden, shown, cut)
-        if enforced != Enforced():
+        enforced = EnforcementCounts(hidden, shown, cut)
+        if enforced != EnforcementCounts():
             text = "policy: %d registrations are hidden now, %d shown, %d connections were cut"
             log.info(text, hidden, shown, cut)
         return enforced
@@ -108,12 +108,12 @@ class PolicyEnforcer:
 
     def _take_fast_ports(self) -> int:
         """Take fast ports from nodes of which something may be denied; how many connections."""
-        count = 0 if self._access.inside_may_bypass() else self._stand_ins.take_fast_ports()
+        count = 0 if self._access.inside_may_bypass() else self._stand_ins.close_fast_ports()
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:
             if endpoint.fast_port is not None and not self._access.may_bypass(endpoint):
                 count += endpoint.fast_connections
                 self._plane.cut(endpoint)
-                self._leases.take_fast_port(endpoint)
+                self._leases.withdraw_fast_port(endpoint)
         return count

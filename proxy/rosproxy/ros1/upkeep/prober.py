@@ -46,14 +46,16 @@ class Prober:
     _registrar: Registrar
     _resubscriber: Resubscriber
     _recovery: Recovery
-    kept: KeptConnections[Endpoint] = field(init=False)
+    kept_connections: KeptConnections[Endpoint] = field(init=False)
     _probing: set[Endpoint] = field(default_factory=set)
     _sweep_at: float = 0.0
     _limit: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARALLEL_PROBES))
 
     def __post_init__(self) -> None:
         """Begin with no connection."""
-        self.kept = KeptConnections(self._context.nodes, self._context.settings.probe_timeout)
+        self.kept_connections = KeptConnections(
+            self._context.nodes, self._context.settings.probe_timeout
+        )
 
     async def look(self) -> None:
         """Look after all endpoints once."""
@@ -61,7 +63,7 @@ class Prober:
         if context.retired:
             return
         now, interval = context.now(), context.settings.probe_interval
-        for endpoint, result in self.kept.collect(now).items():
+        for endpoint, result in self.kept_connections.collect(now).items():
             self._note_result(endpoint, result, now)
         busy = self._probing | self._recovery.verifying
         for endpoint in liveness.to_look_at(context.registry, now, interval):
@@ -70,12 +72,12 @@ class Prober:
             self._end_if_unused(endpoint)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_INTERVAL
-            self.kept.keep(set(context.registry))
+            self.kept_connections.keep(set(context.registry))
 
     def _ask(self, endpoint: Endpoint, now: float) -> None:
         """Find out how a node is, in the cheapest way that there is."""
         pid = endpoint.health.pid if liveness.may_be_kept(endpoint) else None
-        if pid is None or not self.kept.ask(endpoint, endpoint.slave, pid, now):
+        if pid is None or not self.kept_connections.ask(endpoint, endpoint.slave, pid, now):
             self._begin_probe(endpoint)
 
     def _note_result(self, endpoint: Endpoint, result: ProbeResult | None, now: float) -> None:
@@ -130,7 +132,7 @@ class Prober:
             await self._registrar.come_back(endpoint, pid)
         elif health.pid not in (None, pid):
             await self._registrar.unregister_left_over(endpoint)
-        elif endpoint.direct:
+        elif endpoint.has_registered_directly:
             await self._registrar.reconcile(endpoint)
         health.pid = pid
         if not self._leases.is_open(endpoint):

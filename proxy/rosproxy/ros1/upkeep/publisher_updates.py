@@ -45,7 +45,7 @@ class PublisherUpdates:
 
         All URIs are given as the master holds them.
         """
-        endpoint = self._context.addressing.stands_for(subscriber)
+        endpoint = self._context.addressing.endpoint_of(subscriber)
         if endpoint:
             return await self.update_inside(endpoint, topic, publishers)
         slave = parse_slave_uri(subscriber)
@@ -61,12 +61,12 @@ class PublisherUpdates:
         imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
         return await self._update(endpoint.slave, topic, [*imported])
 
-    def note(self, registration: Registration) -> None:
+    def note_registration(self, registration: Registration) -> None:
         """Note that a registration was made or has ended: subscribers that need it are told."""
         if registration.kind is Kind.PUBLISHER:
-            self.tell([registration.name], registration.hidden)
+            self.update_subscribers([registration.name], registration.hidden)
 
-    def tell(self, topics: Iterable[str], everybody: bool = True) -> None:
+    def update_subscribers(self, topics: Iterable[str], everybody: bool = True) -> None:
         """Tell the subscribers inside that publishers of some topics have changed.
 
         Not ``everybody``: only the hidden subscribers, since the master tells the others.
@@ -107,7 +107,7 @@ class PublisherUpdates:
         await asyncio.gather(*(self._hand(e, r.name, lists.get(e, [])) for e, r in subscribers))
 
     async def _hand(self, endpoint: Endpoint, topic: str, publishers: Sequence[str]) -> None:
-        await self._context.after_registration(endpoint)
+        await self._context.wait_for_registration(endpoint)
         await self.update_inside(endpoint, topic, publishers)
 
     async def _update(self, slave: HostPort, topic: str, publishers: Sequence[str]) -> bool:

@@ -2,20 +2,21 @@
 
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
 graph once, and what the proxy has it remember (`LeaseMemory`), finds the URIs that this proxy
-advertised (`decisions.claims`), and rebuilds the endpoints on the ports that they had. Calls that
-register wait for it: a node that registered before would get another port, and the master would
-shut it down for having moved. Before that an operator's policy is waited for (``--await-policy``),
-or what it denies would be registered for a moment.
+advertised (`decisions.find_claims`), and rebuilds the endpoints on the ports that they had. Calls
+that register wait for it: a node that registered before would get another port, and the master
+would shut it down for having moved. Before that an operator's policy is waited for
+(``--await-policy``), or what it denies would be registered for a moment.
 
 What the master says is only a claim, since anybody can write to it. Until the node itself has
 borne it out (`Verifier`), the endpoint's port is held but refuses. Then subscribers are made to
 connect again (`Resubscriber.announce`). A node that does not answer yet is verified when a probe
 finds it (`Prober`).
 
-A claim keeps no port from a node that lives: where the range is used up, one that registers waits
-a moment for claims that are being verified, and gets the port of one whose node is dead (`hasten`).
-What the master has for nodes that got no port again, although it carries this proxy's own address,
-is nobody's: a former proxy left it behind, and it is taken back (`_sweep`).
+A claim keeps no port from a node that lives: where the range is used up, one that registers waits a
+moment for claims that are being verified, and gets the port of one whose node is dead
+(`wait_for_dead_claim`). What the master has for nodes that got no port again, although it carries
+this proxy's own address, is nobody's: a former proxy left it behind, and it is taken back
+(`_sweep`).
 
 If ports are others after a start, look here: the log names each claim that was refused, and why.
 """
@@ -125,7 +126,7 @@ class Recovery:
             if endpoints:
                 await self._resubscriber.announce(endpoints)
 
-    async def hasten(self) -> None:
+    async def wait_for_dead_claim(self) -> None:
         """Wait a moment for a node that is being verified to turn out dead.
 
         Those that were inspected all that time and are silent count as failing from then on.
@@ -133,7 +134,10 @@ class Recovery:
         end, awaited = self._context.now() + CLAIM_GRACE, set(self.verifying)
         inspected = set(self._inspecting)
         while awaited & self.verifying and self._context.now() < end:
-            if self._context.registry.pool.free or self._context.registry.dead() is not None:
+            if (
+                self._context.registry.pool.free
+                or self._context.registry.dead_endpoint() is not None
+            ):
                 return
             await asyncio.sleep(0.01)
         for endpoint in inspected & self._inspecting:
@@ -143,7 +147,7 @@ class Recovery:
         self._context.refresh_networks()
         memory = await self._memory.read()
         graph = await self._context.upstream.read_graph()
-        claims, forgotten = decisions.claims(graph, self._context.addressing, memory)
+        claims, forgotten = decisions.find_claims(graph, self._context.addressing, memory)
         restored = [(claim, self._restore(claim)) for claim in await self._settle(claims)]
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served_ids = {id(claim) for claim, endpoint in restored if endpoint is not None}
@@ -163,10 +167,10 @@ class Recovery:
         async def ask(claim: Claim) -> None:
             log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
             if is_inside(claim.slave.host, self._context.addressing.networks):
-                claim.said = await self._context.nodes.inspect(claim.slave)
+                claim.node_info = await self._context.nodes.inspect(claim.slave)
 
-        await asyncio.gather(*map(ask, decisions.contested(claims)))
-        return decisions.settle(claims)
+        await asyncio.gather(*map(ask, decisions.contested_claims(claims)))
+        return decisions.choose_claims(claims)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
         """The endpoint of a claim, not trusted yet; None if it is outside, or its port is taken."""
@@ -244,7 +248,7 @@ class Recovery:
         if endpoint.trusted or self._context.registry.by_port.get(endpoint.port) is not endpoint:
             return  # it has registered meanwhile, or was given up for a node that lives
         if info is None:
-            if endpoint.health.answered is None:
+            if endpoint.health.answered_at is None:
                 endpoint.health.note(ProbeResult.SILENT, self._context.now())
             return
         if borne_out is None:
@@ -265,7 +269,9 @@ class Recovery:
         # Neighbours can use the host's name if it leads here.
         if endpoint.location.address == address:
             endpoint.note_named(address in addresses)
-        await self._registrar.disown(endpoint, decisions.others(registrations, info))
+        await self._registrar.disown(
+            endpoint, decisions.unconfirmed_registrations(registrations, info)
+        )
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
             current = list(endpoint.registrations.values())
             await self._registrar.register([(endpoint, r) for r in current])

@@ -60,7 +60,7 @@ class Registrar:
             uri = uris.get(registration.caller_id)
             if uri in (None, self._context.addressing.advertised_uri(endpoint)):
                 to_register.append((endpoint, registration))
-            elif decisions.known_as(endpoint, uri):
+            elif decisions.is_known_as(endpoint, uri):
                 former[registration.caller_id] = endpoint, uri
             else:
                 log.info("%s is registered as %s by now; left to it", registration.caller_id, uri)
@@ -89,7 +89,7 @@ class Registrar:
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
         """Register what a node has and the master does not know of. Raises Unreachable."""
-        missing = decisions.unregistered(endpoint, info)
+        missing = decisions.unregistered_topics(endpoint, info)
         for registration in missing:
             self._context.registry.register(endpoint, registration)
         if missing:
@@ -112,7 +112,7 @@ class Registrar:
         if state is None:
             return
         endpoints = {r: e for e in alive for r in e.registrations.values()}
-        missing = decisions.lost(list(endpoints), state, started)
+        missing = decisions.lost_registrations(list(endpoints), state, started)
         if missing:
             log.warning("the master has lost %d registrations; making them again", len(missing))
             await self.register([(endpoints[r], r) for r in missing])
@@ -142,7 +142,7 @@ class Registrar:
         slave = parse_slave_uri(uri)
         if slave is None:
             return
-        endpoint = addressing.stands_for(uri)  # another node's, which has the port by now
+        endpoint = addressing.endpoint_of(uri)  # another node's, which has the port by now
         names = endpoint.callers if endpoint else ()
         stale = [
             r for r in registrations if uris.get(r.caller_id) == uri and r.caller_id not in names
@@ -171,7 +171,7 @@ class Registrar:
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is None:
             return
-        kept = decisions.still_held(endpoint, info, pid == endpoint.health.pid)
+        kept = decisions.valid_registrations(endpoint, info, pid == endpoint.health.pid)
         for registration in list(endpoint.registrations.values()):
             if registration not in kept and registration.since < endpoint.health.cleaned_at:
                 self._context.registry.unregister(
@@ -190,7 +190,7 @@ class Registrar:
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
             endpoint.replace_topic_ports(info.topic_ports)
-            await self._forget(endpoint, decisions.left_over(endpoint, info, started))
+            await self._forget(endpoint, decisions.left_over_registrations(endpoint, info, started))
 
     async def reconcile(self, endpoint: Endpoint) -> None:
         """Make up for the calls that a node made around the proxy. Raises Unreachable, MasterError.
@@ -200,7 +200,7 @@ class Registrar:
         started = self._context.now()
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
-            await self._forget(endpoint, decisions.vanished(endpoint, info, started))
+            await self._forget(endpoint, decisions.vanished_topics(endpoint, info, started))
             await self.register_missing(endpoint, info)
 
     async def apply_policy(self) -> tuple[int, int]:
@@ -253,7 +253,9 @@ class Registrar:
         subscribers = [(e, r) for e, r in registrations if r.kind is Kind.SUBSCRIBER]
         update = self._publisher_updates.update_inside
         await asyncio.gather(*(update(e, r.name, []) for e, r in subscribers))
-        self._publisher_updates.tell({r.name for _, r in registrations if r.kind is Kind.PUBLISHER})
+        self._publisher_updates.update_subscribers(
+            {r.name for _, r in registrations if r.kind is Kind.PUBLISHER}
+        )
 
     async def _take_back(self, registrations: Iterable[EndpointRegistration]) -> None:
         addressing = self._context.addressing
@@ -293,7 +295,7 @@ class Registrar:
         )
         await asyncio.gather(*updates)
         topics = {r.name for _, r in permitted if r.kind is Kind.PUBLISHER}
-        self._publisher_updates.tell(topics, everybody=False)
+        self._publisher_updates.update_subscribers(topics, everybody=False)
 
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
@@ -308,7 +310,7 @@ class Registrar:
         ended = list(registrations)
         await self._take_back((endpoint, r) for r in ended if not r.hidden)
         for registration in ended:
-            self._publisher_updates.note(registration)
+            self._publisher_updates.note_registration(registration)
 
     async def _free(self, former: FormerUris) -> list[EndpointRegistration]:
         """All registrations of some names, once they are taken back at the master.

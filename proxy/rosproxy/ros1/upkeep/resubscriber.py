@@ -38,7 +38,7 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
-LOOKS = (4.0, 10.0, 25.0, 75.0, 165.0)
+LOOK_DELAYS = (4.0, 10.0, 25.0, 75.0, 165.0)
 """Seconds after which endpoints are looked after that were out of reach for a time.
 
 Before the first a proxy that is replaced by force has ended, and roscpp's first retries are over.
@@ -78,7 +78,7 @@ class Resubscriber:
         """Have endpoints looked at some times from now on."""
         now = self._context.now()
         for endpoint in endpoints:
-            self._look_times[endpoint] = [now + delay for delay in LOOKS]
+            self._look_times[endpoint] = [now + delay for delay in LOOK_DELAYS]
 
     async def announce(self, endpoints: Sequence[Endpoint]) -> None:
         """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError."""
@@ -130,7 +130,7 @@ class Resubscriber:
         state = await self._context.upstream.read_registrations()
         subscriptions = decisions.subscriptions(state, endpoints, self._context.addressing)
         unrelayed = decisions.without_relay(subscriptions, self._tcpros.topic_connections())
-        if not unrelayed and not self._context.stand_ins.both:
+        if not unrelayed and not self._context.stand_ins.is_bidirectional:
             return set()
         graph = Graph(state, await self._context.upstream.look_up("lookupNode", state))
         unrelayed = self._through_proxy(graph, unrelayed)
@@ -158,12 +158,12 @@ class Resubscriber:
 
         def is_relayed(sub: TopicSubscription) -> bool:
             uri = graph.uris.get(sub.caller_id)
-            subscriber = addressing.stands_for(uri) if uri else None
+            subscriber = addressing.endpoint_of(uri) if uri else None
             if subscriber is None:
                 return uri is not None
             caller = self._context.caller_at(subscriber)
             inside_uri = addressing.import_slave(addressing.advertised_uri(sub.endpoint), caller)
-            return addressing.handed_out(inside_uri, caller)
+            return addressing.is_own_uri(inside_uri, caller)
 
         return [s for s in unrelayed if is_relayed(s)]
 
@@ -190,7 +190,7 @@ class Resubscriber:
         """The addresses of the subscribers' hosts, where the kernel's connections are by host."""
 
         async def resolve_host(uri: str) -> list[str]:
-            endpoint = self._context.addressing.stands_for(uri)
+            endpoint = self._context.addressing.endpoint_of(uri)
             slave = endpoint.slave if endpoint else parse_slave_uri(uri)
             return await resolve(self._context.upstream.reach(slave).host, NODES) if slave else []
 
@@ -205,8 +205,8 @@ class Resubscriber:
 
         Nothing where these are reached without the proxy.
         """
-        both, publishers = self._context.stand_ins.both, graph.by_topic(Kind.PUBLISHER)
-        foreign = self._context.addressing.foreign
+        both, publishers = self._context.stand_ins.is_bidirectional, graph.by_topic(Kind.PUBLISHER)
+        foreign = self._context.addressing.stand_in_target
         return [
             (endpoint, r, list(filter(foreign, publishers.get(r.name, ()))))
             for endpoint in (endpoints if both else ())

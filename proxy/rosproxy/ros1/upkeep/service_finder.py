@@ -16,7 +16,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.rewriting.master_calls import Request, second_name
+from rosproxy.ros1.rewriting.master_calls import Request, second_parameter_name
 
 ASK_AGAIN = 5.0
 """Seconds in which nodes are not asked for the same service again."""
@@ -34,7 +34,9 @@ class ServiceFinder:
     async def find_for(self, request: Request) -> None:
         """Register as hidden what nodes inside have of the services that a request looks up."""
         looked_up = {
-            second_name(call) for call in request.calls if call and call.method == "lookupService"
+            second_parameter_name(call)
+            for call in request.calls
+            if call and call.method == "lookupService"
         }
         for name in looked_up - self._context.registry.services.keys():
             await self._find(name)

@@ -65,7 +65,7 @@ class Verifier:
     ) -> bool:
         """Whether it answers for a topic or service, by a name that has registered it."""
         callers = {r.caller_id for r in undecided}
-        topics, services = decisions.to_ask(undecided)
+        topics, services = decisions.topics_and_services_to_ask(undecided)
         for topic in topics:
             port = info.topic_ports.get(topic) or await self._topic_port(slave, topic)
             if port is None:

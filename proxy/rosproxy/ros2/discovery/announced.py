@@ -32,7 +32,7 @@ _VALID = 0x8000_0000
 
 def lease_duration(spdp: Announcement, datagram: bytes) -> float:
     """For how many seconds a participant counts as there without being heard, within bounds."""
-    seconds = spdp.held.seconds(datagram, Pid.PARTICIPANT_LEASE_DURATION)
+    seconds = spdp.parameters.seconds(datagram, Pid.PARTICIPANT_LEASE_DURATION)
     return min(max(USUAL_LEASE if seconds is None else seconds, 1.0), LONGEST_LEASE)
 
 
@@ -48,7 +48,7 @@ def first_metatraffic(spdp: Announcement, datagram: bytes, address: str) -> Host
 
 def traits(spdp: Announcement, datagram: bytes, address: str) -> ParticipantTraits:
     """What a participant at an address says of itself that may keep others from meeting it."""
-    domain = spdp.held.number(datagram, Pid.DOMAIN_ID)
+    domain = spdp.parameters.number(datagram, Pid.DOMAIN_ID)
     return ParticipantTraits(
         None if domain == _UNKNOWN_DOMAIN else domain,
         _security(spdp, datagram),
@@ -69,9 +69,9 @@ def note_endpoints(
             continue
         topic, type_name = (
             announcement.topic(datagram),
-            announcement.held.text(datagram, Pid.TYPE_NAME) or "",
+            announcement.parameters.text(datagram, Pid.TYPE_NAME) or "",
         )
-        qos = read_qos(datagram, announcement.held, kind is EndpointKind.WRITER)
+        qos = read_qos(datagram, announcement.parameters, kind is EndpointKind.WRITER)
         endpoint = DdsEndpoint(kind, topic[:256], type_name[:256], qos)
         notes.note(participant, entity, None if announcement.ended else endpoint)
 
@@ -81,18 +81,18 @@ def _security(spdp: Announcement, datagram: bytes) -> DdsSecurity:
 
     SPDP tells by parameters of its own what DDS Security protects (1.1, 7.4.1.4 and 7.4.1.6).
     """
-    attributes = spdp.held.number(datagram, Pid.PARTICIPANT_SECURITY_INFO)
+    attributes = spdp.parameters.number(datagram, Pid.PARTICIPANT_SECURITY_INFO)
     if attributes is not None and attributes & _VALID and attributes & _PROTECTED:
         return DdsSecurity.PROTECTED
-    tokens = spdp.held.all(Pid.IDENTITY_TOKEN, Pid.PERMISSIONS_TOKEN)
+    tokens = spdp.parameters.all(Pid.IDENTITY_TOKEN, Pid.PERMISSIONS_TOKEN)
     return DdsSecurity.AUTHENTICATED if tokens or attributes else DdsSecurity.NONE
 
 
 def _locator_fault(spdp: Announcement, datagram: bytes, address: str) -> LocatorFault:
     """Why nothing can be passed on to a participant at an address; the first reason."""
     for pid in (Pid.METATRAFFIC_UNICAST_LOCATOR, Pid.DEFAULT_UNICAST_LOCATOR):
-        locators = [read_locator(datagram, spdp.held, p) for p in spdp.held.all(pid)]
-        hosts = {locator.where.host for locator in locators if locator and locator.where}
+        locators = [read_locator(datagram, spdp.parameters, p) for p in spdp.parameters.all(pid)]
+        hosts = {locator.host_port.host for locator in locators if locator and locator.host_port}
         if address in hosts:
             continue
         if hosts:

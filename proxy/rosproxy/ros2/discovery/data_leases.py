@@ -24,7 +24,7 @@ class ForwardedLease:
     """
 
     port: int
-    where: HostPort
+    target: HostPort
     label: str
     fast_port: int | None = None
     fast_peers: Mapping[str, int] = field(default_factory=dict)
@@ -40,12 +40,12 @@ class ForwardedLease:
     @property
     def address(self) -> str:
         """The IP address at which the proxy reaches the participant."""
-        return self.where.host
+        return self.target.host
 
     @property
     def node_ports(self) -> tuple[int]:
         """The port of the locator."""
-        return (self.where.port,)
+        return (self.target.port,)
 
     @property
     def caller_ids(self) -> list[str]:
@@ -99,7 +99,7 @@ class DataLeases:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
                 cached = self._cached.get(port)
-                if cached is not None and (cached.where, cached.label) == (lease.where, label):
+                if cached is not None and (cached.target, cached.label) == (lease.target, label):
                     yield cached
                 else:
-                    yield ForwardedLease(port, lease.where, label)
+                    yield ForwardedLease(port, lease.target, label)

@@ -38,7 +38,7 @@ from rosproxy.ros2.discovery.own import OwnParticipants
 from rosproxy.ros2.discovery.partings import Partings
 from rosproxy.ros2.discovery.policing import has_changed
 from rosproxy.ros2.discovery.rates import DiscoveryRates
-from rosproxy.ros2.discovery.returning import Returning
+from rosproxy.ros2.discovery.returning import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
 from rosproxy.ros2.protocol.envelope import unwrapped
 from rosproxy.ros2.protocol.rtps import (
@@ -77,7 +77,7 @@ class Domain:
     own: OwnParticipants
     inside: InsideParticipants
     outside: OutsideParticipants
-    returning: Returning
+    returning: ReturningParticipants
     refused: Refused
     fragments: FragmentStores
     partings: Partings
@@ -97,7 +97,7 @@ class Domain:
         keeper = Keeper.of(settings.host, settings.ports.listen, settings.number, when)
         inside = InsideParticipants(settings, ports, refused)
         outside = OutsideParticipants(settings, refused)
-        returning, fragments = Returning(settings, ports, keeper), FragmentStores()
+        returning, fragments = ReturningParticipants(settings, ports, keeper), FragmentStores()
         participants = OwnParticipants(
             settings, Observer(own), keeper, inside, outside, returning, fragments
         )
@@ -153,7 +153,9 @@ class Domain:
         leased = self.inside.leases.get(port)
         try:
             if leased is None:
-                if self.ports.remembers(now) and not self._is_too_much(datagram, source, now):
+                if self.ports.may_have_returning(now) and not self._is_too_much(
+                    datagram, source, now
+                ):
                     self.ports.note_use(port, datagram, now)
                 return []
             insider, lease = leased
@@ -177,7 +179,7 @@ class Domain:
                     return []
                 exported = partial(self._exported, port, source, users[0][0].prefix, now)
                 passed, back = _pass_on_each(datagram, exported)
-            elif source in self.inside.here:
+            elif source in self.inside.count_by_address:
                 passed = [datagram]
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
@@ -190,11 +192,11 @@ class Domain:
 
     def settle(self, now: float) -> list[Outgoing]:
         """Admit those that waited until it was known who had which port; and have others meet."""
-        sent = self.returning.asked_again(now)
+        sent = self.returning.repeated_questions(now)
         for source, message in self.returning.ready(now):
             if message.prefix not in self.outside.by_prefix:
                 sent += self._announced_inside(message, source, now)
-        return sent + self.partings.go_on(self.inside.by_prefix.values(), now)
+        return sent + self.partings.proceed(self.inside.by_prefix.values(), now)
 
     def expire(self, now: float) -> None:
         """Forget those that have not been heard for as long as they said."""
@@ -222,7 +224,7 @@ class Domain:
         for insider in self.inside.by_prefix.values():
             if has_changed(self.settings.judge, insider):
                 insider.verdicts.clear()
-                sent += self.partings.part(insider, now)
+                sent += self.partings.separate(insider, now)
         return sent
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
@@ -233,7 +235,7 @@ class Domain:
             return self.own.told_inside(message, source, now)
         if spdp.ended:
             return self._end_inside(message, source, now)
-        if prefix not in self.inside.by_prefix and self.ports.remembers(now):
+        if prefix not in self.inside.by_prefix and self.ports.may_have_returning(now):
             return self.returning.wait(message, source, now)
         return self._announced_inside(message, source, now)
 
@@ -268,17 +270,17 @@ class Domain:
         if insider is None:
             return []
         lease_count = len(insider.leases)
-        exported = self.inside.exported(insider, message, now, self.returning.had(prefix))
+        exported = self.inside.exported(insider, message, now, self.returning.former_ports(prefix))
         sent = self.inside.introduced(insider, message)
         if is_new and prefix in self.returning.former:
-            sent += self.own.met_elsewhere(insider)
+            sent += self.own.keeper_farewell(insider)
             insider.parting_from = now
         else:
             sent += self._reminders(insider, lease_count)
         sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
         if is_new:
             sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
-        return sent + self.own.asked_first(insider)
+        return sent + self.own.first_questions(insider)
 
     def _tell_outside(
         self, insider: InsideParticipant, announcement: bytes, now: float
@@ -287,13 +289,13 @@ class Domain:
 
         Participants repeat themselves while many meet, and each time it goes to all ports of peers.
         """
-        if announcement == insider.announcement and now - insider.announced < ANNOUNCED_AGAIN:
+        if announcement == insider.announcement and now - insider.announced_at < ANNOUNCED_AGAIN:
             return []
-        insider.announcement, insider.announced = announcement, now
+        insider.announcement, insider.announced_at = announcement, now
         return [] if insider.apart_until else self.settings.to_outside(announcement)
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        insider = self.inside.at(message.prefix, source)
+        insider = self.inside.find(message.prefix, source)
         if insider is None:
             return []
         exported = self.inside.exported(insider, message, now)  # it may tell other things as well
@@ -315,7 +317,7 @@ class Domain:
         self, port: int, source: str, reader: bytes, now: float, message: DiscoveryMessage
     ) -> _Passing:
         """Metatraffic from inside as outside gets it. Raises RtpsError."""
-        insider = self.inside.at(message.prefix, source)
+        insider = self.inside.find(message.prefix, source)
         if insider is None:
             self._drop("unknown_participant", source, "it has not announced itself")
             return [], []
@@ -345,7 +347,7 @@ class Domain:
         prefix, spdp = message.prefix, message.of_participant
         if prefix in self.inside.by_prefix or insider.is_apart:
             return [], []
-        outsider = self.outside.at(prefix, source)
+        outsider = self.outside.find(prefix, source)
         if spdp is not None:
             if outsider is None and not self.settings.is_peer(source):
                 text = "a participant that is neither a peer's nor was heard"
@@ -357,7 +359,7 @@ class Domain:
         outsider.note_sent(message.datagram, insider.prefix)
         imported = partial(self.outside.imported, outsider, insider)
         passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
-        back = self.outside.asked(outsider, questions)
+        back = self.outside.allowed_questions(outsider, questions)
         if spdp is not None and spdp.ended:
             self._forget_outside(outsider)
         return passed, back
@@ -374,7 +376,7 @@ class Domain:
         """A datagram that goes to where a lease leads."""
         lease.note_passed(len(datagram))
         self.passed[lease.kind, inwards] += len(datagram)
-        return Outgoing(lease.where, datagram)
+        return Outgoing(lease.target, datagram)
 
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether a source makes more discovery than it may; what is not is charged to it."""

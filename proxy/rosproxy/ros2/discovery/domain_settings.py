@@ -43,7 +43,7 @@ class Refused:
 class Outgoing(msgspec.Struct, frozen=True):
     """A datagram to send."""
 
-    to: HostPort
+    target: HostPort
     datagram: bytes
 
 
@@ -59,15 +59,15 @@ class DomainSettings:
     ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
     each family; a participant is led to that of its own family, if there is one. ``peers`` are
     those outside that are told of participants inside, with port 0 at their well-known ports;
-    ``ear`` is where the program listens that passes announcements on to the LAN. ``near`` gives the
-    proxy's own address that an address inside reaches. ``both_ways``: inside reaches the locators
-    of those outside through the proxy alone.
+    ``ear`` is where the program listens that passes announcements on to the LAN.
+    ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
+    ``both_ways``: inside reaches the locators of those outside through the proxy alone.
     """
 
     number: int
     hosts: tuple[str, ...]
     ports: PortMap
-    near: Callable[[str], str]
+    proxy_address_for: Callable[[str], str]
     note: Note
     judge: Judge
     both_ways: bool = False
@@ -99,7 +99,7 @@ class DomainSettings:
         """The port of the range, its first, at which outside announces itself to the proxy."""
         return self.ports.listen.first
 
-    def told(self) -> list[HostPort]:
+    def announcement_targets(self) -> list[HostPort]:
         """Where participants inside are announced."""
         targets = [self.ear] if self.ear else []
         for peer in self.peers:
@@ -108,7 +108,7 @@ class DomainSettings:
 
     def to_outside(self, datagram: bytes) -> list[Outgoing]:
         """A datagram for everybody to whom participants inside are announced."""
-        return [Outgoing(target, datagram) for target in self.told()]
+        return [Outgoing(target, datagram) for target in self.announcement_targets()]
 
     def well_known(self, host: str, count: int = PARTICIPANTS_TRIED) -> list[HostPort]:
         """Where the first participants of a host are told of others (9.6.2.3)."""

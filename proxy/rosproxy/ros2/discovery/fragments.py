@@ -50,11 +50,11 @@ _PAYLOAD_AT = HEADER + 24
 _Key = tuple[int, bytes, int, int]
 
 
-class Passed(NamedTuple):
+class PassedFragments(NamedTuple):
     """Datagrams that go on, and those that go back to ask for missing fragments."""
 
-    on: list[bytes]
-    back: list[bytes]
+    forwarded: list[bytes]
+    questions: list[bytes]
 
 
 @dataclass(slots=True)
@@ -98,14 +98,14 @@ class FragmentStores:
 
     def rewritten(
         self, port: int, message: DiscoveryMessage, reader: bytes, rewrite: Rewrite
-    ) -> Passed:
+    ) -> PassedFragments:
         """The datagrams of a participant that may go on now, rewritten. Raises RtpsError.
 
         ``port`` is where the message came: each way has fragments of its own. ``reader`` is the
         GUID prefix of the participant that is to get them.
         """
         if not message.fragments:
-            return Passed([rewrite(message)], [])
+            return PassedFragments([rewrite(message)], [])
         store = self.by_prefix.setdefault(message.prefix, FragmentStore())
         before = store.size
         try:
@@ -115,7 +115,9 @@ class FragmentStores:
             self.size += store.size - before
             while self.size > MOST_OF_ALL:
                 self.forget(max(self.by_prefix, key=lambda prefix: self.by_prefix[prefix].size))
-        return Passed(released, [self._question(message, reader, *pair) for pair in missing])
+        return PassedFragments(
+            released, [self._question(message, reader, *pair) for pair in missing]
+        )
 
     def _question(
         self, message: DiscoveryMessage, reader: bytes, sample: Sample, missing: Sequence[int]
@@ -140,7 +142,7 @@ class FragmentStore:
     """Announcements of a participant of which fragments have come, and the datagrams that wait."""
 
     _samples: dict[_Key, _Gathered] = field(default_factory=dict)
-    _held: list[_WaitingDatagram] = field(default_factory=list)
+    _waiting_datagrams: list[_WaitingDatagram] = field(default_factory=list)
     _sample_bytes: int = 0
     _waiting_bytes: int = 0
 
@@ -173,8 +175,8 @@ class FragmentStore:
                 return [self._filled(arrived)]
             self._hold(arrived)
             return []
-        waiting = [*self._held, arrived]
-        self._held, self._waiting_bytes = [], 0
+        waiting = [*self._waiting_datagrams, arrived]
+        self._waiting_datagrams, self._waiting_bytes = [], 0
         for datagram in waiting:
             if not self._is_whole(datagram):
                 self._hold(datagram)
@@ -182,10 +184,10 @@ class FragmentStore:
 
     def _hold(self, datagram: _WaitingDatagram) -> None:
         """Have a datagram wait."""
-        self._held.append(datagram)
+        self._waiting_datagrams.append(datagram)
         self._waiting_bytes += datagram.cost
         while self._waiting_bytes > MOST_BYTES:
-            self._waiting_bytes -= self._held.pop(0).cost
+            self._waiting_bytes -= self._waiting_datagrams.pop(0).cost
 
     def _gather(
         self,
@@ -267,7 +269,7 @@ def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tup
 
 def _as_data(datagram: bytes, sample: Sample, payload: bytes) -> bytes:
     """The message that would carry a sample in one DATA."""
-    payload_flag = 0x08 if sample.key else 0x04
+    payload_flag = 0x08 if sample.is_key_only else 0x04
     head = struct.pack("<BBHHH", SubmessageId.DATA, 0x01 | payload_flag, 0, 0, 16)
     head += struct.pack(">II", sample.reader, sample.writer)
     head += struct.pack("<iI", sample.sequence >> 32, sample.sequence & 0xFFFFFFFF)

@@ -43,15 +43,15 @@ from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, rewritten
 class InsideParticipants(ParticipantTable[InsideParticipant]):
     """The participants inside; ``leases`` by port of the range, each with its participant.
 
-    ``lacking`` tells why a locator got no port, by its participant's prefix. ``changes`` counts how
-    often the leases have changed.
+    ``port_shortages`` tells why a locator got no port, by its participant's prefix. ``changes``
+    counts how often the leases have changed.
     """
 
     settings: DomainSettings
     ports: LocatorPorts
     refused: Refused
     leases: dict[int, tuple[InsideParticipant, Lease]] = field(default_factory=dict)
-    lacking: dict[bytes, str] = field(default_factory=dict)
+    port_shortages: dict[bytes, str] = field(default_factory=dict)
     changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
@@ -60,18 +60,21 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         One that is on several networks itself is served at the first.
         """
         prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
-        participant = self.at(prefix, source)
+        participant = self.find(prefix, source)
         if spdp is None:
             return participant
         if participant is None:
             if prefix in self.by_prefix:
                 return None
-            if self.here[source] >= MOST_PER_ADDRESS or len(self.by_prefix) >= MOST_INSIDE:
+            if (
+                self.count_by_address[source] >= MOST_PER_ADDRESS
+                or len(self.by_prefix) >= MOST_INSIDE
+            ):
                 text = f"more than {MOST_PER_ADDRESS} participants there, or {MOST_INSIDE} in all"
                 self.refused("participants", source, text)
                 return None
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
-            participant.near = self.settings.near(source)
+            participant.proxy_address = self.settings.proxy_address_for(source)
             self.add(participant)
         participant.until = now + lease_duration(spdp, datagram)
         participant.metatraffic = first_metatraffic(spdp, datagram, source)
@@ -114,7 +117,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         """Note the participants that were heard from an address by multicast."""
         with contextlib.suppress(RtpsError):
             for message in by_source(datagram):
-                if participant := self.at(source_prefix(message), source):
+                if participant := self.find(source_prefix(message), source):
                     participant.is_in_group = True
 
     def introduced(self, newcomer: InsideParticipant, message: DiscoveryMessage) -> list[Outgoing]:
@@ -128,7 +131,9 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         return [
             Outgoing(p.metatraffic, announcement)
             for p in self.by_prefix.values()
-            if p.near == newcomer.near and p.address != newcomer.address and p.metatraffic
+            if p.proxy_address == newcomer.proxy_address
+            and p.address != newcomer.address
+            and p.metatraffic
         ]
 
     def forget(self, participant: InsideParticipant) -> None:
@@ -138,7 +143,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             del self.leases[lease.port]
             self.ports.give_back(lease.port)
         self.remove(participant)
-        self.lacking.pop(participant.prefix, None)
+        self.port_shortages.pop(participant.prefix, None)
 
     def _lead_out(
         self,
@@ -176,13 +181,13 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     ) -> Lease | None:
         if len(participant.leases) >= MOST_LEASES:
             text = f"has more than {MOST_LEASES} locators; {locator} got no port"
-            self.lacking[participant.prefix] = text
+            self.port_shortages[participant.prefix] = text
             return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)
         if port is None:
             ports = self.settings.ports.listen
             text = f"no port of {ports} is free for {locator}: give a longer --port-range"
-            self.lacking[participant.prefix] = text
+            self.port_shortages[participant.prefix] = text
             return None
         lease = participant.leases[locator] = Lease(port, locator, kind)
         self.leases[port] = participant, lease

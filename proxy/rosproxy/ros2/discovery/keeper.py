@@ -17,7 +17,7 @@ from hashlib import blake2b
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import WRITES, announcement
+from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
 from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
 from rosproxy.ros2.protocol.rtps import NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
@@ -35,12 +35,12 @@ _WIDTHS = (7, 10, 16)
 class Keeper:
     """Keeps ports of a range in participants; ``prefix`` is its own.
 
-    ``kept`` is what each has answered last, by GUID prefix.
+    ``number_by_prefix`` is what each has answered last, by GUID prefix.
     """
 
     prefix: bytes
     ports: PortRange
-    kept: dict[bytes, int] = field(default_factory=dict)
+    number_by_prefix: dict[bytes, int] = field(default_factory=dict)
     _first_count: int = 0
     _counts: dict[bytes, int] = field(default_factory=dict)
 
@@ -58,34 +58,34 @@ class Keeper:
 
     def questions(self, prefix: bytes, reached_at: HostPort) -> list[bytes]:
         """What asks a participant for its ports; ``reached_at`` is where it answers."""
-        spdp = announcement(self.prefix, [reached_at], LEASE, WRITES)
+        spdp = announcement(self.prefix, [reached_at], LEASE, WRITER_ENDPOINTS)
         return [spdp, self._heartbeat(prefix, 1)]
 
     def reminders(self, prefix: bytes, ports: Sequence[int], reached_at: HostPort) -> list[bytes]:
         """What makes a participant keep its ports; nothing if it does already."""
         if self.keeps(prefix, ports):
             return []
-        spdp = announcement(self.prefix, [reached_at], LEASE, WRITES)
+        spdp = announcement(self.prefix, [reached_at], LEASE, WRITER_ENDPOINTS)
         return [spdp, self._heartbeat(prefix, self.number(ports))]
 
     def keeps(self, prefix: bytes, ports: Sequence[int]) -> bool:
         """Whether a participant keeps all these ports."""
-        return self.kept.get(prefix, 0) >= self.number(ports)
+        return self.number_by_prefix.get(prefix, 0) >= self.number(ports)
 
     def take(self, prefix: bytes, datagram: bytes) -> bool:
         """Note what a participant answers; whether it is an answer. Raises RtpsError."""
         numbers = acknowledged(datagram, self.prefix, BuiltinWriter.PUBLICATIONS)
         for number in numbers:
-            self.kept[prefix] = number
+            self.number_by_prefix[prefix] = number
         return bool(numbers)
 
-    def had(self, prefix: bytes) -> list[int]:
+    def former_ports(self, prefix: bytes) -> list[int]:
         """The ports that a participant has kept, in the order of its locators."""
-        return list(self._ports(self.kept.get(prefix, 1)))
+        return list(self._ports(self.number_by_prefix.get(prefix, 1)))
 
     def forget(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
-        self.kept.pop(prefix, None)
+        self.number_by_prefix.pop(prefix, None)
         self._first_count = max(self._first_count, self._counts.pop(prefix, 0))  # it may come again
 
     def number(self, ports: Iterable[int]) -> int:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import READS, announcement, farewell
+from rosproxy.ros2.protocol.announcement import READER_ENDPOINTS, announcement, farewell
 from rosproxy.ros2.protocol.reliable import MOST_ASKED, Heartbeat, acknack, heartbeats
 from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
@@ -30,12 +30,12 @@ class Observer:
     """The samples that the proxy's participant has got; ``prefix`` is its own, which is random."""
 
     prefix: bytes
-    _got: dict[tuple[bytes, int], set[int]] = field(default_factory=dict)
+    _received: dict[tuple[bytes, int], set[int]] = field(default_factory=dict)
     _count: int = 0
 
     def announcement(self, *reached_at: HostPort) -> bytes:
         """The datagram by which it announces itself; ``reached_at`` is where it is answered."""
-        return announcement(self.prefix, reached_at, LEASE, READS)
+        return announcement(self.prefix, reached_at, LEASE, READER_ENDPOINTS)
 
     def farewell(self) -> bytes:
         """The datagram by which it says that it has ended."""
@@ -43,7 +43,7 @@ class Observer:
 
     def first_question(self, prefix: bytes) -> list[bytes]:
         """What asks a participant's writers what they have."""
-        return [self._ask(prefix, w, 1, ()) for w in OBSERVED if (prefix, w) not in self._got]
+        return [self._ask(prefix, w, 1, ()) for w in OBSERVED if (prefix, w) not in self._received]
 
     def take(self, prefix: bytes, datagram: bytes) -> list[bytes]:
         """Note a participant's message; what to ask it for. Raises RtpsError.
@@ -52,13 +52,13 @@ class Observer:
         """
         for sample in samples(datagram):
             if sample.writer in OBSERVED and sample.prefix == prefix:
-                received = self._got.setdefault((prefix, sample.writer), set())
+                received = self._received.setdefault((prefix, sample.writer), set())
                 if len(received) < MOST_SAMPLES:
                     received.add(sample.sequence)
         answers = []
         for heartbeat in heartbeats(datagram):
             if heartbeat.writer in OBSERVED:
-                self._got.setdefault((prefix, heartbeat.writer), set())
+                self._received.setdefault((prefix, heartbeat.writer), set())
                 if heartbeat.last > 0:  # an empty writer would take an answer for a question
                     answers.append(self._answer(prefix, heartbeat))
         return answers
@@ -66,10 +66,10 @@ class Observer:
     def forget(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
         for writer in OBSERVED:
-            self._got.pop((prefix, writer), None)
+            self._received.pop((prefix, writer), None)
 
     def _answer(self, prefix: bytes, heartbeat: Heartbeat) -> bytes:
-        received = self._got[prefix, heartbeat.writer]
+        received = self._received[prefix, heartbeat.writer]
         first = max(heartbeat.first, 1)
         base = next((n for n in range(first, heartbeat.last + 1) if n not in received), None)
         if base is None or len(received) >= MOST_SAMPLES:

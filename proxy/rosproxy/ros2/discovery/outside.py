@@ -45,7 +45,7 @@ from rosproxy.ros2.rewriting.discovery import (
     rewritten,
 )
 
-PARTED_AGAIN = 2.0
+FAREWELL_INTERVAL = 2.0
 """Seconds after which a participant inside is told again to forget one outside, until they meet."""
 
 
@@ -65,7 +65,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> OutsideParticipant | None:
         """The participant that announces itself or its end at an address; None if not accepted."""
         prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
-        participant = self.at(prefix, source)
+        participant = self.find(prefix, source)
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
             if participant is not None:
                 participant.announcement = for_all(datagram)
@@ -107,25 +107,28 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             message = read_discovery(outsider.announcement)
             for insider in inside:
                 if insider.metatraffic and not insider.is_apart:
-                    sent += self.parting(outsider, insider, now)
+                    sent += self.farewell_to(outsider, insider, now)
                     sent.append(
                         Outgoing(insider.metatraffic, self._imported(outsider, insider, message))
                     )
         return sent
 
-    def parting(
+    def farewell_to(
         self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
     ) -> list[Outgoing]:
         """What makes one inside forget one outside, if it has to and was not told just now."""
-        if insider.parted is None or now - insider.parted.get(outsider.prefix, -inf) < PARTED_AGAIN:
+        if (
+            insider.farewell_times is None
+            or now - insider.farewell_times.get(outsider.prefix, -inf) < FAREWELL_INTERVAL
+        ):
             return []
-        insider.parted[outsider.prefix] = now
+        insider.farewell_times[outsider.prefix] = now
         datagram = farewell(outsider.prefix, outsider.vendor, next_number(outsider.announcement))
         return sent_to(insider.metatraffic, [datagram])
 
     def is_strange(self, source: str) -> bool:
         """Whether nobody is known at an address, so that nothing from there is read."""
-        if source in self.here or self.settings.is_peer(source):
+        if source in self.count_by_address or self.settings.is_peer(source):
             return False
         self.refused("not_a_peer", source, "it is no peer's address, and nobody was heard there")
         return True
@@ -135,10 +138,12 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
         One that names the ``observer`` has heard it: its prefix goes to peers and the ear alone.
         """
-        is_met = self.at(message.prefix, source) is not None
+        is_met = self.find(message.prefix, source) is not None
         return is_met or destination(message.datagram) == observer or self.settings.is_peer(source)
 
-    def asked(self, outsider: OutsideParticipant, questions: Iterable[bytes]) -> list[Outgoing]:
+    def allowed_questions(
+        self, outsider: OutsideParticipant, questions: Iterable[bytes]
+    ) -> list[Outgoing]:
         """Questions to a participant about its discovery, as many as it may be sent."""
         target = outsider.metatraffic
         allowed = [q for q in questions if target and outsider.may_be_sent(len(q))]
@@ -158,12 +163,12 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         if for_good:
             self.blocked.add(port)
         for participant, lease in list(self.stand_ins.get(port, ())):
-            self._close(participant, lease.where)
+            self._close(participant, lease.target)
 
     def _add(
         self, prefix: bytes, datagram: bytes, source: str, now: float
     ) -> OutsideParticipant | None:
-        if self.here[source] >= MOST_PER_HOST or len(self.by_prefix) >= MOST_OUTSIDE:
+        if self.count_by_address[source] >= MOST_PER_HOST or len(self.by_prefix) >= MOST_OUTSIDE:
             text = f"more than {MOST_PER_HOST} participants there, or {MOST_OUTSIDE} outside in all"
             self.refused("participants", source, text)
             return None
@@ -186,7 +191,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def _leading_in(
         self, outsider: OutsideParticipant, address: str
     ) -> Callable[[int, HostPort], HostPort | None]:
-        return partial(self._lead_in, outsider, self.settings.near(address))
+        return partial(self._lead_in, outsider, self.settings.proxy_address_for(address))
 
     def _lead_in(
         self, outsider: OutsideParticipant, near: str, pid: int, locator: HostPort

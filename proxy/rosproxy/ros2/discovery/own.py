@@ -15,7 +15,7 @@ from rosproxy.ros2.discovery.inside import InsideParticipants
 from rosproxy.ros2.discovery.keeper import Keeper
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside import OutsideParticipants
-from rosproxy.ros2.discovery.returning import Returning
+from rosproxy.ros2.discovery.returning import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
@@ -30,7 +30,7 @@ class OwnParticipants:
     keeper: Keeper
     inside: InsideParticipants
     outside: OutsideParticipants
-    returning: Returning
+    returning: ReturningParticipants
     fragments: FragmentStores
 
     def announced_inside(self, near: str) -> bytes:
@@ -43,16 +43,16 @@ class OwnParticipants:
         reached_at = (HostPort(host, port) for host in self.settings.hosts)
         return self.settings.to_outside(self.observer.announcement(*reached_at))
 
-    def asked_first(self, participant: InsideParticipant) -> list[Outgoing]:
+    def first_questions(self, participant: InsideParticipant) -> list[Outgoing]:
         """What asks a participant inside that has announced itself for its readers and writers."""
         return sent_to(participant.metatraffic, self.observer.first_question(participant.prefix))
 
-    def met_elsewhere(self, participant: InsideParticipant) -> list[Outgoing]:
+    def keeper_farewell(self, participant: InsideParticipant) -> list[Outgoing]:
         """What makes a participant forget the keeper, which it knows at a former address."""
         self.keeper.forget(participant.prefix)  # it is to keep its ports anew
         return sent_to(participant.metatraffic, [farewell(self.keeper.prefix)])
 
-    def keeping(self) -> list[Outgoing]:
+    def port_reminders(self) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
         participants = self.inside.by_prefix.values()
         return [sent for p in participants for sent in self.returning.reminders(p)]
@@ -60,24 +60,26 @@ class OwnParticipants:
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Take in what a participant inside tells the keeper, or the observer. Raises RtpsError."""
         prefix = message.prefix
-        insider = self.inside.at(prefix, source)
-        is_waiting = self.returning.has(prefix, source)
+        insider = self.inside.find(prefix, source)
+        is_waiting = self.returning.is_waiting(prefix, source)
         if (is_waiting or insider) and self.keeper.take(prefix, message.datagram):
             return []
         if insider is None:
             return []
-        rewrite = partial(self.inside.observed, insider, now=now, kept=self.returning.had(prefix))
+        rewrite = partial(
+            self.inside.observed, insider, now=now, kept=self.returning.former_ports(prefix)
+        )
         return sent_to(insider.metatraffic, self._ask(self.settings.unicast_port, message, rewrite))
 
     def told_outside(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
         """Take in what a participant outside tells the observer. Raises RtpsError."""
-        outsider = self.outside.at(message.prefix, source)
+        outsider = self.outside.find(message.prefix, source)
         if outsider is None:
             return []
         outsider.note_sent(message.datagram, self.observer.prefix)
         rewrite = partial(self.outside.observed, outsider)
         questions = self._ask(self.settings.discovery_port, message, rewrite)
-        return self.outside.asked(outsider, questions)
+        return self.outside.allowed_questions(outsider, questions)
 
     def forget(self, prefix: bytes) -> None:
         """Forget what a participant that has gone has told."""

@@ -24,7 +24,7 @@ from rosproxy.ros2.discovery.outside import OutsideParticipants
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.participants import InsideParticipant
 
-APART = 0.4
+APART_TIME = 0.4
 """Seconds in which a farewell arrives, and is taken in, on both sides."""
 EAR_TIME = 30.0
 """Seconds that the ear may take to be heard; the wait is in vain if nobody is on its LAN."""
@@ -38,20 +38,24 @@ class Partings:
     outside: OutsideParticipants
     ear_heard: bool = False
 
-    def part(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+    def separate(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
         """Have a participant inside and all outside forget each other."""
-        insider.parting_from, insider.apart_until, insider.parted = None, now + APART, {}
+        insider.parting_from, insider.apart_until, insider.farewell_times = (
+            None,
+            now + APART_TIME,
+            {},
+        )
         datagram = farewell(insider.prefix, insider.vendor, next_number(insider.announcement))
         outsiders = self.outside.by_prefix.values()
-        inwards = [sent for o in outsiders for sent in self.outside.parting(o, insider, now)]
+        inwards = [sent for o in outsiders for sent in self.outside.farewell_to(o, insider, now)]
         return inwards + self.settings.to_outside(datagram)
 
-    def go_on(self, insiders: Iterable[InsideParticipant], now: float) -> list[Outgoing]:
+    def proceed(self, insiders: Iterable[InsideParticipant], now: float) -> list[Outgoing]:
         """Part those that have waited, and introduce those that are apart for long enough."""
         sent = list[Outgoing]()
         for insider in insiders:
             if insider.parting_from is not None and self._may_part(insider.parting_from, now):
-                sent += self.part(insider, now)
+                sent += self.separate(insider, now)
             elif insider.apart_until is not None and now >= insider.apart_until:
                 insider.apart_until = None
                 sent += self.settings.to_outside(insider.announcement)
@@ -60,14 +64,14 @@ class Partings:
 
     def note_met(self, insider: InsideParticipant, prefix: bytes) -> None:
         """Note that a participant inside has sent something to where one outside is found now."""
-        if insider.parted is not None and prefix in insider.parted:
-            insider.parted[prefix] = inf
+        if insider.farewell_times is not None and prefix in insider.farewell_times:
+            insider.farewell_times[prefix] = inf
 
     def forget(self, insiders: Iterable[InsideParticipant], prefix: bytes) -> None:
         """Forget that those inside were told to forget a participant outside, which has gone."""
         for insider in insiders:
-            if insider.parted is not None:
-                insider.parted.pop(prefix, None)
+            if insider.farewell_times is not None:
+                insider.farewell_times.pop(prefix, None)
 
     def _may_part(self, waits_from: float, now: float) -> bool:
         no_ear = self.settings.ear is None

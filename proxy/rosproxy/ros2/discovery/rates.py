@@ -24,20 +24,20 @@ class DiscoveryRates:
 
     per_second: float = PER_SECOND
     burst: float = BURST
-    _left: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _remaining: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def take(self, source: str, size: int, now: float) -> bool:
         """Whether a datagram of a source, of so many bytes, may be read; it is charged then."""
-        remaining, since = self._left.get(source, (self.burst, now))
+        remaining, since = self._remaining.get(source, (self.burst, now))
         remaining = min(remaining + max(now - since, 0.0) * self.per_second, self.burst)
         allowed = remaining >= 1.0
-        if source not in self._left and len(self._left) >= MOST_SOURCES:
-            del self._left[next(iter(self._left))]
-        self._left[source] = (remaining - 1 - size // STEP if allowed else remaining), now
+        if source not in self._remaining and len(self._remaining) >= MOST_SOURCES:
+            del self._remaining[next(iter(self._remaining))]
+        self._remaining[source] = (remaining - 1 - size // STEP if allowed else remaining), now
         return allowed
 
     def charge(self, source: str, count: int) -> None:
         """Charge a source with so many datagrams that its own have led to; it may go into debt."""
-        if count and source in self._left:
-            remaining, since = self._left[source]
-            self._left[source] = remaining - count, since
+        if count and source in self._remaining:
+            remaining, since = self._remaining[source]
+            self._remaining[source] = remaining - count, since

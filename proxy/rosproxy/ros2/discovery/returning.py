@@ -27,7 +27,7 @@ ANSWER_TIME = 5.0
 
 
 @dataclass(slots=True)
-class Returning:
+class ReturningParticipants:
     """Participants that wait, by prefix: where their announcement came from, it, and since when.
 
     At one address as many may wait as there may be participants. ``former`` are the ports of those
@@ -43,7 +43,7 @@ class Returning:
     former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
 
-    def has(self, prefix: bytes, source: str) -> bool:
+    def is_waiting(self, prefix: bytes, source: str) -> bool:
         """Whether a participant at an address waits."""
         return prefix in self.waiting and self.waiting[prefix][0] == source
 
@@ -57,7 +57,7 @@ class Returning:
         self._counts[source] += 1
         return self._questions(message, source)
 
-    def asked_again(self, now: float) -> list[Outgoing]:
+    def repeated_questions(self, now: float) -> list[Outgoing]:
         """Questions again to those that have not answered."""
         return [
             question
@@ -68,7 +68,7 @@ class Returning:
 
     def ready(self, now: float) -> Iterator[tuple[str, DiscoveryMessage]]:
         """The announcements of those that may get ports now; they wait no longer."""
-        if not self.ports.settled(now):
+        if not self.ports.may_give_ports(now):
             return
         for prefix, (source, message, since) in list(self.waiting.items()):
             if self._has_answered(prefix, since, now):
@@ -92,9 +92,9 @@ class Returning:
             if ports and prefix not in present and len(self.former) < MOST_INSIDE:
                 self.former[prefix] = tuple(ports) if in_range else ()
 
-    def had(self, prefix: bytes) -> Sequence[int]:
+    def former_ports(self, prefix: bytes) -> Sequence[int]:
         """The ports that a participant had before the start, in the order of its locators."""
-        return self.former.get(prefix) or self.keeper.had(prefix)
+        return self.former.get(prefix) or self.keeper.former_ports(prefix)
 
     def forget_participant(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
@@ -111,7 +111,11 @@ class Returning:
         return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
 
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
-        return prefix in self.former or prefix in self.keeper.kept or now - since >= ANSWER_TIME
+        return (
+            prefix in self.former
+            or prefix in self.keeper.number_by_prefix
+            or now - since >= ANSWER_TIME
+        )
 
     def _questions(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
         spdp = message.of_participant
@@ -123,4 +127,4 @@ class Returning:
 
     def _reply_target(self, address: str) -> HostPort:
         """Where a participant inside reaches the proxy's own participants."""
-        return HostPort(self.settings.near(address), self.settings.unicast_port)
+        return HostPort(self.settings.proxy_address_for(address), self.settings.unicast_port)

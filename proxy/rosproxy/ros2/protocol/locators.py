@@ -35,7 +35,7 @@ class Locator(msgspec.Struct, frozen=True):
     address: bytes
 
     @property
-    def where(self) -> HostPort | None:
+    def host_port(self) -> HostPort | None:
         """The address and port of a UDP locator; None for other kinds, or without a valid port."""
         if not 0 < self.port < 65536:
             return None

@@ -61,7 +61,7 @@ class Parameter(msgspec.Struct, frozen=True):
     """A parameter: its id, where that stands in the datagram, and where its value is."""
 
     pid: int
-    at: int
+    offset: int
     value: Span
 
 
@@ -107,7 +107,7 @@ class ParameterList(msgspec.Struct, frozen=True):
 
     def removed(self, parameter: Parameter) -> Overwrite:
         """The edit that takes a parameter out."""
-        return Overwrite(parameter.at, struct.pack(self.order + "H", Pid.PAD))
+        return Overwrite(parameter.offset, struct.pack(self.order + "H", Pid.PAD))
 
 
 def payload_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:

@@ -121,15 +121,15 @@ class Sample(msgspec.Struct, frozen=True):
     body: Span
     inline_qos: Span | None
     payload: Span | None
-    key: bool = False
+    is_key_only: bool = False
     fragments: Fragments | None = None
 
 
 class Overwrite(msgspec.Struct, frozen=True):
     """Bytes at a position of a datagram that replace as many others."""
 
-    at: int
-    after: bytes
+    offset: int
+    replacement: bytes
 
 
 def source_prefix(datagram: bytes) -> bytes:
@@ -223,10 +223,10 @@ def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
     """The datagram with all edits made. Raises ValueError if one leads outside of it."""
     changed = bytearray(datagram)
     for edit in edits:
-        end = edit.at + len(edit.after)
-        if not 0 <= edit.at <= end <= len(changed):
-            raise ValueError(f"an edit of bytes {edit.at} to {end} of {len(changed)}")
-        changed[edit.at : end] = edit.after
+        end = edit.offset + len(edit.replacement)
+        if not 0 <= edit.offset <= end <= len(changed):
+            raise ValueError(f"an edit of bytes {edit.offset} to {end} of {len(changed)}")
+        changed[edit.offset : end] = edit.replacement
     return bytes(changed)
 
 
@@ -305,7 +305,7 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
         body=body,
         inline_qos=qos,
         payload=Span(offset, body.end) if has_payload and offset < body.end else None,
-        key=key,
+        is_key_only=key,
         fragments=_fragments(datagram, start + 20, flags) if is_fragment else None,
     )
 

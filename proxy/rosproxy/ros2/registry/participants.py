@@ -28,7 +28,7 @@ VENDORS = {
 }
 """Names of implementations, by the vendor id in each message's header (OMG's list). Zero stands for
 none; a proxy's own participants have it."""
-MOST_ENDPOINTS, MOST_ENDPOINTS_HERE, MOST_ENDPOINTS_IN_ALL = 2048, 8192, 65_536
+MOST_ENDPOINTS, MOST_ENDPOINTS_PER_ADDRESS, MOST_ENDPOINTS_IN_ALL = 2048, 8192, 65_536
 """Readers and writers that are remembered, which is for the status alone: of a participant, at an
 address, on a side."""
 
@@ -103,7 +103,7 @@ class Lease:
     """
 
     port: int
-    where: HostPort
+    target: HostPort
     kind: LeaseKind
     datagrams: int = 0
     bytes: int = 0
@@ -155,9 +155,9 @@ class Participant:
 
 @dataclass(slots=True)
 class EndpointNotes:
-    """Notes the readers and writers of participants, within bounds; ``here`` counts by address."""
+    """Notes the readers and writers of participants, within bounds for each address and in all."""
 
-    here: Counter[str] = field(default_factory=Counter)
+    count_by_address: Counter[str] = field(default_factory=Counter)
     total: int = 0
 
     def note(self, participant: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
@@ -176,15 +176,15 @@ class EndpointNotes:
     def _has_room(self, participant: Participant) -> bool:
         return (
             len(participant.endpoints) < MOST_ENDPOINTS
-            and self.here[participant.address] < MOST_ENDPOINTS_HERE
+            and self.count_by_address[participant.address] < MOST_ENDPOINTS_PER_ADDRESS
             and self.total < MOST_ENDPOINTS_IN_ALL
         )
 
     def _count(self, address: str, change: int) -> None:
         self.total += change
-        self.here[address] += change
-        if not self.here[address]:
-            del self.here[address]
+        self.count_by_address[address] += change
+        if not self.count_by_address[address]:
+            del self.count_by_address[address]
 
 
 @dataclass(slots=True)
@@ -192,19 +192,20 @@ class InsideParticipant(Participant):
     """A participant inside, with a port of the range for each of its locators.
 
     ``verdicts``: whether the policy allows a topic or service, by rule; of its own endpoints and of
-    those outside that it was to be told of. ``near`` is the proxy's address on its network;
-    ``is_in_group``: it was heard there by multicast. ``announced`` is when outside was last told of
-    it. `Partings` sets the rest, None if it does not apply: since when it waits to be parted from
-    outside; until when it is apart; when it was last told to forget each one outside, by prefix.
+    those outside that it was to be told of. ``proxy_address`` is the proxy's address on its
+    network; ``is_in_group``: it was heard there by multicast. ``announced_at`` is when outside was
+    last told of it. `Partings` sets the rest, None if it does not apply: since when it waits to be
+    parted from outside; until when it is apart; when it was last told to forget each one outside,
+    by prefix.
     """
 
     verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
-    near: str = ""
+    proxy_address: str = ""
     is_in_group: bool = False
-    announced: float = 0.0
+    announced_at: float = 0.0
     parting_from: float | None = None
     apart_until: float | None = None
-    parted: dict[bytes, float] | None = None
+    farewell_times: dict[bytes, float] | None = None
 
     @property
     def is_apart(self) -> bool:
@@ -255,10 +256,10 @@ class ParticipantTable(Generic[Someone]):
     """
 
     by_prefix: dict[bytes, Someone] = field(default_factory=dict)
-    here: Counter[str] = field(default_factory=Counter)
+    count_by_address: Counter[str] = field(default_factory=Counter)
     notes: EndpointNotes = field(default_factory=EndpointNotes)
 
-    def at(self, prefix: bytes, source: str) -> Someone | None:
+    def find(self, prefix: bytes, source: str) -> Someone | None:
         """The participant with a prefix, if it is at the address that a datagram came from."""
         participant = self.by_prefix.get(prefix)
         return participant if participant is not None and participant.address == source else None
@@ -266,12 +267,12 @@ class ParticipantTable(Generic[Someone]):
     def add(self, participant: Someone) -> None:
         """Add a participant that has come."""
         self.by_prefix[participant.prefix] = participant
-        self.here[participant.address] += 1
+        self.count_by_address[participant.address] += 1
 
     def remove(self, participant: Someone) -> None:
         """Forget a participant that has gone."""
         del self.by_prefix[participant.prefix]
         self.notes.forget(participant)
-        self.here[participant.address] -= 1
-        if not self.here[participant.address]:
-            del self.here[participant.address]
+        self.count_by_address[participant.address] -= 1
+        if not self.count_by_address[participant.address]:
+            del self.count_by_address[participant.address]

@@ -46,11 +46,11 @@ class LocatorPorts:
         self._former_users: dict[int, tuple[bytes, LeaseKind]] = {}
         self._forwarded: dict[int, HostPort] = {}
 
-    def settled(self, now: float) -> bool:
+    def may_give_ports(self, now: float) -> bool:
         """Whether ports may be given."""
         return now - self._started >= SETTLING
 
-    def remembers(self, now: float) -> bool:
+    def may_have_returning(self, now: float) -> bool:
         """Whether there may still be participants that had ports before the start."""
         return now - self._started < REMEMBERED
 
@@ -59,11 +59,11 @@ class LocatorPorts:
         prefix, is_built_in = destination(datagram), of_built_in_writer(datagram)
         if prefix is not None and is_built_in is not None:
             kind = LeaseKind.METATRAFFIC if is_built_in else LeaseKind.DATA
-            self.note_meant(port, prefix, kind, now)
+            self.note_former_user(port, prefix, kind, now)
 
-    def note_meant(self, port: int, prefix: bytes, kind: LeaseKind, now: float) -> None:
+    def note_former_user(self, port: int, prefix: bytes, kind: LeaseKind, now: float) -> None:
         """Note that a participant had a port."""
-        if self.remembers(now) and port in self.pool.range:
+        if self.may_have_returning(now) and port in self.pool.range:
             self._former_users[port] = prefix, kind
 
     def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
@@ -77,7 +77,7 @@ class LocatorPorts:
 
         ``had`` is the port that the participant itself says that it had.
         """
-        if not self.remembers(now):
+        if not self.may_have_returning(now):
             self._former_users.clear()
             self._forwarded.clear()
         if not self.pool.free:

@@ -19,35 +19,38 @@ MOST_HELD, MOST_HELD_EACH, LONGEST_HELD = 256, 8, 8192
 
 @dataclass(slots=True)
 class SelectedAddresses:
-    """Which addresses are let in: ``told``, or from ``until`` on all, if no operator has told any.
+    """Which addresses are let in: ``selected``, or from ``until`` on all, if no operator names any.
 
-    ``held`` are the last announcements of each address that is not let in, by GUID prefix.
+    ``held_announcements`` are the last announcements of each address that is not let in, by GUID
+    prefix.
     """
 
     until: float
-    told: frozenset[str] | None = None
-    held: dict[str, dict[bytes, bytes]] = field(default_factory=dict)
+    selected: frozenset[str] | None = None
+    held_announcements: dict[str, dict[bytes, bytes]] = field(default_factory=dict)
 
     def select(self, addresses: Iterable[str]) -> None:
         """Take in which addresses an operator has selected, instead of those before."""
-        self.told = frozenset(addresses)
+        self.selected = frozenset(addresses)
 
     def admits(self, address: str, now: float) -> bool:
         """Whether participants at an address are let in."""
-        return now >= self.until if self.told is None else address in self.told
+        return now >= self.until if self.selected is None else address in self.selected
 
     def hold(self, address: str, datagram: bytes) -> None:
         """Keep an announcement from an address that is not let in. Raises RtpsError."""
         prefix = source_prefix(datagram)
         if len(datagram) > LONGEST_HELD:
             return
-        if address not in self.held and len(self.held) >= MOST_HELD:
-            del self.held[next(iter(self.held))]
-        by_prefix = self.held.setdefault(address, {})
+        if address not in self.held_announcements and len(self.held_announcements) >= MOST_HELD:
+            del self.held_announcements[next(iter(self.held_announcements))]
+        by_prefix = self.held_announcements.setdefault(address, {})
         if prefix in by_prefix or len(by_prefix) < MOST_HELD_EACH:
             by_prefix[prefix] = datagram
 
     def released(self, now: float) -> list[tuple[str, bytes]]:
         """Announcements held of addresses that are let in now, each with its address."""
-        admitted = [address for address in self.held if self.admits(address, now)]
-        return [(a, datagram) for a in admitted for datagram in self.held.pop(a).values()]
+        admitted = [address for address in self.held_announcements if self.admits(address, now)]
+        return [
+            (a, datagram) for a in admitted for datagram in self.held_announcements.pop(a).values()
+        ]

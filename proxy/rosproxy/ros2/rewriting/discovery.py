@@ -67,21 +67,21 @@ _KINDS = {
     BuiltinWriter.SUBSCRIPTIONS: EndpointKind.READER,
 }
 
-Lead = Callable[[int, HostPort], HostPort | None]
+LocatorRedirect = Callable[[int, HostPort], HostPort | None]
 """Where a locator is to lead, by its parameter's id and where it leads; None: take it out."""
 
 
 class Announcement(msgspec.Struct, frozen=True):
     """What a participant says of itself, or of one of its readers or writers.
 
-    ``held`` are the payload's parameters; none if it only tells an end. ``in_front`` are those of
-    the inline QoS. ``ended``: what it is about is disposed of, or unregistered.
+    ``parameters`` are the payload's parameters; none if it only tells an end. ``inline_parameters``
+    are those of the inline QoS. ``ended``: what it is about is disposed of, or unregistered.
     """
 
     writer: BuiltinWriter
     sample: Sample
-    held: ParameterList
-    in_front: ParameterList | None
+    parameters: ParameterList
+    inline_parameters: ParameterList | None
     ended: bool
 
     @property
@@ -91,14 +91,14 @@ class Announcement(msgspec.Struct, frozen=True):
 
     def topic(self, datagram: bytes) -> str:
         """The topic of DDS that its reader or writer is of; empty if it does not say."""
-        return self.held.text(datagram, Pid.TOPIC_NAME) or ""
+        return self.parameters.text(datagram, Pid.TOPIC_NAME) or ""
 
     def endpoint(self, datagram: bytes) -> bytes | None:
         """The entity id of the reader or writer that it is about; None if it does not say.
 
         One that has ended is named by its key, in the payload or in the inline QoS (9.6.3.8).
         """
-        for parameters in (self.held, self.in_front):
+        for parameters in (self.parameters, self.inline_parameters):
             for parameter in parameters.all(Pid.ENDPOINT_GUID, Pid.KEY_HASH) if parameters else ():
                 if parameter.value.end - parameter.value.start >= 16:
                     return datagram[parameter.value.start + 12 : parameter.value.start + 16]
@@ -106,9 +106,9 @@ class Announcement(msgspec.Struct, frozen=True):
 
     def reached_at(self, datagram: bytes) -> Iterator[tuple[int, HostPort]]:
         """The unicast locators of UDP, each with its parameter's id."""
-        for parameter in self.held.all(*UNICAST):
-            locator = read_locator(datagram, self.held, parameter)
-            host_port = locator.where if locator else None
+        for parameter in self.parameters.all(*UNICAST):
+            locator = read_locator(datagram, self.parameters, parameter)
+            host_port = locator.host_port if locator else None
             if host_port:
                 yield parameter.pid, host_port
 
@@ -153,7 +153,7 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
 
 
 def rewritten(
-    message: DiscoveryMessage, lead: Lead, is_hidden: Callable[[Announcement], bool]
+    message: DiscoveryMessage, lead: LocatorRedirect, is_hidden: Callable[[Announcement], bool]
 ) -> bytes:
     """The message with the locators in its announcements led elsewhere, and some of these hidden.
 
@@ -164,13 +164,13 @@ def rewritten(
         if is_hidden(announcement):
             edits.append(withheld(announcement.sample))
         else:
-            edits += _edits(message.datagram, announcement.held, lead)
+            edits += _edits(message.datagram, announcement.parameters, lead)
     return apply(message.datagram, edits)
 
 
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     parameters, inline = payload_parameters(datagram, sample), inline_parameters(datagram, sample)
-    ended = sample.key or _tells_an_end(datagram, inline)
+    ended = sample.is_key_only or _tells_an_end(datagram, inline)
     if parameters is None and not ended:
         raise RtpsError("an announcement that is no parameter list")
     parameters = parameters or ParameterList(sample.little, ())
@@ -191,17 +191,19 @@ def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
     return False
 
 
-def _edits(datagram: bytes, parameters: ParameterList, lead: Lead) -> Iterator[Overwrite]:
+def _edits(
+    datagram: bytes, parameters: ParameterList, lead: LocatorRedirect
+) -> Iterator[Overwrite]:
     for parameter in parameters.all(*UNICAST, *MULTICAST):
         target = _target(datagram, parameters, parameter, lead)
         yield replaced(parameters, parameter, target) if target else parameters.removed(parameter)
 
 
 def _target(
-    datagram: bytes, parameters: ParameterList, parameter: Parameter, lead: Lead
+    datagram: bytes, parameters: ParameterList, parameter: Parameter, lead: LocatorRedirect
 ) -> HostPort | None:
     """Where a locator is to lead; None if it is taken out."""
     locator = read_locator(datagram, parameters, parameter)
-    if locator is None or locator.where is None or parameter.pid in MULTICAST:
+    if locator is None or locator.host_port is None or parameter.pid in MULTICAST:
         return None
-    return lead(parameter.pid, locator.where)
+    return lead(parameter.pid, locator.host_port)

@@ -18,7 +18,7 @@ import time
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 
 from rosproxy.forwarding import datagrams
-from rosproxy.forwarding.datagrams import LARGEST
+from rosproxy.forwarding.datagrams import LARGEST_DATAGRAM
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.ros2.discovery.domain import Domain
@@ -120,10 +120,10 @@ class DomainServer:
 
     def select(self, addresses: Iterable[str]) -> None:
         """Let in participants at these addresses alone, from now on."""
-        before = self._selected.told or frozenset()
+        before = self._selected.selected or frozenset()
         self._selected.select(addresses)
         self._release()
-        self._ask((self._selected.told or frozenset()) - before)
+        self._ask((self._selected.selected or frozenset()) - before)
 
     def note_former(self, former: Mapping[bytes, Sequence[int]]) -> None:
         """Take in which ports participants had at a proxy with another address."""
@@ -149,13 +149,16 @@ class DomainServer:
             self._observe(address)
         settings, inside = self.domain.settings, list(self.domain.inside.by_prefix.values())
         self._send(
-            Outgoing(p.metatraffic, self.domain.own.announced_inside(settings.near(p.address)))
+            Outgoing(
+                p.metatraffic,
+                self.domain.own.announced_inside(settings.proxy_address_for(p.address)),
+            )
             for p in inside
             if p.metatraffic
         )
-        self._ask(self._selected.told or ())
+        self._ask(self._selected.selected or ())
         self._send(self.domain.own.announced_outside())
-        self._send(self.domain.own.keeping())
+        self._send(self.domain.own.port_reminders())
 
     def close(self) -> None:
         """Close all sockets."""
@@ -180,9 +183,9 @@ class DomainServer:
 
         Docker's internal networks do not, where bridged packets are filtered (br_netfilter).
         """
-        settings, counts = self.domain.settings, self.domain.inside.here
+        settings, counts = self.domain.settings, self.domain.inside.count_by_address
         for address in addresses:
-            announcement = self.domain.own.announced_inside(settings.near(address))
+            announcement = self.domain.own.announced_inside(settings.proxy_address_for(address))
             count = counts.get(address, 0)
             targets = settings.well_known(address, count + 2 if count else PARTICIPANTS_TRIED)
             self._send(Outgoing(target, announcement) for target in targets)
@@ -250,10 +253,10 @@ class DomainServer:
         """
         byte_count = count = 0
         with contextlib.suppress(BlockingIOError):
-            while count < PER_TURN and byte_count < LARGEST // 2:
+            while count < PER_TURN and byte_count < LARGEST_DATAGRAM // 2:
                 count += 1
                 try:
-                    datagram, sender = sock.recvfrom(LARGEST)
+                    datagram, sender = sock.recvfrom(LARGEST_DATAGRAM)
                 except ConnectionRefusedError:
                     continue
                 byte_count += len(datagram)
@@ -265,10 +268,12 @@ class DomainServer:
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
         for out in outgoing:
             try:
-                self._out[family_of(out.to.host)].sendto(out.datagram, (out.to.host, out.to.port))
+                self._out[family_of(out.target.host)].sendto(
+                    out.datagram, (out.target.host, out.target.port)
+                )
             except OSError as error:
                 self.lost += 1
-                log.debug("a datagram to %s: %s", out.to, error)
+                log.debug("a datagram to %s: %s", out.target, error)
 
     def _tell_changes(self) -> None:
         """Tell that leases have changed, if they have."""

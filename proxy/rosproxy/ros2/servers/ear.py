@@ -15,7 +15,7 @@ import socket
 from dataclasses import dataclass
 
 from rosproxy.forwarding import datagrams
-from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST
+from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
 from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.ros2.discovery.domain_settings import (
     PORTS_PER_DOMAIN,
@@ -57,7 +57,7 @@ class Ear:
         self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
         self._groups = GroupEars(self._port, self._begin, self._end)
         self._rates = DiscoveryRates(PER_SECOND, BURST)
-        self.heard = self.told = self.dropped = 0
+        self.from_lan = self.to_lan = self.dropped = 0
 
     def start(self) -> None:
         """Bind all sockets. Raises OSError."""
@@ -90,10 +90,10 @@ class Ear:
         """Tell the proxy what the LAN announces."""
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
-                datagram, sender = lan.recvfrom(LARGEST)
+                datagram, sender = lan.recvfrom(LARGEST_DATAGRAM)
                 source = plain_address(sender[0])
                 for announcement in self._announcements(datagram, source):
-                    self.heard += 1
+                    self.from_lan += 1
                     self._send(self._own, wrapped(source, announcement), self._settings.proxy)
 
     def _tell(self) -> None:
@@ -101,7 +101,7 @@ class Ear:
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
                 try:
-                    datagram, sender = self._own.recvfrom(LARGEST)
+                    datagram, sender = self._own.recvfrom(LARGEST_DATAGRAM)
                 except ConnectionRefusedError:  # the proxy is away
                     continue
                 source = plain_address(sender[0])
@@ -109,7 +109,7 @@ class Ear:
                     self.dropped += 1
                     continue
                 for announcement in self._announcements(datagram, source):
-                    self.told += 1
+                    self.to_lan += 1
                     for group in groups_of(self._settings.lan):
                         self._send(self._lan, announcement, HostPort(group, self._port))
 

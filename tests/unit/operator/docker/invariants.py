@@ -139,7 +139,7 @@ class Invariants:
         boxes = {box.id: box for box in self.engine.boxes}
         wanted = {}
         for member in live:
-            home = boxes.get(member.container.shares or "", boxes[member.container.id])
+            home = boxes.get(member.container.network_container or "", boxes[member.container.id])
             given = member.container.master_uri.removeprefix("http://") if self.engine.image else ""
             joined = [self.engine.networks[name] for name in home.networks]
             if (
@@ -221,12 +221,12 @@ class Invariants:
 
     def check_names(self, member: Member, networks: frozenset[str]) -> None:
         """By the name that a container uses it finds its own proxy and nobody else."""
-        for network in networks if member.needs else ():
+        for network in networks if member.wanted_alias else ():
             found = [
                 box.own.key if box.own else box.name
                 for box in self.engine.boxes
                 if network in box.networks
-                and member.needs in box.networks[network][1] | {box.name}
+                and member.wanted_alias in box.networks[network][1] | {box.name}
                 and box.state not in ("dead", "removing")
             ]
             restarting = [own.key for _, own in self.own("restarting", role=ROLE_SANDBOX)]

@@ -17,7 +17,7 @@ from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.planner.actions import Create, CreateRedirect, CreateSandbox
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.plan import plan
-from rosproxy_operator.docker.planner.redirect import _named, redirect_config
+from rosproxy_operator.docker.planner.redirect import _with_fingerprint, redirect_config
 from rosproxy_operator.docker.planner.specs import (
     container_config,
     own_labels,
@@ -95,7 +95,7 @@ async def test_without_a_file_the_secret_is_the_uplinks(engine: FakeEngine) -> N
     settings = replace(SETTINGS, secret="")
     looking = DockerObserver(DockerClient(), settings, MasterResolver(print), print)
     fresh = (await looking.look(5.0)).state.secret
-    assert fresh == (await looking.look(5.0)).fresh  # for the network that is going to be made
+    assert fresh == (await looking.look(5.0)).new_secret  # for the network that is going to be made
     uplink = captured.network() | {"Name": SETTINGS.uplink}
     engine.knows["/networks"].append(uplink | {"Labels": {"io.rosproxy.secret": "kept"}})
     assert (await looking.look(5.0)).state.secret == "kept"
@@ -179,7 +179,7 @@ async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
     looking = observer()
     await looking.look(5.0)
     del engine.knows[f"/containers/{'p' * 64}/json"]
-    looking.doubt("p" * 64)
+    looking.mark_doubtful("p" * 64)
     look = await looking.look(5.0)
     assert look.state.busy == {proxy_name(KEY)}
     assert look.access[proxy_name(KEY)].token == TOKEN
@@ -199,7 +199,7 @@ async def test_what_nothing_happened_to_is_not_inspected_again(engine: FakeEngin
     await looking.look(5.0)
     assert inspected_again(engine) == set()
     for container, again in (("p" * 64, {"p"}), ("x" * 64, {"p"}), (None, {"p", "b"})):
-        looking.doubt(container)
+        looking.mark_doubtful(container)
         assert not (await looking.look(5.0)).state.busy
         assert inspected_again(engine) == again
 
@@ -212,7 +212,7 @@ async def test_a_doubt_is_good_for_one_look_however_late(
     first = (await looking.look(5.0)).access[proxy_name(KEY)].run
     engine.knows[f"/containers/{'p' * 64}/json"]["State"]["StartedAt"] = "2"
     for container in ("p" * 64, None):
-        looking.doubt(container)
+        looking.mark_doubtful(container)
         await asyncio.sleep(0.01)
         assert (await looking.look(5.0)).access[proxy_name(KEY)].run != first
         engine.calls.clear()
@@ -226,13 +226,13 @@ async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngi
     seen = replace((await looking.look(5.0)).state, image_id=IMAGE)
     there = HostPort("192.0.2.7", 11311)
     made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", there, HostPort("172.18.0.9", 11311))
-    made = _named(made, seen, SETTINGS)
+    made = _with_fingerprint(made, seen, SETTINGS)
     row = own(made, "r" * 64, f"container:{'c' * 64}", "") | {"State": "exited"}
     state = {"Status": "exited", "StartedAt": "1", "ExitCode": 1}
     engine.add(row, inspection(redirect_config(made, SETTINGS)) | {"State": state})
     assert [one.done for one in (await looking.look(5.0)).state.redirects] == [False]
     state["ExitCode"] = 0
-    looking.doubt("r" * 64)
+    looking.mark_doubtful("r" * 64)
     assert [one.done for one in (await looking.look(5.0)).state.redirects] == [True]
 
 

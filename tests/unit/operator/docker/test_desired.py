@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.desired import assign, desire
+from rosproxy_operator.docker.planner.desired import assign_aliases, desire
 from rosproxy_operator.docker.planner.model import (
     Container,
     Desired,
@@ -16,7 +16,7 @@ from rosproxy_operator.docker.planner.model import (
     PlanSettings,
 )
 from rosproxy_operator.docker.planner.specs import proxy_name
-from rosproxy_operator.docker.planner.state import DockerMemory, noticed
+from rosproxy_operator.docker.planner.state import DockerMemory, with_exited
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
@@ -45,7 +45,7 @@ def want(
     settings: PlanSettings = SETTINGS,
 ) -> tuple[dict[Key, Desired], tuple[Problem, ...]]:
     members, _ = read_members(seen, settings)
-    memory = noticed(memory or DockerMemory(), members, now)
+    memory = with_exited(memory or DockerMemory(), members, now)
     desired, problems = desire(seen, settings, members, memory, now)
     assert list(desired) == sorted(desired, key=lambda one: one.key)
     return {one.key: one for one in desired}, problems
@@ -54,7 +54,7 @@ def want(
 def names(*containers: Container, **more: Any) -> tuple[dict[tuple[Key, str], set[str]], list[str]]:
     """The names that proxies get on networks, and who is told that it won't find its own."""
     seen = observed(*containers, **more)
-    given, problems = assign([*want(seen)[0].values()], seen)
+    given, problems = assign_aliases([*want(seen)[0].values()], seen)
     told = [problem.subject.removeprefix("container ") for problem in problems]
     places = {(key, name): set(found) for key in given for name, found in given[key].items()}
     return places, told
@@ -162,7 +162,7 @@ def test_a_masters_name_that_another_container_has_is_not_taken() -> None:
 def test_who_looks_for_the_masters_name_then_is_told() -> None:
     robot = container("robot", {}, state="exited")
     seen = observed(container(env=KEY.master_uri), robot)
-    problems = assign([*want(seen)[0].values()], seen)[1]
+    problems = assign_aliases([*want(seen)[0].values()], seen)[1]
     assert problems == [
         Problem(
             "container talker",

@@ -28,7 +28,7 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.own import gives_away
+from rosproxy_operator.docker.planner.own import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     OwnLabels,
@@ -246,7 +246,7 @@ def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
     }
     own = read_own(config["Labels"])
     assert own == OwnLabels("ear", KEY, RANGE, "")
-    assert not gives_away(own, MADE.name, read_making(inspection(config)), IMAGE)
+    assert not forgery_reason(own, MADE.name, read_making(inspection(config)), IMAGE)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
     making = inspection(ear_config(MADE, SETTINGS))
     making["HostConfig"][field] = value
     own = OwnLabels("ear", KEY, RANGE, "")
-    found = gives_away(own, MADE.name, read_making(making), IMAGE)
+    found = forgery_reason(own, MADE.name, read_making(making), IMAGE)
     assert found == f"its HostConfig.{field} is none that it gives"
 
 

@@ -48,7 +48,7 @@ from tests.unit.operator.docker.conftest import FakeEngine
 PERMISSIONS = Path(__file__).parents[4] / "docs/reference/permissions.md"
 BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
 SEEN = observed(masters={"robot": "192.0.2.7"})
-LOOK = DockerSnapshot(SEEN, LabelReading(), {}, at_host=True, fresh="fresh secret")
+LOOK = DockerSnapshot(SEEN, LabelReading(), {}, at_host=True, new_secret="fresh secret")
 ACTIONS: list[Action] = [
     CreateNetwork("0-rosproxy"),
     BOX,

@@ -12,7 +12,7 @@ from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, within_bounds
 from rosproxy_operator.docker.planner.labels.values import MOST_LABEL_RULES
 from rosproxy_operator.docker.planner.model import Attachment, Key, Member
-from rosproxy_operator.docker.planner.proxy_news import ProxyNews, facts
+from rosproxy_operator.docker.planner.proxy_news import ProxyNews, network_facts
 from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint
 from rosproxy_operator.docker.planner.state import DockerMemory
 from tests.run_options import settings_of
@@ -92,7 +92,7 @@ def test_a_layer_is_for_the_addresses_of_its_container() -> None:
     members = [Member(one, KEY, policy=RULES) for one in (talker, guest, soon, ended)]
     plain = Member(container("plain", networks=[Attachment("app", B)]), KEY)
     other = Member(talker, Key("http://other:11311", "192.0.2.10"), policy=RULES)
-    known = facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
+    known = network_facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
     assert known.policy == (*COMMON, layer("talker", A), layer("guest", A))
 
 
@@ -139,7 +139,7 @@ def test_the_same_look_is_the_same_policy() -> None:
     first, second = ProxyNews(), ProxyNews()
     for news, order in ((first, layers), (second, layers[::-1])):
         seen = observed(**both())
-        known = replace(facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
+        known = replace(network_facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
         news.look(known, 0.0)
     assert first.policy == second.policy
     assert first.policy[0] == COMMON[0]

@@ -73,7 +73,7 @@ def test_a_labelled_container_wishes_for_a_proxy() -> None:
 @pytest.mark.parametrize("value", ["true", "True", " TRUE "])
 def test_the_label_alone_is_enough(value: str) -> None:
     member = good(container(labels={"rosproxy.enable": value}, env=ROBOT))
-    assert (member.key, member.ports, member.needs) == (KEY, 0, "robot")
+    assert (member.key, member.ports, member.wanted_alias) == (KEY, 0, "robot")
 
 
 URI = "is not of the form http://HOST:11311"
@@ -245,7 +245,7 @@ def test_a_variable_that_leads_astray(env: str, told: str) -> None:
 @pytest.mark.parametrize("env", ["", "http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
 def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
     needs = "rosproxy" if "rosproxy" in env or not env else "robot"
-    assert good(container(env=env)).needs == needs
+    assert good(container(env=env)).wanted_alias == needs
 
 
 # this host's address

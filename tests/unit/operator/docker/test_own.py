@@ -9,7 +9,7 @@ from msgspec import structs
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.engine_json import check_inspection, read_making
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
-from rosproxy_operator.docker.planner.own import gives_away, has_own_name
+from rosproxy_operator.docker.planner.own import forgery_reason, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     container_config,
     own_labels,
@@ -34,7 +34,7 @@ def wrong(inspected: dict[str, Any], name: str, image: str = IMAGE) -> str:
     """What gives a container away, read as the operator reads it."""
     own = read_own(inspected["Config"]["Labels"])
     assert own is not None
-    return gives_away(own, name, read_making(check_inspection(inspected)), image)
+    return forgery_reason(own, name, read_making(check_inspection(inspected)), image)
 
 
 def changed(role: str, *path: str, value: object) -> dict[str, Any]:

@@ -14,7 +14,12 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, Places, ProxyNews, facts
+from rosproxy_operator.docker.planner.proxy_news import (
+    AddressHistory,
+    NetworkFacts,
+    ProxyNews,
+    network_facts,
+)
 
 KEY = Key("http://robot:11311", "192.0.2.10")
 PORTS = PortRange(11400, 11431)
@@ -50,7 +55,7 @@ def look(*containers: Container) -> HostState:
 
 
 def told(seen: HostState, *members: Member) -> NetworkFacts:
-    return facts(replace(seen, masters={"robot": "198.51.100.7"}), seen.proxies[0], members)
+    return network_facts(replace(seen, masters={"robot": "198.51.100.7"}), seen.proxies[0], members)
 
 
 def member(container: Container) -> Member:
@@ -92,7 +97,7 @@ def test_the_masters_address_is_only_told_for_a_name() -> None:
     seen = replace(look(), masters={"198.51.100.8": "198.51.100.8"})
     key = Key("http://198.51.100.8:11311", "192.0.2.10")
     process = replace(seen.proxies[0], key=key)
-    assert facts(seen, process, ()).master_address == ""
+    assert network_facts(seen, process, ()).master_address == ""
 
 
 def test_selected_are_all_that_may_use_it_on_its_networks() -> None:
@@ -133,8 +138,8 @@ HERE, AWAY, THERE, NOBODY = (
 )
 
 
-def places(*looks: tuple[float, NetworkFacts]) -> Places:
-    found = Places()
+def places(*looks: tuple[float, NetworkFacts]) -> AddressHistory:
+    found = AddressHistory()
     for when, known in looks:
         found.look(known, when)
     return found
@@ -144,34 +149,34 @@ def test_a_container_with_another_address_has_moved_until_its_proxy_knows() -> N
     found = places((0.0, HERE), (1.0, THERE))
     assert found.moved({OLD}) == {OLD: NEW}
     assert found.moved({NEW}) == {}
-    assert found.held == {OLD}
-    assert found.until == 6.0
+    assert found.reserved_addresses == {OLD}
+    assert found.next_expiry == 6.0
 
 
 def test_a_move_is_given_up_in_the_end() -> None:
     found = places((0.0, HERE), (1.0, THERE), (6.0, THERE))
     assert not found.moved({OLD})
-    assert not found.held
-    assert found.until is None
+    assert not found.reserved_addresses
+    assert found.next_expiry is None
 
 
 def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> None:
     found = places((0.0, HERE), (1.0, AWAY))
     assert not found.moved({OLD})
-    assert found.held == {OLD}
-    assert found.until == 3.0
+    assert found.reserved_addresses == {OLD}
+    assert found.next_expiry == 3.0
     found.look(THERE, 2.0)
     assert found.moved({OLD}) == {OLD: NEW}
 
 
 def test_a_container_that_stays_away_is_gone() -> None:
-    assert places((0.0, HERE), (1.0, AWAY), (3.0, AWAY)).held == frozenset()
+    assert places((0.0, HERE), (1.0, AWAY), (3.0, AWAY)).reserved_addresses == frozenset()
 
 
 def test_a_container_that_does_not_run_is_gone_at_once() -> None:
     found = places((0.0, HERE), (1.0, NOBODY))
-    assert not found.held
-    assert found.until is None
+    assert not found.reserved_addresses
+    assert found.next_expiry is None
 
 
 def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> None:
@@ -188,7 +193,7 @@ def test_container_that_changes_networks_takes_its_nodes_along() -> None:
     found = places((0.0, before), (0.1, between), (1.0, after))
 
     assert found.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
-    assert found.held == {"172.18.0.5"}
+    assert found.reserved_addresses == {"172.18.0.5"}
     found.look(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
     assert found.moved({"172.19.0.9"}) == {"172.19.0.9": "172.19.0.3"}
 
@@ -208,13 +213,13 @@ def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None
     (arrived,) = news.body(set(), 0.0)["arrived"]
     assert arrived["address"] == OLD
     assert "talker" in arrived["names"]
-    news.told(0.0)
+    news.mark_delivered(0.0)
     assert news.next_due(0.0) == 1.0
     assert news.body(set(), 0.5) == {}
     for when in (1.0, 3.0, 10.0):
         news.look(told(look(talker()), member(talker())), when)
         assert news.body(set(), when)["arrived"]
-        news.told(when)
+        news.mark_delivered(when)
     assert news.next_due(11.0) is None
 
 
@@ -240,6 +245,6 @@ def test_a_move_is_told_until_the_proxy_knows() -> None:
     news.body({OLD}, 0.0)
     news.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # nobody has the old one: not gone
     assert news.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
-    news.told(1.0)
+    news.mark_delivered(1.0)
     assert news.next_due(1.0) == 1.0
     assert news.body({NEW}, 2.0) == {}

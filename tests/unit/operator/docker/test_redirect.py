@@ -20,9 +20,9 @@ from rosproxy_operator.docker.planner.model import (
     RedirectContainer,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.own import gives_away
+from rosproxy_operator.docker.planner.own import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
-from rosproxy_operator.docker.planner.proxy_news import facts
+from rosproxy_operator.docker.planner.proxy_news import network_facts
 from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import own_labels, read_own
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -78,7 +78,7 @@ def look(state: HostState, settings: PlanSettings = SETTINGS) -> DockerPlan:
 def steps(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]:
     """What is to be done for redirects alone."""
     groups = look(state, settings).groups
-    return [action for group in groups if group.about for action in group.actions]
+    return [action for group in groups if group.subject for action in group.actions]
 
 
 def wanted(state: HostState) -> CreateRedirect:
@@ -203,7 +203,7 @@ def test_a_masters_name_may_be_known_by_the_address() -> None:
 def test_who_is_not_redirected_is_told(one: Container, settings: PlanSettings, text: str) -> None:
     members, problems = read_members(observed(one), settings)
     assert text in " ".join(problem.text for problem in problems)
-    assert not any(member.by_address for member in members)
+    assert not any(member.redirected_master for member in members)
 
 
 def test_a_label_can_not_widen() -> None:
@@ -214,7 +214,7 @@ def test_a_label_can_not_widen() -> None:
 def test_without_a_way_outwards_nothing_is_redirected() -> None:
     cell = replace(APP, internal=True)
     (member,), (problem,) = read_members(observed(node(), networks=[UPLINK, cell]))
-    assert member.by_address is None
+    assert member.redirected_master is None
     assert "its networks have no way outwards" in problem.text
 
 
@@ -230,7 +230,7 @@ def test_its_nodes_arrive_once_more_when_it_is_there() -> None:
 
     def arrivals(*records: RedirectContainer) -> Any:
         state = observed(node(), **there(), redirects=records)
-        return facts(state, state.proxies[0], members).arrivals
+        return network_facts(state, state.proxies[0], members).arrivals
 
     assert len(arrivals() | arrivals(record(made))) == 2
     assert arrivals() == arrivals(record(made, code=1))
@@ -256,7 +256,7 @@ def test_it_has_one_capability_and_bounds() -> None:
     }
     own = read_own(config["Labels"])
     assert own is not None
-    assert not gives_away(own, MADE.name, read_making(inspection(config)), IMAGE)
+    assert not forgery_reason(own, MADE.name, read_making(inspection(config)), IMAGE)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
     making["HostConfig"][field] = value
     own = read_own(own_labels(MADE))
     assert own is not None
-    found = gives_away(own, MADE.name, read_making(making), IMAGE)
+    found = forgery_reason(own, MADE.name, read_making(making), IMAGE)
     assert found == f"its HostConfig.{field} is none that it gives"
 
 
@@ -292,8 +292,8 @@ def test_what_an_image_says_gives_it_away_as_well(change: dict[str, Any], text: 
     making = inspection({**redirect_config(MADE, SETTINGS), **change})
     own = read_own(own_labels(MADE))
     assert own is not None
-    assert gives_away(own, MADE.name, read_making(making), IMAGE) == text
-    assert gives_away(own, "talker", read_making(making), IMAGE).startswith("its name is not")
+    assert forgery_reason(own, MADE.name, read_making(making), IMAGE) == text
+    assert forgery_reason(own, "talker", read_making(making), IMAGE).startswith("its name is not")
 
 
 def test_the_end_of_a_container_without_a_network_shows_in_the_list() -> None:

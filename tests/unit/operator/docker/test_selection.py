@@ -26,30 +26,30 @@ def test_everybody_has_one_part(some: list[tuple[str, bool]], creatable: bool) -
     if any(one.state == "removing" for one in every):
         assert found.waiting
         assert (found.kept is None) == (not runs)
-        assert (found.old, found.others) == (None, ())
+        assert (found.predecessor, found.surplus) == (None, ())
         return
     assert found.stuck == (not runs and not ready and not creatable)
     if found.stuck:
         return
-    parts = [one for one in (found.kept, found.old) if one] + list(found.others)
+    parts = [one for one in (found.kept, found.predecessor) if one] + list(found.surplus)
     assert sorted(one.name for one in parts) == sorted(one.name for one in every)
     if any(one.id in right for one in runs) or (runs and not creatable):
         assert found.kept in runs
-        assert found.old is None
+        assert found.predecessor is None
     elif ready:
         assert found.kept in ready
-        assert found.old in runs or (found.old is None and not runs)
+        assert found.predecessor in runs or (found.predecessor is None and not runs)
     else:
         assert found.kept is None
-        assert found.old is None or found.old in runs or not runs
-    assert not found.old or found.old.state != "dead"
+        assert found.predecessor is None or found.predecessor in runs or not runs
+    assert not found.predecessor or found.predecessor.state != "dead"
 
 
 def test_the_one_with_the_name_is_preferred() -> None:
     every = [own(name) for name in ("a", "name", "z")]
     found = select(every, "name", {one.container.id for one in every}, True)
     assert found.kept == every[1].container
-    assert [one.name for one in found.others] == ["a", "z"]
+    assert [one.name for one in found.surplus] == ["a", "z"]
 
 
 def test_free_names() -> None:

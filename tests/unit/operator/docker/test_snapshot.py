@@ -23,7 +23,7 @@ from rosproxy_operator.docker.planner.model import (
     Network,
     Sandbox,
 )
-from rosproxy_operator.docker.snapshot import address_in, strangers
+from rosproxy_operator.docker.snapshot import address_in, foreign_ports
 from tests.unit.operator.docker import captured
 
 APP = Network(captured.APP_ID, "app")
@@ -135,14 +135,14 @@ def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
     key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
     box = Sandbox(key, Container("1", "box", "created"), ports, "")
     listening = frozenset({22, 11400, 11401})
-    assert strangers([box], [], listening) == {22}
-    assert strangers([], [], listening) == listening
+    assert foreign_ports([box], [], listening) == {22}
+    assert foreign_ports([], [], listening) == listening
 
 
 def test_the_port_of_an_ear_is_no_strangers() -> None:
     key, ports = Key("", "192.0.2.10", 0), PortRange(11400, 11431)
     ear = EarContainer(key, Container("1", "ear", "running"), ports, "")
-    assert strangers([], [ear], frozenset({11400, 11431})) == {11400}
+    assert foreign_ports([], [ear], frozenset({11400, 11431})) == {11400}
 
 
 def test_the_engine_knows_names_that_no_name_server_has() -> None:

@@ -3,7 +3,12 @@
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.resources.cluster import NodeState, ProxyPod, ProxyReport, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import (
+    PodFailure,
+    ProxyPod,
+    ProxyReport,
+    RosProxyOnNode,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Json,
@@ -133,7 +138,7 @@ def proxy(node: str = "node1", ready: bool = True, **more: Any) -> ProxyPod:
     return ProxyPod(own, of, "uid-arm", node, RANGE, "f", "rosproxy:1", ready=ready, **more)
 
 
-def stuck_proxy(why: Stuck, message: str = "because") -> ProxyPod:
+def stuck_proxy(why: PodFailure, message: str = "because") -> ProxyPod:
     """A proxy that does not run."""
     return proxy(ready=False, stuck=why, message=message)
 
@@ -144,7 +149,7 @@ def answer(*names: str, **more: Any) -> ProxyReport:
     return ProxyReport(**{"answered": True, "master_up": True, "nodes": there, **more})
 
 
-def state(node: str = "node1", **more: Any) -> NodeState:
+def state(node: str = "node1", **more: Any) -> RosProxyOnNode:
     """A node with a pod, a proxy and its answer, unless told otherwise."""
     found = {
         "proxy": proxy(node),
@@ -152,11 +157,11 @@ def state(node: str = "node1", **more: Any) -> NodeState:
         "answer": answer("/talker", topics=frozenset({"/chatter"})),
         **more,
     }
-    return NodeState(node, "192.0.2.11", found.pop("range", RANGE), **found)
+    return RosProxyOnNode(node, "192.0.2.11", found.pop("range", RANGE), **found)
 
 
 def status(
-    *states: NodeState,
+    *states: RosProxyOnNode,
     of: RosProxy | None = None,
     more: tuple[ClusterFinding, ...] = (),
     **given: Any,

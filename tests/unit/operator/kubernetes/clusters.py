@@ -113,7 +113,7 @@ class Clusters(World):
         there = [meta(pod)["uid"] for pod in self.users() if node_of(pod) == node]
         known = {self.cluster.addresses[uid] for uid in there if uid in self.cluster.addresses}
         for pod, proxy in self.proxies():
-            if proxy.on == node and proxy.pod.uid in self.cluster.ros:
+            if proxy.node == node and proxy.pod.uid in self.cluster.ros:
                 self.cluster.ros[meta(pod)["uid"]] |= known
 
     # nodes

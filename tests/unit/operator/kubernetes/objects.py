@@ -9,15 +9,15 @@ from msgspec.structs import replace
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
-from rosproxy_operator.kubernetes.planner.manifests import Site
+from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
+    PodFailure,
     ProxyPod,
     ProxyService,
-    Stuck,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
@@ -42,7 +42,7 @@ def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
     words: dict[str, Any] = {
         "master": MasterSpec("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
     }  # fmt: skip
-    own = {key: changes.pop(key) for key in ("former", "cluster_ip", "status", "deleting")
+    own = {key: changes.pop(key) for key in ("former_ranges", "cluster_ip", "status", "deleting")
            if key in changes}  # fmt: skip
     return RosProxy(
         Name("ros", name), uid or f"uid-{name}", 1, RosProxySpec(**words | changes), **own
@@ -66,21 +66,21 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
         "phase": "Running",
         "ip": f"10.244.1.{sum(name.encode()) % 250 + 2}",
         "host_ports": taken,
-        "wired": "" if taken else "http://10.96.1.1:11311",
+        "wired_master_uri": "" if taken else "http://10.96.1.1:11311",
     }
     return Pod(Name("ros", name), f"uid-{name}", **words | changes)
 
 
-def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> Site:
+def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> ProxySite:
     host = on.advertise_host or on.addresses["InternalIP"]
-    return Site(of, on, host, ports, replace(of.spec.master, publish=publish))
+    return ProxySite(of, on, host, ports, replace(of.spec.master, publish=publish))
 
 
 def proxy(
     of: RosProxy | None = None,
     on: ClusterNode | None = None,
     ports: PortRange = RANGE,
-    stuck: Stuck | None = None,
+    stuck: PodFailure | None = None,
     phase: str = "Running",
     publish: int = 0,
     settings: ClusterSettings = SETTINGS,

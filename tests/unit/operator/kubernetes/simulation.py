@@ -385,7 +385,7 @@ class Controller:
         stamp = f"2026-01-01T{int(self.now) // 3600 % 24:02}:00:00Z"
         found = plan(observed, self.settings, self.state, self.now, stamp)
         self.state = found.state
-        for uid, addresses in found.gone.items():
+        for uid, addresses in found.departed_addresses.items():
             self.cluster.ros[uid] -= set(addresses)
         return found
 

@@ -10,7 +10,7 @@ from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProx
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, PodFailure
 from rosproxy_operator.kubernetes.resources.model import MasterSpec, ProxyPlace
 from tests.unit.operator.kubernetes.objects import (
     RANGE,
@@ -75,8 +75,8 @@ def host_ports(action: CreateProxy) -> list[int]:
         # never the proxy's own
         (rosproxy(window=PortRange(11309, 11330)), [], "11313-11316"),
         # those in the status, unless somebody holds them
-        (rosproxy(former=FORMER), [], "11450-11453"),
-        (rosproxy(former=FORMER), [pod("web", ports=[11451])], "11400-11403"),
+        (rosproxy(former_ranges=FORMER), [], "11450-11453"),
+        (rosproxy(former_ranges=FORMER), [pod("web", ports=[11451])], "11400-11403"),
     ],
 )  # fmt: skip
 def test_a_new_range(of: Any, others: list, ports: str) -> None:
@@ -105,7 +105,7 @@ def test_two_rosproxies_get_different_ports_on_a_node_and_the_same_on_two() -> N
 def test_former_ports_of_another_rosproxy_are_left_alone_if_there_are_others(
     changes: dict, ports: PortRange
 ) -> None:
-    arm = rosproxy("arm", former={"one": RANGE})
+    arm = rosproxy("arm", former_ranges={"one": RANGE})
     assert created(look(two(B, arm=arm, robot=rosproxy(**changes)))) == str(ports)
 
 
@@ -173,7 +173,7 @@ def test_who_has_left_his_ports_is_told() -> None:
 # conflicts
 
 
-STUCK = scene(proxy(stuck=Stuck.PORTS))
+STUCK = scene(proxy(stuck=PodFailure.PORTS))
 
 
 def served(**more: Any) -> ClusterState:
@@ -195,7 +195,7 @@ def test_ports_that_never_served_are_left_at_once_if_they_can_not_be_had() -> No
 
 def test_the_next_range_begins_after_the_port_that_a_pod_is_seen_to_hold() -> None:
     first = look(scene())
-    stuck = scene(proxy(stuck=Stuck.PORTS), pod("web", ports=[11400]))
+    stuck = scene(proxy(stuck=PodFailure.PORTS), pod("web", ports=[11400]))
     assert str(look(stuck, first.state, 101.0).state.given[HERE]) == "11401-11404"
 
 
@@ -203,7 +203,7 @@ def test_ports_that_have_served_are_tried_for_a_while() -> None:
     first = look(STUCK, served(), 101.0)
     assert done(first) == []
     assert told(first, "PortConflict")
-    assert look(STUCK, first.state, 119.0).again_in == 2.0
+    assert look(STUCK, first.state, 119.0).next_look_in == 2.0
     second = look(STUCK, first.state, 120.9)
     assert done(second) == []
     third = look(STUCK, second.state, 121.0)
@@ -213,7 +213,7 @@ def test_ports_that_have_served_are_tried_for_a_while() -> None:
 
 
 def test_a_rejected_pod_is_made_anew_on_the_same_ports_for_a_while() -> None:
-    failed = scene(replace(proxy(phase="Failed"), stuck=Stuck.PORTS))
+    failed = scene(replace(proxy(phase="Failed"), stuck=PodFailure.PORTS))
     first = look(failed, served(), 101.0)
     assert kinds(first) == [DeleteProxy]
     second = look(scene(), first.state, 102.0)
@@ -230,7 +230,7 @@ def test_who_gets_his_ports_back_in_time_stays() -> None:
 
 
 def test_another_proxy_that_is_about_to_end_is_waited_for() -> None:
-    waits = scene(proxy(stuck=Stuck.PORTS), proxy(rosproxy("arm"), deleting=True))
+    waits = scene(proxy(stuck=PodFailure.PORTS), proxy(rosproxy("arm"), deleting=True))
     found = look(waits)
     for now in (200.0, 300.0):
         assert not [one for one in done(found) if one.of == ROBOT]
@@ -238,8 +238,8 @@ def test_another_proxy_that_is_about_to_end_is_waited_for() -> None:
 
 
 def test_what_the_status_names_counts_as_served_after_a_restart_of_the_controller() -> None:
-    of = rosproxy(former={"one": RANGE})
-    assert done(look(scene(proxy(stuck=Stuck.PORTS), of=of))) == []
+    of = rosproxy(former_ranges={"one": RANGE})
+    assert done(look(scene(proxy(stuck=PodFailure.PORTS), of=of))) == []
 
 
 def test_refused_ports_are_avoided_for_five_minutes() -> None:
@@ -312,7 +312,7 @@ def test_who_has_the_masters_port_keeps_it() -> None:
 
 def test_a_masters_port_that_is_in_the_way_does_not_move_the_range() -> None:
     of = publishing(11500)
-    stuck = proxy(of, stuck=Stuck.PORTS, publish=11500)
+    stuck = proxy(of, stuck=PodFailure.PORTS, publish=11500)
     found = look(scene(stuck, pod("web", ports=[11500]), of=of), look(scene(of=of)).state, 101.0)
     assert kinds(found) == [DeleteProxy]
     assert found.state.given[HERE] == RANGE

@@ -10,11 +10,11 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.client import (
     SOON,
     Api,
-    ApiAway,
     ApiConflict,
     ApiError,
-    ApiGone,
     ApiInvalid,
+    ApiNotFound,
+    ApiUnavailable,
     refusal,
 )
 from rosproxy_operator.kubernetes.api.rbac import missing_rule
@@ -40,8 +40,11 @@ async def test_lists_with_selectors(server: ApiServer, api: Api) -> None:
     server.put("pods", pod("a", app="x"))
     server.put("pods", pod("other", app="x"), "elsewhere")
     server.put("pods", {"metadata": {"name": "mine", "labels": own_labels("arm")}})
-    assert names(await in_thread(api.fresh, "pods", "", "spec.nodeName=node1")) == {"a", "other"}
-    assert names(await in_thread(api.fresh, "pods", "ns", "metadata.name=a")) == {"a"}
+    assert names(await in_thread(api.list_fresh, "pods", "", "spec.nodeName=node1")) == {
+        "a",
+        "other",
+    }
+    assert names(await in_thread(api.list_fresh, "pods", "ns", "metadata.name=a")) == {"a"}
     assert names(await in_thread(api.own_pods)) == {"mine"}
     assert not any("resourceVersion" in query for query in server.asked("GET", "pods"))
 
@@ -53,8 +56,8 @@ async def test_a_list_comes_in_pages(
     for name in "abc":
         server.put("pods", pod(name))
     first = await in_thread(api.page, "pods", "")
-    last = await in_thread(api.page, "pods", "", first.more)
-    assert (names(first.items), names(last.items), last.more) == ({"a", "b"}, {"c"}, "")
+    last = await in_thread(api.page, "pods", "", first.continue_token)
+    assert (names(first.items), names(last.items), last.continue_token) == ({"a", "b"}, {"c"}, "")
 
 
 async def test_who_is_put_off_asks_again_when_told(
@@ -65,13 +68,13 @@ async def test_who_is_put_off_asks_again_when_told(
     monkeypatch.setattr("rosproxy_operator.kubernetes.api.client.time.sleep", slept.append)
     server.refuse("GET", "nodes", 429, "too many requests")
     server.retry_after = "7"
-    with pytest.raises(ApiAway, match="too many requests"):
+    with pytest.raises(ApiUnavailable, match="too many requests"):
         await in_thread(api.page, "nodes", "")
     assert slept == [7.0] * 4
-    with pytest.raises(ApiAway):
+    with pytest.raises(ApiUnavailable):
         await in_thread(api.get, "nodes", Name("", "node1"), SOON)
     server.retry_after = "999999"
-    with pytest.raises(ApiAway):
+    with pytest.raises(ApiUnavailable):
         await in_thread(api.page, "nodes", "")
     assert max(slept) == 10.0
 
@@ -132,7 +135,7 @@ async def test_an_api_server_that_is_away_and_back(
     late = Api()
     with pytest.raises(ApiError, match=f"API server at {other.url} can't be reached") as caught:
         await in_thread(late.page, "nodes", "")
-    assert type(caught.value) is ApiAway
+    assert type(caught.value) is ApiUnavailable
     async with listening(other, port):
         assert (await in_thread(late.page, "nodes", "")).items == []
         late.close()
@@ -142,7 +145,7 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
     server.refuse("GET", "nodes", 200, "hello")
     with pytest.raises(ApiError, match="is no API server") as caught:
         await in_thread(api.page, "nodes", "")
-    assert type(caught.value) is ApiAway
+    assert type(caught.value) is ApiUnavailable
 
 
 @pytest.mark.parametrize("text", [b"", b"<html>", b"[]", b"\xff", b'{"items": ["\xff"]}'])
@@ -151,7 +154,7 @@ async def test_what_does_not_answer_in_json_is_away(
 ) -> None:
     answer = SimpleNamespace(status=200, reason="OK", read=lambda: text, getheader=lambda *_: "")
     monkeypatch.setattr(api._client, "call_api", lambda *_, **__: answer)
-    with pytest.raises(ApiAway, match="/api/v1/nodes is no API server"):
+    with pytest.raises(ApiUnavailable, match="/api/v1/nodes is no API server"):
         await in_thread(api.page, "nodes", "")
 
 
@@ -179,15 +182,15 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
         (
             403,
             "unable to create new content in namespace x because it is being terminated",
-            ApiGone,
+            ApiNotFound,
             "terminated",
         ),
-        (401, "Unauthorized", ApiAway, "does not know the operator's token"),
-        (404, 'pods "p" not found', ApiGone, 'pods "p" not found'),
+        (401, "Unauthorized", ApiUnavailable, "does not know the operator's token"),
+        (404, 'pods "p" not found', ApiNotFound, 'pods "p" not found'),
         (409, "exists", ApiConflict, "exists"),
         (422, "spec.clusterIP: Invalid value", ApiInvalid, "spec.clusterIP"),
-        (429, "storage is (re)initializing", ApiAway, "HTTP 429"),
-        (503, "etcd", ApiAway, "HTTP 503: etcd"),
+        (429, "storage is (re)initializing", ApiUnavailable, "HTTP 429"),
+        (503, "etcd", ApiUnavailable, "HTTP 503: etcd"),
         (418, "tea", ApiError, "tea"),
     ],
 )

@@ -7,7 +7,11 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.access.bounds import may_name, objection, within_bounds
+from rosproxy_operator.kubernetes.planner.access.bounds import (
+    bounds_violation,
+    is_allowed_master,
+    within_bounds,
+)
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import MasterSpec, Name
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
@@ -41,7 +45,7 @@ NARROW = bounded(window=PortRange(12000, 12999))
 
 
 def asks(settings: ClusterSettings = OWN, **changes: Any) -> str:
-    return objection(rosproxy(**changes), {}, settings)
+    return bounds_violation(rosproxy(**changes), {}, settings)
 
 
 def condition(found: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, str]:
@@ -108,7 +112,7 @@ def test_what_the_administrator_allows(
     ],
 )
 def test_a_masters_pattern(master: str, pattern: str, allowed: bool) -> None:
-    assert may_name(master, (pattern,)) is allowed
+    assert is_allowed_master(master, (pattern,)) is allowed
 
 
 @pytest.mark.parametrize(
@@ -140,7 +144,7 @@ def test_another_namespaces_master_needs_its_consent(
     consents: tuple[str, ...], allowed: bool, publish: int
 ) -> None:
     agreed = {ROSCORE: frozenset(consents)}
-    said = objection(rosproxy(master=replace(THEIRS, publish=publish)), agreed, OWN)
+    said = bounds_violation(rosproxy(master=replace(THEIRS, publish=publish)), agreed, OWN)
     assert (said == "") is allowed
     command = "kubectl -n other annotate --overwrite service roscore rosproxy.io/allow-from="
     if not allowed:
@@ -156,7 +160,7 @@ def test_whether_another_namespaces_service_exists_is_not_told() -> None:
 
 def test_who_asks_for_too_much_gets_nothing_and_is_told() -> None:
     of = rosproxy(data_plane="kernel")
-    found = look(observed(of, pod(wired="")), settings=OWN)
+    found = look(observed(of, pod(wired_master_uri="")), settings=OWN)
     assert done(found) == []
     text = "spec.dataPlane: 'Kernel' is not what the operator allows"
     for kind, holds in (("Ready", "False"), ("Degraded", "True")):

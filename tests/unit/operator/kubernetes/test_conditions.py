@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer
-from rosproxy_operator.kubernetes.resources.cluster import Obstacle, ProxyReport, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import Obstacle, PodFailure, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, MasterSpec, Name, Reference
 from rosproxy_operator.kubernetes.status.findings import findings
 from tests.unit.operator.kubernetes.builders_api import (
@@ -48,11 +48,15 @@ def test_a_proxy_that_is_yet_to_come_is_no_problem(given, said):
 @pytest.mark.parametrize(
     ("why", "reason", "said"),
     [
-        (Stuck.PORTS, "PortConflict", "ports 11400-11431 are not all free there (because)"),
-        (Stuck.SCHEDULING, "ProxyStuck", "it is not admitted (because): make room"),
-        (Stuck.IMAGE, "ProxyStuck", "can't get the image rosproxy:1 (because): load it there"),
-        (Stuck.CRASHING, "ProxyStuck", "kubectl -n robots logs --previous rosproxy-arm-node1-"),
-        (Stuck.SANDBOX, "ProxyStuck", "kubectl -n robots describe pod rosproxy-arm-node1-"),
+        (PodFailure.PORTS, "PortConflict", "ports 11400-11431 are not all free there (because)"),
+        (PodFailure.SCHEDULING, "ProxyStuck", "it is not admitted (because): make room"),
+        (PodFailure.IMAGE, "ProxyStuck", "can't get the image rosproxy:1 (because): load it there"),
+        (
+            PodFailure.CRASHING,
+            "ProxyStuck",
+            "kubectl -n robots logs --previous rosproxy-arm-node1-",
+        ),
+        (PodFailure.SANDBOX, "ProxyStuck", "kubectl -n robots describe pod rosproxy-arm-node1-"),
     ],
 )
 def test_a_proxy_that_does_not_run(why, reason, said):
@@ -63,7 +67,7 @@ def test_a_proxy_that_does_not_run(why, reason, said):
     assert said in message(found)
     assert judged(found, "Degraded") == ("True", reason)
     assert said[:20] in found["perNode"][0]["message"]
-    ports = ("False", "PortConflict") if why is Stuck.PORTS else ("True", "Allocated")
+    ports = ("False", "PortConflict") if why is PodFailure.PORTS else ("True", "Allocated")
     assert judged(found, "PortsAllocated") == ports
 
 
@@ -206,7 +210,7 @@ def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
 
 
 def test_findings_are_told_at_the_rosproxy():
-    (found,) = findings(rosproxy(), [state(proxy=stuck_proxy(Stuck.PORTS), answer=None)], {})
+    (found,) = findings(rosproxy(), [state(proxy=stuck_proxy(PodFailure.PORTS), answer=None)], {})
 
     assert (found.reason, found.of) == ("PortConflict", rosproxy().id)
     assert found.about == Reference("RosProxy", rosproxy().id, "uid-arm")

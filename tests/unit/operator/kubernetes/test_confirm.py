@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api, ApiAway, ApiConflict
-from rosproxy_operator.kubernetes.confirm import Stale, confirm
+from rosproxy_operator.kubernetes.api.client import Api, ApiConflict, ApiUnavailable
+from rosproxy_operator.kubernetes.confirm import StateChanged, confirm
 from rosproxy_operator.kubernetes.planner.actions import DeleteEar, DeleteProxy, DeleteService
 from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.api_server import ApiServer
@@ -109,10 +109,10 @@ async def test_what_is_not_so_any_more(
     put_all(server)
     seen = known(server)
     happen(server)
-    with pytest.raises(Stale):
+    with pytest.raises(StateChanged):
         await in_thread(confirm, api, DELETE, seen)
     ear = DeleteEar(OF, DELETE.id, DELETE.uid, "nobody wants it")
-    with pytest.raises(Stale):
+    with pytest.raises(StateChanged):
         await in_thread(confirm, api, ear, seen)
 
 
@@ -123,7 +123,7 @@ async def test_a_service_is_its_rosproxys(
     put_all(server)
     seen = known(server)
     happen(server)
-    with pytest.raises(Stale, match="RosProxy robots/arm"):
+    with pytest.raises(StateChanged, match="RosProxy robots/arm"):
         await in_thread(confirm, api, SERVICE, seen)
 
 
@@ -144,7 +144,7 @@ async def test_one_that_nobody_has_seen_is_stale(server: ApiServer, api: Api) ->
     put_all(server)
     seen = known(server)
     other = DeleteProxy(OF, DELETE.id, "another", "nobody wants it")
-    with pytest.raises(Stale):
+    with pytest.raises(StateChanged):
         await in_thread(confirm, api, other, seen)
 
 
@@ -154,5 +154,5 @@ async def test_an_api_server_that_does_not_answer_confirms_nothing(
     put_all(server)
     seen = known(server)
     server.refuse("GET", "pods", 503, "starting")
-    with pytest.raises(ApiAway):
+    with pytest.raises(ApiUnavailable):
         await in_thread(confirm, api, DELETE, seen)

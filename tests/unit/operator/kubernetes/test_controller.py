@@ -268,7 +268,7 @@ async def test_a_proxy_is_asked_and_told(
 
     def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
         found = real(observed, *rest)
-        return structs.replace(found, gone={**gone})
+        return structs.replace(found, departed_addresses={**gone})
 
     monkeypatch.setattr(module, "plan", planned)
     put_all(server)

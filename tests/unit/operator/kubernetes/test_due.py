@@ -1,7 +1,7 @@
 """Which parts are planned when: what has changed, what wanted to be, and now and then all."""
 
-from rosproxy_operator.kubernetes.due import Due
-from rosproxy_operator.kubernetes.planner.parts import Part
+from rosproxy_operator.kubernetes.due import PlanSchedule
+from rosproxy_operator.kubernetes.planner.parts import Partition
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
 
@@ -13,24 +13,24 @@ APART = ClusterSnapshot(
     ),
     selected=frozenset({"uid-one", "uid-two"}),
 )
-ROBOTS = Part(frozenset({"robots"}), frozenset({"node1"}))
-LEGS = Part(frozenset({"legs"}), frozenset({"node2"}))
+ROBOTS = Partition(frozenset({"robots"}), frozenset({"node1"}))
+LEGS = Partition(frozenset({"legs"}), frozenset({"node2"}))
 
 
-def begun(now: float = 100.0, again_in: float | None = None) -> Due:
+def begun(now: float = 100.0, again_in: float | None = None) -> PlanSchedule:
     """After a first look at all."""
-    due = Due()
+    due = PlanSchedule()
     assert due.is_all(now, 30.0)
-    assert due.part(APART, (), (), now) is None
+    assert due.due_partition(APART, (), (), now) is None
     due.planned(None, APART, again_in, now)
     return due
 
 
 def test_what_has_changed_is_planned() -> None:
     due = begun()
-    assert due.part(APART, ["robots"], (), 101.0) == ROBOTS
-    assert due.part(APART, (), ["node2"], 101.0) == LEGS
-    assert due.part(APART, (), ["nobody's"], 101.0) == Part()
+    assert due.due_partition(APART, ["robots"], (), 101.0) == ROBOTS
+    assert due.due_partition(APART, (), ["node2"], 101.0) == LEGS
+    assert due.due_partition(APART, (), ["nobody's"], 101.0) == Partition()
 
 
 def test_all_is_planned_now_and_then_and_when_asked_for() -> None:
@@ -38,19 +38,19 @@ def test_all_is_planned_now_and_then_and_when_asked_for() -> None:
     assert not due.is_all(129.0, 30.0)
     assert due.is_all(130.0, 30.0)
     due = begun()
-    due.all()
+    due.mark_all_due()
     assert due.is_all(100.0, 30.0)
 
 
 def test_what_wants_to_be_planned_again_is_then() -> None:
     due = begun(again_in=5.0)
     assert due.again_in(101.0, None) == 4.0
-    assert due.part(APART, (), (), 104.0) == Part()
-    assert due.part(APART, (), (), 105.0) == Part(
+    assert due.due_partition(APART, (), (), 104.0) == Partition()
+    assert due.due_partition(APART, (), (), 105.0) == Partition(
         ROBOTS.namespaces | LEGS.namespaces, ROBOTS.nodes | LEGS.nodes
     )
     due.planned(ROBOTS, APART, None, 105.0)
-    assert due.part(APART, (), (), 105.0) == LEGS
+    assert due.due_partition(APART, (), (), 105.0) == LEGS
     due.planned(LEGS, APART, None, 105.0)
     assert due.again_in(105.0, None) is None
     assert due.again_in(105.0, 3.0) == 3.0
@@ -58,9 +58,9 @@ def test_what_wants_to_be_planned_again_is_then() -> None:
 
 def test_the_earlier_of_two_times_counts() -> None:
     due = begun()
-    due.soon(["robots"], 110.0)
-    due.soon(["robots"], 105.0)
-    due.soon(["robots"], 120.0)
+    due.due_at(["robots"], 110.0)
+    due.due_at(["robots"], 105.0)
+    due.due_at(["robots"], 120.0)
     assert due.again_in(100.0, 30.0) == 5.0
     due.at_once(["robots"])
     assert due.again_in(100.0, None) == 0.0

@@ -11,11 +11,11 @@ from rosproxy_operator.kubernetes.planner.pods.injection import (
     MIRROR,
     Target,
     Wiring,
-    unwired,
     wire,
+    wiring_finding,
 )
 from rosproxy_operator.kubernetes.resources import objects
-from rosproxy_operator.kubernetes.resources.model import ELSEWHERE
+from rosproxy_operator.kubernetes.resources.model import VALUE_AT_RUNTIME
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, URI, pod, rosproxy
 
 TO = Target(URI)
@@ -221,8 +221,8 @@ def test_a_wired_pod_is_wired():
 
     stored = objects.pod(applied(obj, wire(obj, TO)))
 
-    assert stored.wired == URI
-    assert unwired(stored, rosproxy(), CLUSTER_IP) is None
+    assert stored.wired_master_uri == URI
+    assert wiring_finding(stored, rosproxy(), CLUSTER_IP) is None
 
 
 @pytest.mark.parametrize(
@@ -235,11 +235,11 @@ def test_a_wired_pod_is_wired():
         "http://rosproxy-arm.robots.svc:11311/",
         "http://rosproxy-arm.robots.svc.cluster.local:11311",
         "http://rosproxy-arm.robots.svc.cluster.local.:11311",
-        ELSEWHERE,
+        VALUE_AT_RUNTIME,
     ],
 )
 def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
-    assert unwired(pod(own_masters=(master,)), rosproxy(), CLUSTER_IP) is None
+    assert wiring_finding(pod(own_masters=(master,)), rosproxy(), CLUSTER_IP) is None
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,9 @@ def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
     ],
 )
 def test_a_pod_that_goes_around_its_proxy_is_told(master):
-    found = unwired(pod(own_masters=(URI, master), wired=URI), rosproxy(), CLUSTER_IP)
+    found = wiring_finding(
+        pod(own_masters=(URI, master), wired_master_uri=URI), rosproxy(), CLUSTER_IP
+    )
 
     assert found is not None
     assert (found.reason, found.fatal) == ("NotWired", False)
@@ -269,11 +271,11 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
     [
         (pod(), "create the pod anew"),
         (pod(labels={"app": "x"}), "rosproxy.io/inject=arm"),
-        (pod(wired="http://10.96.0.1:11311"), f"its proxy is at {URI} now"),
+        (pod(wired_master_uri="http://10.96.0.1:11311"), f"its proxy is at {URI} now"),
     ],
 )
 def test_a_pod_that_is_not_wired_is_told_what_to_do(there, said):
-    found = unwired(there, rosproxy(), CLUSTER_IP)
+    found = wiring_finding(there, rosproxy(), CLUSTER_IP)
 
     assert found is not None
     assert said in found.text

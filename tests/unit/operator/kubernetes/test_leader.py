@@ -51,7 +51,7 @@ class Candidates:
 
     async def kill(self, one: LeaderElection) -> None:
         task = self.tasks.pop(one)
-        async with one._room:  # no request is under way
+        async with one._lock:  # no request is under way
             task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
@@ -88,7 +88,9 @@ async def test_another_one_leads_when_it_is_killed(
     second = candidates.join()
     await candidates.kill(first)
     last = server.get(*KEY)["metadata"]["resourceVersion"]
-    await until(lambda: second._one.seen is not None and second._one.seen.version == last)
+    await until(
+        lambda: second._candidate.record is not None and second._candidate.record.version == last
+    )
     now[0] += leadership.DEADLINE
     assert candidates.leaders() == []
     assert not first.leads()
@@ -133,7 +135,7 @@ async def test_a_lease_that_was_taken_away_is_made_anew(
     await until(one.leads)
     server.forget(*KEY)
     await until(lambda: not one.leads())
-    await until(lambda: one._one.seen is not None)
+    await until(lambda: one._candidate.record is not None)
     now[0] += leadership.DURATION
     await until(one.leads)
 

@@ -12,11 +12,11 @@ from rosproxy_operator.kubernetes.planner.leadership import (
     NOBODY,
     Candidate,
     LeaseRecord,
+    after_resignation,
+    after_write,
+    next_record,
     observe,
-    released,
-    resigned,
-    wanted,
-    wrote,
+    released_record,
 )
 
 OTHER = LeaseRecord("7", "b", transitions=3, acquired="then")
@@ -28,68 +28,68 @@ MINE = LeaseRecord("", "a")
 def test_one_that_is_missing_is_made_and_has_to_run_out() -> None:
     """Whoever held it before it was taken away may still act."""
     one = observe(Candidate("a"), None, 5.0)
-    made = wanted(one, 5.0)
+    made = next_record(one, 5.0)
     assert made == LeaseRecord("", NOBODY)
-    assert not wrote(one, made, 5.0, 5.0).leads(5.0)
+    assert not after_write(one, made, 5.0, 5.0).leads(5.0)
     one = observe(one, LeaseRecord("1", NOBODY), 6.0)
-    assert wanted(one, 6.0 + DURATION - 0.1) is None
-    assert wanted(one, 6.0 + DURATION) == LeaseRecord("1", "a", transitions=1)
+    assert next_record(one, 6.0 + DURATION - 0.1) is None
+    assert next_record(one, 6.0 + DURATION) == LeaseRecord("1", "a", transitions=1)
 
 
 def test_one_acts_for_a_time_that_begins_before_its_write() -> None:
-    one = wrote(Candidate("a"), MINE, 15.0, 16.0)
+    one = after_write(Candidate("a"), MINE, 15.0, 16.0)
     assert (one.leads(15.0 + DEADLINE - 0.1), one.leads(15.0 + DEADLINE)) == (True, False)
 
 
 def test_one_that_nobody_holds_is_taken_at_once() -> None:
-    assert wanted(observe(Candidate("a"), LeaseRecord("1"), 5.0), 5.0) is not None
+    assert next_record(observe(Candidate("a"), LeaseRecord("1"), 5.0), 5.0) is not None
 
 
 def test_one_that_is_held_is_taken_once_it_has_been_the_same_for_long() -> None:
     one = observe(Candidate("a"), OTHER, 100.0)
     one = observe(one, OTHER, 105.0)
-    assert wanted(one, 100.0 + DURATION - 0.1) is None
-    assert wanted(one, 100.0 + DURATION) == LeaseRecord("7", "a", transitions=4)
+    assert next_record(one, 100.0 + DURATION - 0.1) is None
+    assert next_record(one, 100.0 + DURATION) == LeaseRecord("7", "a", transitions=4)
 
 
 def test_a_renewal_begins_the_time_anew() -> None:
     one = observe(Candidate("a"), OTHER, 100.0)
     one = observe(one, LeaseRecord("8", "b"), 109.0)
-    assert wanted(one, 109.0 + DURATION - 0.1) is None
+    assert next_record(one, 109.0 + DURATION - 0.1) is None
 
 
 def test_a_holder_that_promises_longer_is_waited_for() -> None:
     """Another release may have other times."""
     one = observe(Candidate("a"), LeaseRecord("7", "b", duration=30.0), 100.0)
-    assert wanted(one, 129.0) is None
-    assert wanted(one, 130.0) is not None
+    assert next_record(one, 129.0) is None
+    assert next_record(one, 130.0) is not None
 
 
 def test_one_that_was_released_is_taken_at_once() -> None:
-    record = released(LeaseRecord("7", "b"), "b")
+    record = released_record(LeaseRecord("7", "b"), "b")
     assert record is not None
     assert record.holder == ""
-    assert wanted(observe(Candidate("a"), record, 100.0), 100.0) is not None
+    assert next_record(observe(Candidate("a"), record, 100.0), 100.0) is not None
 
 
 def test_only_the_holder_releases() -> None:
-    assert released(OTHER, "a") is None
-    assert released(None, "a") is None
+    assert released_record(OTHER, "a") is None
+    assert released_record(None, "a") is None
 
 
 def test_who_sees_another_holder_leads_no_more() -> None:
-    one = wrote(observe(Candidate("a"), LeaseRecord("6"), 99.0), MINE, 100.0, 100.0)
+    one = after_write(observe(Candidate("a"), LeaseRecord("6"), 99.0), MINE, 100.0, 100.0)
     assert observe(one, LeaseRecord("8", "a"), 101.0).leads(101.0)
     assert not observe(one, OTHER, 101.0).leads(101.0)
     assert not observe(one, None, 101.0).leads(101.0)
 
 
 def test_terms_are_counted() -> None:
-    one = wrote(Candidate("a"), MINE, 100.0, 100.0)
-    one = wrote(one, MINE, 102.0, 102.0)
+    one = after_write(Candidate("a"), MINE, 100.0, 100.0)
+    one = after_write(one, MINE, 102.0, 102.0)
     assert one.terms == 1
-    assert wrote(one, MINE, 120.0, 120.0).terms == 2
-    assert resigned(one).terms == 1
+    assert after_write(one, MINE, 120.0, 120.0).terms == 2
+    assert after_resignation(one).terms == 1
 
 
 @dataclass
@@ -128,7 +128,7 @@ class Operator:
             self.read = store.record
         elif self.step == 2:
             self.one = observe(self.one, self.read, own)
-            record = wanted(self.one, own)
+            record = next_record(self.one, own)
             self.writing = (record, own) if record is not None else None
         elif self.step == 3:
             self.answered = None
@@ -136,7 +136,7 @@ class Operator:
                 done = store.write(self.writing[0])
                 self.answered = done and not lost  # it was written, and the answer is lost
         elif self.writing is not None and self.answered:
-            self.one = wrote(self.one, *self.writing, own)
+            self.one = after_write(self.one, *self.writing, own)
 
     def round(self, store: Store, now: float) -> None:
         """End what is under way, then do a whole round at once."""
@@ -145,8 +145,8 @@ class Operator:
 
     def stop(self, store: Store) -> None:
         """Act no more, then release what it holds."""
-        self.one = resigned(self.one)
-        if record := released(store.record, self.one.name):
+        self.one = after_resignation(self.one)
+        if record := released_record(store.record, self.one.name):
             store.write(record)
         self.one, self.step = Candidate(f"{self.one.name}'"), 0  # it is started again
 

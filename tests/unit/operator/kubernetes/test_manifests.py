@@ -11,26 +11,26 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
 from rosproxy_operator.common.policy import AWAITED, administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
-from rosproxy_operator.kubernetes.planner.manifests import Site
+from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec, Name
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 
 
-def body(place: Site | None = None, **changes: Any) -> Json:
+def body(place: ProxySite | None = None, **changes: Any) -> Json:
     return manifests.proxy_pod(place or site(rosproxy(**changes), node()), SETTINGS)
 
 
-def spec(place: Site | None = None, **changes: Any) -> Json:
+def spec(place: ProxySite | None = None, **changes: Any) -> Json:
     return dict(body(place, **changes)["spec"])
 
 
-def container(place: Site | None = None, **changes: Any) -> Json:
+def container(place: ProxySite | None = None, **changes: Any) -> Json:
     return dict(spec(place, **changes)["containers"][0])
 
 
-def env(place: Site | None = None, **changes: Any) -> dict[str, str]:
+def env(place: ProxySite | None = None, **changes: Any) -> dict[str, str]:
     return env_of(body(place, **changes))
 
 
@@ -42,7 +42,7 @@ def test_the_proxy_understands_all_of_its_variables() -> None:
     of = rosproxy(cleanup_after=0.5, slave_control="master")
     on = node(pod_networks=("10.244.1.0/24", "fd00::/64"))
     master = MasterSpec("http://roscore.ros.svc:1", "10.96.0.9", publish=999)
-    place = Site(of, on, "192.0.2.1", RANGE, master)
+    place = ProxySite(of, on, "192.0.2.1", RANGE, master)
     found = settings_of(env(place))
     assert found.master_uri == "http://roscore.ros.svc:1"
     assert found.master_address == "10.96.0.9"
@@ -192,7 +192,7 @@ def test_a_pod_is_read_back_as_it_was_made() -> None:
     made = body(replace(site(rosproxy(), node()), token_hash="5e884898da28"))
     found = objects.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
     assert found is not None
-    assert (found.of, found.owner, found.on) == (rosproxy().id, "uid-robot", "one")
+    assert (found.of, found.owner, found.node) == (rosproxy().id, "uid-robot", "one")
     assert (found.range, found.image, found.token) == (RANGE, "rosproxy:1", "")
     assert found.fingerprint == manifests.fingerprint_of(made)
     assert found.pod.host_ports == set(RANGE.ports())
@@ -227,11 +227,11 @@ def test_a_rosproxy_may_only_narrow_who_controls_its_nodes(
 def test_a_fingerprint_tells_whether_nodes_are_found_again() -> None:
     own = manifests.fingerprint_of(body())
     same = manifests.fingerprint_of(body(cleanup_after=1.0))
-    assert manifests.finds_again(own, same)
-    assert manifests.finds_again("", own)
+    assert manifests.keeps_registrations(own, same)
+    assert manifests.keeps_registrations("", own)
     for other in (body(master=MasterSpec("http://arm:11311")),
                   body(site(rosproxy(), node(advertise_host="gate")))):  # fmt: skip
-        assert not manifests.finds_again(own, manifests.fingerprint_of(other))
+        assert not manifests.keeps_registrations(own, manifests.fingerprint_of(other))
 
 
 def test_it_goes_on_for_a_moment_after_its_deletion() -> None:
@@ -261,7 +261,7 @@ def test_the_fingerprint_does_not_depend_on_the_image() -> None:
         replace(site(rosproxy(), node()), token_hash="other"),
     ],
 )
-def test_the_fingerprint_depends_on_all_else(other: Site) -> None:
+def test_the_fingerprint_depends_on_all_else(other: ProxySite) -> None:
     assert manifests.fingerprint_of(body(other)) != manifests.fingerprint_of(body())
 
 

@@ -167,7 +167,7 @@ def test_switched_off_it_is_deleted() -> None:
 
 
 def test_a_role_that_lacks_the_right_is_told() -> None:
-    seen = complete(no_policies="the operator's role lacks a rule")
+    seen = complete(policies_error="the operator's role lacks a rule")
     found = look(seen)
     assert done(found) == []
     assert "the operator's role lacks a rule" in told(found, "NoNetworkPolicy")[0]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import read_status
 from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT, no_answer, report
-from rosproxy_operator.kubernetes.resources.model import ELSEWHERE, Name
+from rosproxy_operator.kubernetes.resources.model import VALUE_AT_RUNTIME, Name
 from rosproxy_operator.kubernetes.resources.objects import node, pod, proxy_pod, service
 from rosproxy_operator.kubernetes.resources.values import host_problem
 from tests.unit.operator.kubernetes.builders_api import (
@@ -77,7 +77,7 @@ def test_a_pod():
     assert found.id == Name(NAMESPACE, "talker")
     assert (found.node, found.phase, found.ip) == ("node1", "Running", "10.244.1.5")
     assert found.labels == {"app": "talker"}
-    assert (found.own_masters, found.wired, found.host_network) == ((), "", False)
+    assert (found.own_masters, found.wired_master_uri, found.host_network) == ((), "", False)
 
 
 def test_a_pod_at_admission_has_neither_name_nor_node():
@@ -137,7 +137,7 @@ def test_masters_that_a_template_sets_itself():
         )
     )
 
-    assert found.own_masters == ("", "http://robot:11311", ELSEWHERE, ELSEWHERE)
+    assert found.own_masters == ("", "http://robot:11311", VALUE_AT_RUNTIME, VALUE_AT_RUNTIME)
 
 
 def test_what_the_webhook_has_set_is_not_the_templates_own():
@@ -148,7 +148,7 @@ def test_what_the_webhook_has_set_is_not_the_templates_own():
 
     found = pod(obj)
 
-    assert (found.own_masters, found.wired) == ((), "http://a:11311")
+    assert (found.own_masters, found.wired_master_uri) == ((), "http://a:11311")
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_a_proxy_is_read_back_from_its_pod():
     )
 
     assert found is not None
-    assert (found.of, found.owner, found.on) == (Name(NAMESPACE, "arm"), "uid-arm", "node1")
+    assert (found.of, found.owner, found.node) == (Name(NAMESPACE, "arm"), "uid-arm", "node1")
     assert (found.range, found.fingerprint, found.image) == (
         RANGE,
         "0123456789abcdef",

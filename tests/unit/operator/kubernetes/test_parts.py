@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import Action
-from rosproxy_operator.kubernetes.planner.parts import Part, cut, cut_state, joined, part_of, parts
+from rosproxy_operator.kubernetes.planner.parts import (
+    Partition,
+    merge_state,
+    partition_of,
+    partition_snapshot,
+    partition_state,
+    partitions,
+)
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
@@ -58,7 +65,7 @@ class Together:
         for world in self.worlds:
             mine = [one for one in found.actions if one.of.namespace == world.namespace]
             world.controller.carry_out(replace(found, actions=tuple(mine)))
-            for uid, addresses in found.gone.items():
+            for uid, addresses in found.departed_addresses.items():
                 if uid in world.cluster.ros:
                     world.cluster.ros[uid] -= set(addresses)
 
@@ -71,17 +78,20 @@ def by_rosproxy(actions: tuple[Action, ...]) -> dict[Any, list[Action]]:
     return found
 
 
-def all_of(observed: ClusterSnapshot) -> Part:
+def all_of(observed: ClusterSnapshot) -> Partition:
     """All parts as one. What is remembered of others is forgotten with the next look at all."""
-    every = [*parts(observed)]
-    return Part(
+    every = [*partitions(observed)]
+    return Partition(
         frozenset(one for part in every for one in part.namespaces),
         frozenset(one for part in every for one in part.nodes),
     )
 
 
 def check(
-    whole: ClusterPlan, pieces: list[tuple[Part, ClusterPlan]], state: ClusterState, union: Part
+    whole: ClusterPlan,
+    pieces: list[tuple[Partition, ClusterPlan]],
+    state: ClusterState,
+    union: Partition,
 ) -> None:
     merged: dict[Any, list[Action]] = {}
     for _, one in pieces:
@@ -89,13 +99,13 @@ def check(
             assert of not in merged, "two parts have it"
             merged[of] = actions
     assert merged == by_rosproxy(whole.actions)
-    for name in ("gone", "callers", "policies", "peers", "former"):
+    for name in ("departed_addresses", "callers", "policies", "peers", "former_ports"):
         both = {uid: told for _, one in pieces for uid, told in getattr(one, name).items()}
         assert both == dict(getattr(whole, name)), name
     assert {one for _, each in pieces for one in each.problems} == {*whole.problems}
-    waits = [one.again_in for _, one in pieces if one.again_in is not None]
-    assert min(waits, default=None) == whole.again_in
-    remembered = cut_state(whole.state, union)
+    waits = [one.next_look_in for _, one in pieces if one.next_look_in is not None]
+    assert min(waits, default=None) == whole.next_look_in
+    remembered = partition_state(whole.state, union)
     for name in state.__struct_fields__:
         assert getattr(state, name) == getattr(remembered, name), name
 
@@ -109,13 +119,13 @@ def test_planning_by_parts_is_planning_it_all(shared: bool, events: list) -> Non
             continue  # several things happen between two looks
         observed = both.observe()
         union = all_of(observed)
-        both.state = cut_state(both.state, union)
+        both.state = partition_state(both.state, union)
         whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
         pieces, state = [], ClusterState(begun=both.state.begun)
-        for part in parts(observed):
-            before = cut_state(both.state, part)
-            one = plan(cut(observed, part), SETTINGS, before, both.now, STAMP)
-            state = joined(state, part, one.state)
+        for part in partitions(observed):
+            before = partition_state(both.state, part)
+            one = plan(partition_snapshot(observed, part), SETTINGS, before, both.now, STAMP)
+            state = merge_state(state, part, one.state)
             pieces.append((part, one))
         check(whole, pieces, replace(state, begun=True), union)
         both.state = whole.state
@@ -131,13 +141,19 @@ def test_what_is_not_touched_stays_as_it_is(shared: bool, events: list) -> None:
         happen(both.worlds[which], n, m)
     observed = both.observe()
     whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
-    for part in parts(observed):
+    for part in partitions(observed):
         before = copy.copy(whole.state)
-        one = plan(cut(observed, part), SETTINGS, cut_state(before, part), both.now, STAMP)
-        after = joined(before, part, one.state)
-        others = [other for other in parts(observed) if other != part]
+        one = plan(
+            partition_snapshot(observed, part),
+            SETTINGS,
+            partition_state(before, part),
+            both.now,
+            STAMP,
+        )
+        after = merge_state(before, part, one.state)
+        others = [other for other in partitions(observed) if other != part]
         for other in others:
-            assert cut_state(after, other) == cut_state(whole.state, other)
+            assert partition_state(after, other) == partition_state(whole.state, other)
 
 
 def test_who_shares_a_node_is_one_part() -> None:
@@ -145,10 +161,10 @@ def test_who_shares_a_node_is_one_part() -> None:
     for world in both.worlds:
         world.run(0, 0)
     observed = both.observe()
-    (part,) = [one for one in parts(observed) if one.nodes]
+    (part,) = [one for one in partitions(observed) if one.nodes]
     assert part.namespaces == {"ros", "arms"}
-    assert part_of(observed, ["arms"]) == part
-    assert part_of(observed, [], part.nodes) == part
+    assert partition_of(observed, ["arms"]) == part
+    assert partition_of(observed, [], part.nodes) == part
 
 
 def test_who_shares_no_node_is_apart() -> None:
@@ -156,6 +172,6 @@ def test_who_shares_no_node_is_apart() -> None:
     for world in both.worlds:
         world.run(0, 0)
     observed = both.observe()
-    assert [one.namespaces for one in parts(observed)] == [{"arms"}, {"ros"}]
-    assert part_of(observed, ["ros"]).namespaces == {"ros"}
-    assert part_of(observed, [], ["nowhere"]) == Part()
+    assert [one.namespaces for one in partitions(observed)] == [{"arms"}, {"ros"}]
+    assert partition_of(observed, ["ros"]).namespaces == {"ros"}
+    assert partition_of(observed, [], ["nowhere"]) == Partition()

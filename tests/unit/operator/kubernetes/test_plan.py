@@ -16,7 +16,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, PodFailure, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
@@ -80,7 +80,7 @@ def test_when_all_is_there_nothing_is_done() -> None:
     assert done(first) == []
     of = rosproxy(status=status(first), cluster_ip="10.96.1.1")
     second = look(complete(rosproxies=(of,)), first.state, 101.0)
-    assert (second.actions, second.again_in) == ((), None)
+    assert (second.actions, second.next_look_in) == ((), None)
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ def test_a_node_that_is_being_deleted_gets_no_proxy() -> None:
 def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
     alone = written(observed(rosproxy(grace=30.0), service(), proxy()))
     first = look(alone, now=100.0)
-    assert (done(first), first.again_in) == ([], 30.0)
+    assert (done(first), first.next_look_in) == ([], 30.0)
     second = look(alone, first.state, 120.0)
-    assert (done(second), second.again_in) == ([], 10.0)
+    assert (done(second), second.next_look_in) == ([], 10.0)
     (gone,) = done(look(alone, second.state, 130.0))
     assert gone == DeleteProxy(
         ROBOT, PROXY, "uid-proxy-robot-one", "no pod on node one wants it since 30 s", retire=True
@@ -131,13 +131,13 @@ def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
 def test_the_grace_begins_anew_when_pods_come_back() -> None:
     alone = written(observed(rosproxy(grace=30.0), service(), proxy()))
     memory = look(complete(), look(alone, now=100.0).state, 110.0).state
-    assert look(alone, memory, 135.0).again_in == 30.0
+    assert look(alone, memory, 135.0).next_look_in == 30.0
 
 
 def test_a_proxy_on_a_node_that_is_gone_is_deleted_after_a_while() -> None:
     gone = written(observed(rosproxy(), service(), node("two"), proxy()))
     first = look(gone)
-    assert (done(first), first.again_in) == ([], 10.0)
+    assert (done(first), first.next_look_in) == ([], 10.0)
     (deleted,) = done(look(gone, first.state, 110.0))
     assert isinstance(deleted, DeleteProxy)
     assert (deleted.why, deleted.retire) == ("its node is gone", False)
@@ -328,18 +328,18 @@ def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
 
 
 def test_a_pod_that_is_not_wired_is_told() -> None:
-    found = look(complete(pods=(pod(wired=""),)))
+    found = look(complete(pods=(pod(wired_master_uri=""),)))
     assert "create the pod anew" in told(found, "NotWired")[0]
 
 
 @pytest.mark.parametrize(
     "seen",
     [
-        complete(pods=(pod(wired="", phase="Succeeded"),)),
-        complete(pods=(pod(wired="", deleting=True),)),
-        complete(pods=(pod(wired=""),), services={}),
-        complete(pods=(pod(wired=""),), services={ROBOT: service(ip="")}),
-        complete(pods=(pod(wired=""),), services={ROBOT: service(owner="uid-old")}),
+        complete(pods=(pod(wired_master_uri="", phase="Succeeded"),)),
+        complete(pods=(pod(wired_master_uri="", deleting=True),)),
+        complete(pods=(pod(wired_master_uri=""),), services={}),
+        complete(pods=(pod(wired_master_uri=""),), services={ROBOT: service(ip="")}),
+        complete(pods=(pod(wired_master_uri=""),), services={ROBOT: service(owner="uid-old")}),
     ],
 )
 def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(
@@ -370,7 +370,7 @@ def test_a_service_of_former_times_is_made_anew() -> None:
 
 def test_the_status_keeps_the_ranges_of_nodes_that_have_no_proxy_now() -> None:
     former = {"one": proxy().range, "gone": proxy().range}
-    found = look(observed(rosproxy(former=former), service()))
+    found = look(observed(rosproxy(former_ranges=former), service()))
     assert [(one["name"], one["ports"]) for one in status(found)["perNode"]] == [
         ("one", "11400-11403")
     ]
@@ -409,7 +409,7 @@ def test_another_key_makes_one_proxy_anew_at_a_time() -> None:
     assert isinstance(action, DeleteProxy)
     assert (action.id, action.retire) == (PROXY, False)
     assert action.why.startswith("made anew: its RosProxy, its node or the operator's options")
-    assert found.again_in == 1.0
+    assert found.next_look_in == 1.0
 
 
 @pytest.mark.parametrize("first", [(), (proxy(stuck=None, phase="Pending"),)])
@@ -417,11 +417,11 @@ def test_the_next_waits_until_the_one_before_runs(first: tuple[ProxyPod, ...]) -
     found = look(two(*first, proxy(on=node("two"))))
     assert DeleteProxy not in kinds(found) or first
     assert not [one for one in done(found) if getattr(one, "id", PROXY) != PROXY]
-    assert found.again_in == 1.0
+    assert found.next_look_in == 1.0
 
 
 def test_one_that_can_never_come_holds_up_nobody() -> None:
-    bad = proxy(stuck=Stuck.IMAGE)
+    bad = proxy(stuck=PodFailure.IMAGE)
     found = look(two(replace(bad, fingerprint="x"), proxy(on=node("two"))))
     assert {one.id for one in done(found) if isinstance(one, DeleteProxy)} == {PROXY}
     settled = replace(bad, fingerprint=fingerprint(two()))

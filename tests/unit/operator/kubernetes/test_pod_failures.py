@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.resources.cluster import Stuck
-from rosproxy_operator.kubernetes.resources.pod_failures import stuck as stuck_by_status
+from rosproxy_operator.kubernetes.resources.cluster import PodFailure
+from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure as stuck_by_status
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 
 NO_PORTS = (
@@ -15,7 +15,7 @@ NO_PORTS = (
 )
 
 
-def stuck(obj: dict[str, Any]) -> tuple[Stuck | None, str]:
+def stuck(obj: dict[str, Any]) -> tuple[PodFailure | None, str]:
     return stuck_by_status(obj["status"])
 
 
@@ -41,9 +41,9 @@ def waiting(why: str, said: str = "", **last: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("reason", "message", "why"),
     [
-        ("Unschedulable", NO_PORTS, Stuck.PORTS),
-        ("Unschedulable", "0/2 nodes are available: 1 Insufficient cpu.", Stuck.SCHEDULING),
-        ("SchedulingGated", "Scheduling is blocked due to non-empty gates", Stuck.SCHEDULING),
+        ("Unschedulable", NO_PORTS, PodFailure.PORTS),
+        ("Unschedulable", "0/2 nodes are available: 1 Insufficient cpu.", PodFailure.SCHEDULING),
+        ("SchedulingGated", "Scheduling is blocked due to non-empty gates", PodFailure.SCHEDULING),
     ],
 )
 def test_the_scheduler_finds_no_place(reason, message, why):
@@ -68,13 +68,17 @@ def test_an_error_that_the_scheduler_gets_over_by_itself_is_no_trouble():
             "NodePorts",
             "Pod was rejected: Predicate NodePorts failed: node(s) didn't have free ports for the "
             "requested pod ports",
-            Stuck.PORTS,
+            PodFailure.PORTS,
         ),
-        ("OutOfcpu", "Pod was rejected: Node didn't have enough resource: cpu", Stuck.SCHEDULING),
-        ("UnexpectedAdmissionError", "Pod was rejected: Allocate failed", Stuck.SCHEDULING),
-        ("SysctlForbidden", 'Pod was rejected: forbidden sysctl: "x"', Stuck.SCHEDULING),
-        ("Evicted", "The node was low on resource: memory.", Stuck.SCHEDULING),
-        ("", "", Stuck.SCHEDULING),
+        (
+            "OutOfcpu",
+            "Pod was rejected: Node didn't have enough resource: cpu",
+            PodFailure.SCHEDULING,
+        ),
+        ("UnexpectedAdmissionError", "Pod was rejected: Allocate failed", PodFailure.SCHEDULING),
+        ("SysctlForbidden", 'Pod was rejected: forbidden sysctl: "x"', PodFailure.SCHEDULING),
+        ("Evicted", "The node was low on resource: memory.", PodFailure.SCHEDULING),
+        ("", "", PodFailure.SCHEDULING),
     ],
 )
 def test_the_kubelet_does_not_admit_it(reason, message, why):
@@ -87,15 +91,15 @@ def test_the_kubelet_does_not_admit_it(reason, message, why):
 @pytest.mark.parametrize(
     ("reason", "why"),
     [
-        ("ErrImagePull", Stuck.IMAGE),
-        ("ImagePullBackOff", Stuck.IMAGE),
-        ("ErrImageNeverPull", Stuck.IMAGE),
-        ("InvalidImageName", Stuck.IMAGE),
-        ("ImageInspectError", Stuck.IMAGE),
-        ("CrashLoopBackOff", Stuck.CRASHING),
-        ("CreateContainerConfigError", Stuck.SANDBOX),
-        ("CreateContainerError", Stuck.SANDBOX),
-        ("RunContainerError", Stuck.SANDBOX),
+        ("ErrImagePull", PodFailure.IMAGE),
+        ("ImagePullBackOff", PodFailure.IMAGE),
+        ("ErrImageNeverPull", PodFailure.IMAGE),
+        ("InvalidImageName", PodFailure.IMAGE),
+        ("ImageInspectError", PodFailure.IMAGE),
+        ("CrashLoopBackOff", PodFailure.CRASHING),
+        ("CreateContainerConfigError", PodFailure.SANDBOX),
+        ("CreateContainerError", PodFailure.SANDBOX),
+        ("RunContainerError", PodFailure.SANDBOX),
         ("ContainerCreating", None),
         ("PodInitializing", None),
         ("", None),
@@ -143,7 +147,7 @@ def test_a_crash_is_told_by_how_it_ended_and_not_by_the_wait():
 
 @pytest.mark.parametrize(
     ("code", "restarts", "why"),
-    [(2, 1, Stuck.CRASHING), (2, 0, None), (0, 1, None)],
+    [(2, 1, PodFailure.CRASHING), (2, 0, None), (0, 1, None)],
 )
 def test_a_container_that_has_ended_again_and_is_not_yet_called_crashing(code, restarts, why):
     status = {
@@ -166,7 +170,7 @@ def test_a_program_that_can_not_be_started_is_told_in_the_same_words_between_tri
         )
     )
 
-    assert now == between == (Stuck.SANDBOX, f"RunContainerError: {error}")
+    assert now == between == (PodFailure.SANDBOX, f"RunContainerError: {error}")
 
 
 @pytest.mark.parametrize(
@@ -209,17 +213,17 @@ def test_what_is_not_stuck(status):
         (
             "Failed to create pod sandbox: rpc error: code = Unknown desc = cannot open hostport "
             "11400 for pod: listen tcp4 :11400: bind: address already in use",
-            Stuck.PORTS,
+            PodFailure.PORTS,
         ),
         (
             "Failed to create pod sandbox: rpc error: Bind for 0.0.0.0:11400 failed: port is "
             "already allocated",
-            Stuck.PORTS,
+            PodFailure.PORTS,
         ),
         (
             "Failed to create pod sandbox: rpc error: code = Unknown desc = failed to setup "
             'network for sandbox "1": plugin type="ptp" failed (add): no IP addresses available',
-            Stuck.SANDBOX,
+            PodFailure.SANDBOX,
         ),
     ],
 )

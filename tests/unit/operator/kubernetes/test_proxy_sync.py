@@ -489,8 +489,8 @@ async def test_a_poller_that_ended_by_a_mistake_is_replaced(
 
 async def test_where_the_live_page_asks_each_proxy_and_with_which_token(talk: Talk) -> None:
     talk.all.follow([proxy()], KEY)
-    ((name, way),) = talk.all.ways.items()
+    ((name, way),) = talk.all.admin_endpoints.items()
     assert name == str(proxy().pod.id)
     assert way == (HostPort("10.244.1.7", 11312), token_for(proxy(), KEY))
     talk.all.follow([], KEY)
-    assert not talk.all.ways
+    assert not talk.all.admin_endpoints

@@ -8,20 +8,20 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.kubernetes.api import client as api_module
-from rosproxy_operator.kubernetes.api.client import Api, ApiAway, ApiError, ApiGone
+from rosproxy_operator.kubernetes.api.client import Api, ApiError, ApiNotFound, ApiUnavailable
 from rosproxy_operator.kubernetes.proxies import sandbox
 from rosproxy_operator.kubernetes.proxies.sandbox import SandboxFailures
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
-    Stuck,
+    PodFailure,
 )
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.objects import master_service
 from rosproxy_operator.kubernetes.resources.records import READERS
 from rosproxy_operator.kubernetes.watch import reflector
-from rosproxy_operator.kubernetes.watch.reflector import Reflector, every_kind
-from rosproxy_operator.kubernetes.watch.store import ClusterStore, Touched, read_master
+from rosproxy_operator.kubernetes.watch.reflector import Reflector, watched_collections
+from rosproxy_operator.kubernetes.watch.store import ClusterStore, StoreChanges, read_master
 from tests.unit.operator.kubernetes.api_server import ApiServer, until
 from tests.unit.operator.kubernetes.builders_api import (
     INJECT,
@@ -42,9 +42,9 @@ class Seen:
 
     def __init__(self, api: Api) -> None:
         self.woken = self.back = self.lost = self.corrected = 0
-        kinds = every_kind(api)
+        kinds = watched_collections(api)
         self.store = ClusterStore(
-            kinds, api.places(PLURAL), self.wake, self.come_back, self.correct
+            kinds, api.namespaces_of(PLURAL), self.wake, self.come_back, self.correct
         )
         soon = asyncio.get_running_loop().call_soon_threadsafe
         self.all = [Reflector(api, what, self.store, soon, self.lose) for what in kinds]
@@ -132,7 +132,7 @@ async def test_what_matters_is_seen(server: ApiServer, seen: Seen) -> None:
     assert set(found.nodes) == {"node1", "node2", "node3"}
     names = {pod.id.name for pod in found.pods if not pod.id.name.startswith("rosproxy-")}
     assert names == {"talker", "stranger", "holder"}
-    assert [proxy.on for proxy in found.proxies] == ["node2"]
+    assert [proxy.node for proxy in found.proxies] == ["node2"]
     assert found.selected == {"uid-talker"}
     pages = [query for query in server.asked("GET", "pods") if "limit" in query]
     assert len(pages) == 3  # of two pods each
@@ -220,7 +220,7 @@ async def test_what_is_doubted_is_listed_anew(
     server.forget("pods", "talker", NAMESPACE)
     monkeypatch.setattr(reflector, "DOUBTED", 0.0)
     for each in seen.all:
-        each.doubt()
+        each.relist()
     await until(lambda: "talker" not in seen.pods())
 
 
@@ -231,7 +231,7 @@ async def test_what_is_not_kept_up_with_is_told(server: ApiServer, seen: Seen, k
     server.refuse("GET", kind, 503, "starting")
     server.end_watches({"type": "ERROR", "object": {"code": 500, "message": "etcd"}})
     await until(lambda: bool(seen.store._errors))
-    with pytest.raises(ApiAway, match="starting"):
+    with pytest.raises(ApiUnavailable, match="starting"):
         await seen.store.check()
     server.refusals.clear()
     await until(lambda: not seen.store._errors)
@@ -253,7 +253,7 @@ async def test_a_store_that_was_set_back_is_listed_anew(server: ApiServer, seen:
 async def test_only_what_concerns_somebody_wakes(server: ApiServer, seen: Seen) -> None:
     put_all(server)
     await begun(server, seen)
-    seen.store.touched()
+    seen.store.take_changes()
     woken = seen.woken
     ready = {"type": "Ready", "status": "True", "lastHeartbeatTime": "2"}
     server.put("nodes", changed(server.get("nodes", "node1", ""), conditions=[ready]))
@@ -267,7 +267,7 @@ async def test_only_what_concerns_somebody_wakes(server: ApiServer, seen: Seen) 
     last = {"metadata": {"name": "last", "namespace": "other"}}
     server.put("rosproxies", last, "other")
     await until(lambda: len(seen.store.snapshot().unusable) == 1)
-    assert seen.store.touched() == Touched({"other"}, set())
+    assert seen.store.take_changes() == StoreChanges({"other"}, set())
     assert seen.woken == woken + 1
 
 
@@ -277,17 +277,17 @@ async def test_whom_it_concerns(server: ApiServer, seen: Seen) -> None:
     await begun(server, seen)
 
     async def touches(namespaces: set[str], nodes: set[str]) -> None:
-        found = Touched()
+        found = StoreChanges()
 
         def all_there() -> bool:
-            new = seen.store.touched()
+            new = seen.store.take_changes()
             found.namespaces.update(new.namespaces)
             found.nodes.update(new.nodes)
-            return found == Touched(namespaces, nodes)
+            return found == StoreChanges(namespaces, nodes)
 
         await until(all_there)
 
-    seen.store.touched()
+    seen.store.take_changes()
     server.put("pods", {**pod_obj("talker", {})}, NAMESPACE)  # it has lost its label
     await touches({NAMESPACE}, {"node1"})
     server.drop("pods", "holder", "other")
@@ -332,7 +332,7 @@ async def test_a_missing_crd_is_told(server: ApiServer, seen: Seen) -> None:
     start(seen)
     with pytest.raises(ApiError, match="install the CustomResourceDefinition") as caught:
         await seen.read()
-    assert type(caught.value) is ApiGone
+    assert type(caught.value) is ApiNotFound
 
 
 async def test_what_only_an_event_tells(
@@ -355,8 +355,8 @@ async def test_what_only_an_event_tells(
         server.put("events", event, NAMESPACE)
     found, failures = await begun(server, seen), SandboxFailures(api)
     assert await failures.read(found) == {NAMESPACE}
-    (proxy,) = failures.shown(found).proxies
-    assert proxy.stuck is Stuck.PORTS
+    (proxy,) = failures.with_messages(found).proxies
+    assert proxy.stuck is PodFailure.PORTS
     assert proxy.message == SANDBOX.format("…")
     assert await failures.read(found) == set()
     assert len(server.asked("GET", "events")) == 1  # it is not asked for again at once
@@ -399,7 +399,7 @@ async def test_a_role_without_the_right_to_policies_stops_nothing(
     server.refuse("GET", "networkpolicies", 403, refusal)
     start(seen)
     found = await seen.read()
-    assert 'resources ["networkpolicies"], verbs ["list"]' in found.no_policies
+    assert 'resources ["networkpolicies"], verbs ["list"]' in found.policies_error
     assert [each.id.name for each in found.rosproxies] == ["arm"]
 
 

@@ -30,7 +30,7 @@ WIRED = master_uri(service().cluster_ip)
 
 
 def of_set(name: str = "a", **more: Any) -> Pod:
-    return replace(pod(name), **{"controller": "ReplicaSet", "wired": "", **more})
+    return replace(pod(name), **{"controller": "ReplicaSet", "wired_master_uri": "", **more})
 
 
 def cluster(*pods: Pod, remakes: bool = True) -> ClusterSnapshot:
@@ -53,7 +53,7 @@ def test_one_that_was_not_wired_is_evicted() -> None:
 
 
 def test_one_that_was_wired_to_a_former_address_is_evicted() -> None:
-    assert evicted(look(cluster(of_set(wired="http://10.96.0.200:11311")))) == ["a"]
+    assert evicted(look(cluster(of_set(wired_master_uri="http://10.96.0.200:11311")))) == ["a"]
 
 
 @pytest.mark.parametrize("kind", ["ReplicationController", "StatefulSet", "DaemonSet"])
@@ -64,7 +64,7 @@ def test_whoever_makes_pods_anew(kind: str) -> None:
 @pytest.mark.parametrize(
     "left",
     [
-        of_set(wired=WIRED),
+        of_set(wired_master_uri=WIRED),
         of_set(controller="Job"),
         of_set(controller=""),
         of_set(own_masters=("http://elsewhere:11311",)),
@@ -94,9 +94,11 @@ def test_one_goes_at_a_time() -> None:
     assert evicted(found) == ["a"]
     going = look(cluster(replace(a, deleting=True), b), found.state, 110.0)
     assert evicted(going) == []
-    coming = look(cluster(of_set("c", wired=WIRED, phase="Pending"), b), going.state, 120.0)
+    coming = look(
+        cluster(of_set("c", wired_master_uri=WIRED, phase="Pending"), b), going.state, 120.0
+    )
     assert evicted(coming) == []
-    there = look(cluster(of_set("c", wired=WIRED), b), coming.state, 130.0)
+    there = look(cluster(of_set("c", wired_master_uri=WIRED), b), coming.state, 130.0)
     assert evicted(there) == ["b"]
 
 

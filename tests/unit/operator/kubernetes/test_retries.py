@@ -38,9 +38,9 @@ def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
         found = look(seen, found.state, now)
         assert done(found) == []
         assert "kubectl label namespace ros" in told(found, "ProxyNotAdmitted")[0]
-        assert found.again_in is not None
-        pauses.append(found.again_in)
-        now += found.again_in
+        assert found.next_look_in is not None
+        pauses.append(found.next_look_in)
+        now += found.next_look_in
         found = look(seen, found.state, now)
         assert kinds(found) == [CreateProxy]
     assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
@@ -59,7 +59,7 @@ def test_what_was_created_and_is_not_listed_yet_is_not_created_again_at_once() -
     seen = observed(rosproxy(), pod())
     first = look(seen, now=100.0)
     second = look(seen, first.state, 101.0)
-    assert (done(second), second.again_in) == ([], 2.0)
+    assert (done(second), second.next_look_in) == ([], 2.0)
     third = look(seen, second.state, 103.0)
     assert kinds(third) == [CreateService, CreateProxy]
 

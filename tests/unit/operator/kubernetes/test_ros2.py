@@ -8,10 +8,10 @@ from msgspec.structs import replace
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner import manifests
-from rosproxy_operator.kubernetes.planner.access.bounds import objection
+from rosproxy_operator.kubernetes.planner.access.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.actions import CreateEar, CreateProxy, DeleteEar
 from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
-from rosproxy_operator.kubernetes.planner.pods.ros2_pods import unmet
+from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.steps.ear import ear_pod
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
@@ -25,7 +25,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Ros2Spec,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.pod_failures import stuck
+from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
 from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 from rosproxy_operator.kubernetes.status.status import participants
@@ -60,7 +60,11 @@ def of2(ros2: Ros2Spec | None = None, **changes: Any) -> RosProxy:
 
 
 def pod(*containers: PodContainer, **changes: Any) -> Pod:
-    words: dict[str, Any] = {"wired": "", "static_peers": ADDRESS, "containers": containers}
+    words: dict[str, Any] = {
+        "wired_master_uri": "",
+        "static_peers": ADDRESS,
+        "containers": containers,
+    }
     return some.pod(**words | changes)
 
 
@@ -219,7 +223,7 @@ def test_an_ear_stays_while_its_proxy_is_made_anew():
 
 def test_an_ear_that_does_not_run_is_told():
     of, there = hearing()
-    deaf = stuck({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
+    deaf = pod_failure({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
     found = ear(of, stuck=deaf[0], message=deaf[1])
     plan = look(observed(of, service(of), pod(), there, ears=(found,)))
     assert "so that the LAN is not heard" in told(plan, "EarStuck")[0]
@@ -284,11 +288,11 @@ def test_a_copy_of_a_wired_pod_is_wired_anew():
     ],
 )
 def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
-    (found,) = unmet(pod(container), of2(), ADDRESS)
+    (found,) = ros2_findings(pod(container), of2(), ADDRESS)
     assert (found.reason, found.fatal) == (reason, False)
     assert found.about is not None
     assert found.about.kind == "Pod"
-    assert list(unmet(pod(container), some.rosproxy(), ADDRESS)) == []
+    assert list(ros2_findings(pod(container), some.rosproxy(), ADDRESS)) == []
 
 
 @pytest.mark.parametrize(
@@ -302,13 +306,13 @@ def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
     ],
 )
 def test_what_is_well_is_not_told(container: PodContainer):
-    assert list(unmet(pod(container), of2(), ADDRESS)) == []
+    assert list(ros2_findings(pod(container), of2(), ADDRESS)) == []
 
 
 def test_a_pod_that_no_webhook_has_seen_is_told():
-    (found,) = unmet(pod(static_peers=""), of2(), ADDRESS)
+    (found,) = ros2_findings(pod(static_peers=""), of2(), ADDRESS)
     assert (found.reason, "create the pod anew" in found.text) == ("NotWired", True)
-    (found,) = unmet(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
+    (found,) = ros2_findings(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
     assert "its proxy is at 10.96.1.1 now" in found.text
 
 
@@ -323,7 +327,7 @@ def test_a_pod_that_no_webhook_has_seen_is_told():
 )
 def test_what_the_administrator_allows(bounds: Bounds, field: str):
     of = of2(Ros2Spec(peers=("robot",), multicast=True), ports=5)
-    found = objection(of, {}, ClusterSettings(bounds=bounds))
+    found = bounds_violation(of, {}, ClusterSettings(bounds=bounds))
     assert found.startswith(field)
     assert bool(found) == bool(field)
 
@@ -345,7 +349,7 @@ def test_a_participant_of_a_pod_that_is_gone_is_told_to_the_proxy():
     known = look(seen).state
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)})
     gone = observed(of, service(of), there, reports={there.pod.uid: report})
-    assert look(gone, known, 101.0).gone == {there.pod.uid: ("10.244.1.5",)}
+    assert look(gone, known, 101.0).departed_addresses == {there.pod.uid: ("10.244.1.5",)}
 
 
 def test_what_users_are_told():
@@ -375,11 +379,11 @@ def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)}, leases=leases)
     seen = observed(of, service(of), pod(), there, reports={there.pod.uid: report})
     known = look(seen).state
-    assert look(seen, known).former == {}
+    assert look(seen, known).former_ports == {}
 
     new = replace(there, pod=replace(there.pod, uid="uid-new"))
     starting = observed(of, service(of), pod(), new, reports={"uid-new": ProxyReport(True, True)})
     found = look(starting, known)
-    assert found.former == {"uid-new": leases}
+    assert found.former_ports == {"uid-new": leases}
     complete = replace(starting, reports={"uid-new": report})
-    assert look(complete, found.state).former == {}
+    assert look(complete, found.state).former_ports == {}

@@ -4,10 +4,10 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.pods.selection import (
-    chosen,
     matches,
-    nobody,
     on_node,
+    select_rosproxy,
+    why_not_selected,
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, ClusterNode, Name, Selector
 from rosproxy_operator.kubernetes.resources.names import own_labels
@@ -55,7 +55,7 @@ def test_label_selectors(selector, labels, fits):
 def test_a_pod_is_taken_by_its_label_in_its_namespace(more, taken):
     one = rosproxy()
 
-    assert chosen(pod(**more), [one]) is (one if taken else None)
+    assert select_rosproxy(pod(**more), [one]) is (one if taken else None)
 
 
 @pytest.mark.parametrize(
@@ -69,26 +69,26 @@ def test_a_pod_is_taken_by_its_label_in_its_namespace(more, taken):
     ],
 )
 def test_pods_that_no_selector_takes(labels):
-    assert chosen(pod(labels=labels), [rosproxy(selector=ALL)]) is None
+    assert select_rosproxy(pod(labels=labels), [rosproxy(selector=ALL)]) is None
 
 
 def test_a_rosproxy_that_is_being_deleted_takes_no_pod():
     gone, new = rosproxy("gone", deleting=True), rosproxy("new")
 
-    assert chosen(pod(), [gone, new]) is new
+    assert select_rosproxy(pod(), [gone, new]) is new
 
 
 def test_of_two_the_label_decides():
     arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
 
-    assert chosen(pod(labels={INJECT: "leg"}), [arm, leg]) is leg
+    assert select_rosproxy(pod(labels={INJECT: "leg"}), [arm, leg]) is leg
 
 
 @pytest.mark.parametrize("labels", [{INJECT: "true"}, {}, {INJECT: "third"}])
 def test_a_pod_that_two_select_has_none(labels):
     arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
 
-    found = chosen(pod(labels=labels), [leg, arm])
+    found = select_rosproxy(pod(labels=labels), [leg, arm])
 
     assert isinstance(found, ClusterFinding)
     assert (found.reason, found.of) == ("Ambiguous", arm.id)
@@ -100,15 +100,15 @@ def test_a_pod_that_two_select_has_none(labels):
 
 
 def test_a_pod_in_its_nodes_own_network_is_left_out():
-    found = chosen(pod(host_network=True), [rosproxy()])
+    found = select_rosproxy(pod(host_network=True), [rosproxy()])
 
     assert isinstance(found, ClusterFinding)
     assert (found.reason, found.of) == ("HostNetwork", Name("robots", "arm"))
 
 
 def test_a_pod_that_is_not_labelled_needs_no_warning():
-    assert nobody(pod(labels={}), []) == ""
-    assert nobody(pod(labels={INJECT: "false"}), []) == ""
+    assert why_not_selected(pod(labels={}), []) == ""
+    assert why_not_selected(pod(labels={INJECT: "false"}), []) == ""
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_a_pod_that_is_not_labelled_needs_no_warning():
     ],
 )
 def test_why_no_rosproxy_takes_a_labelled_pod(label, there, said):
-    text = nobody(pod(labels={INJECT: label}), there)
+    text = why_not_selected(pod(labels={INJECT: label}), there)
 
     assert said in text
     assert "create" in text

@@ -102,7 +102,7 @@ async def running(
 ) -> AsyncIterator[Running]:
     monkeypatch.setattr(serving, "BACK_OFF", (0.05,))
     monkeypatch.setattr(serving, "_BETWEEN_TRIES", (0.05,))
-    serving.quieten()
+    serving.quiet_library_logs()
     one = Running(server, api)
     one.serving.start()
     await until_alive(one)

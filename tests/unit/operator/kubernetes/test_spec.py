@@ -26,7 +26,7 @@ def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
     assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
     assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
     assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", RESOURCES)
-    assert (found.former, found.cluster_ip, found.deleting) == ({}, "", False)
+    assert (found.former_ranges, found.cluster_ip, found.deleting) == ({}, "", False)
 
 
 def test_all_fields():
@@ -126,7 +126,7 @@ def test_what_the_status_holds():
 
     found = rosproxy(rosproxy_obj(status={"masterURI": "http://10.96.7.7:11311", "perNode": lines}))
 
-    assert found.former == {"node1": PortRange(11400, 11431)}
+    assert found.former_ranges == {"node1": PortRange(11400, 11431)}
     assert found.cluster_ip == "10.96.7.7"
     assert found.status["perNode"] == lines
 

@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.resources.cluster import NodeState, Obstacle, ProxyReport, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import (
+    Obstacle,
+    PodFailure,
+    ProxyReport,
+    RosProxyOnNode,
+)
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Selector
 from rosproxy_operator.kubernetes.status.status import (
     LONGEST,
@@ -75,7 +80,7 @@ def test_a_node_in_the_status():
 
 
 def test_a_node_that_only_keeps_its_range():
-    kept = NodeState("node9", "", PortRange(12000, 12031))
+    kept = RosProxyOnNode("node9", "", PortRange(12000, 12031))
 
     found = status(state(), kept)
 
@@ -193,7 +198,7 @@ def test_a_large_cluster_is_told_in_bounds():
         )
         for i in range(MOST_NODES + 50)
     ]
-    kept = [NodeState(f"a{i}", "", PortRange(12000, 12031)) for i in range(10)]
+    kept = [RosProxyOnNode(f"a{i}", "", PortRange(12000, 12031)) for i in range(10)]
 
     found = status(*states, *kept)
 
@@ -229,12 +234,12 @@ _answers = st.none() | st.builds(
 _proxies = st.none() | st.builds(
     lambda ready, why, gone: proxy(ready=ready, stuck=why, pod={"deleting": gone}),
     st.booleans(),
-    st.none() | st.sampled_from(Stuck),
+    st.none() | st.sampled_from(PodFailure),
     st.booleans(),
 )
 _states = st.lists(
     st.builds(
-        NodeState,
+        RosProxyOnNode,
         st.sampled_from(["node1", "node2", "node3"]),
         st.just("192.0.2.1"),
         st.none() | st.just(PortRange(11400, 11431)),

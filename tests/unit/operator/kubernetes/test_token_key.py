@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api, ApiAway
+from rosproxy_operator.kubernetes.api.client import Api, ApiUnavailable
 from rosproxy_operator.kubernetes.proxies.token_key import LENGTH, TokenKey
 from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.api_server import ApiServer
@@ -83,7 +83,7 @@ async def test_without_any_secret_it_is_the_processs_own(api: Api) -> None:
 async def test_an_api_server_that_is_away_makes_no_other_key(server: ApiServer, api: Api) -> None:
     put(server)
     server.refuse("GET", "secrets", 503, "starting")
-    with pytest.raises(ApiAway):
+    with pytest.raises(ApiUnavailable):
         await read(TokenKey(api, SECRET))
 
 
@@ -101,6 +101,6 @@ async def test_whoever_was_faster_has_the_right_one(
         return found
 
     monkeypatch.setattr(api, "get", get)
-    with pytest.raises(ApiAway):
+    with pytest.raises(ApiUnavailable):
         await read(one)
     assert await read(one) == await read(other)

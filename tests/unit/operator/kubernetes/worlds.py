@@ -9,7 +9,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
-from rosproxy_operator.kubernetes.planner.pods.selection import chosen, on_node, selects
+from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy, selects
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
@@ -92,7 +92,7 @@ class World:
 
     def in_status(self, place: ProxyPlace) -> PortRange | None:
         rosproxy = self.cluster.state.rosproxies.get(place.of)
-        return parse_rosproxy.rosproxy(rosproxy).former.get(place.node) if rosproxy else None
+        return parse_rosproxy.rosproxy(rosproxy).former_ranges.get(place.node) if rosproxy else None
 
     def seen(self) -> ClusterPlan:
         """A look, which must not take a pod for gone that runs."""
@@ -100,7 +100,9 @@ class World:
         pods = self.cluster.state.pods.values()
         live = {meta(pod)["uid"] for pod in pods if not ended(pod)}
         here = {ip for uid, ip in self.cluster.addresses.items() if uid in live}
-        assert not here & {ip for some in found.gone.values() for ip in some}, "it runs"
+        assert not here & {ip for some in found.departed_addresses.values() for ip in some}, (
+            "it runs"
+        )
         return found
 
     def carry_out(self, found: ClusterPlan, most: int | None = None) -> None:
@@ -109,7 +111,7 @@ class World:
                 self.check_new_range(action)
                 assert self.seen_ready(self.place_of(action).node)
             elif isinstance(action, DeleteProxy):
-                on = {one.pod.uid: one.on for _, one in self.proxies()}.get(action.uid, "")
+                on = {one.pod.uid: one.node for _, one in self.proxies()}.get(action.uid, "")
                 gone = action.why == "its RosProxy is gone"
                 assert gone or on not in self.nodes or self.seen_ready(on)
         self.controller.carry_out(found, most)
@@ -170,14 +172,14 @@ class World:
                 self.may_move.add(place)
         for _, proxy in self.proxies():
             if proxy.stuck is not None:
-                self.may_move.add(ProxyPlace(proxy.of, proxy.on))
+                self.may_move.add(ProxyPlace(proxy.of, proxy.node))
 
     def check(self) -> None:
         """What holds at any moment."""
         self.note_conflicts()
         there: list[ProxyPlace] = []
         for pod, proxy in self.proxies():
-            place = ProxyPlace(proxy.of, proxy.on)
+            place = ProxyPlace(proxy.of, proxy.node)
             if not ended(pod) and not deleting(pod):
                 there.append(place)
             if pod["status"]["phase"] == "Running" and place.of in self.cluster.state.rosproxies:
@@ -202,11 +204,11 @@ class World:
             self.carry_out(found)
             self.cluster.step()
             self.check()
-            if not found.actions and found.again_in is None:
+            if not found.actions and found.next_look_in is None:
                 break
-            self.controller.now += 1.0 if found.again_in is None else found.again_in
+            self.controller.now += 1.0 if found.next_look_in is None else found.next_look_in
         else:
-            raise AssertionError(f"never comes to rest: {found.actions} {found.again_in}")
+            raise AssertionError(f"never comes to rest: {found.actions} {found.next_look_in}")
         assert self.cluster.made <= 40, "it is done over and over again"
         self.check_all_is_as_wished(found)
 
@@ -215,7 +217,7 @@ class World:
         rosproxies = [parse_rosproxy.rosproxy(copy.deepcopy(r)) for r in state.rosproxies.values()]
         wanted = set()
         for pod in map(objects.pod, state.pods.values()):
-            of = chosen(pod, rosproxies)
+            of = select_rosproxy(pod, rosproxies)
             node = state.nodes.get(pod.node)
             if (
                 isinstance(of, RosProxy)
@@ -244,12 +246,12 @@ class World:
         there = {}
         for pod in self.own():
             if ear := objects.ear_pod(pod):
-                there[ProxyPlace(ear.of, ear.on)] = pod, ear
+                there[ProxyPlace(ear.of, ear.node)] = pod, ear
         wanted = {}
         for _, proxy in self.proxies():
             of = self.cluster.state.rosproxies.get(proxy.of)
             if of and of["spec"].get("multicast"):
-                wanted[ProxyPlace(proxy.of, proxy.on)] = proxy
+                wanted[ProxyPlace(proxy.of, proxy.node)] = proxy
         assert {p for p in there if p.node not in unready} <= wanted.keys()
         for place, proxy in wanted.items():
             if place.node in unready or not proxy.pod.ip:
@@ -260,7 +262,7 @@ class World:
             assert proxy.range.last not in proxy.pod.udp_ports
 
     def check_proxies(self, found: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:
-        there = {ProxyPlace(one.of, one.on): (pod, one) for pod, one in self.proxies()}
+        there = {ProxyPlace(one.of, one.node): (pod, one) for pod, one in self.proxies()}
         assert {place for place in there if place.node not in unready} <= wanted
         for place in wanted:
             rosproxy = self.cluster.state.rosproxies[place.of]["spec"]
@@ -311,8 +313,8 @@ class World:
     def check_addresses(self, unready: set[str]) -> None:
         """A proxy knows no ROS node of a pod that is gone."""
         for pod, proxy in self.proxies():
-            if proxy.on in unready or proxy.pod.uid not in self.cluster.running():
+            if proxy.node in unready or proxy.pod.uid not in self.cluster.running():
                 continue
-            live = [one for one in self.users() if node_of(one) == proxy.on and not ended(one)]
+            live = [one for one in self.users() if node_of(one) == proxy.node and not ended(one)]
             here = {self.cluster.addresses[meta(one)["uid"]] for one in live}
             assert self.cluster.ros.get(meta(pod)["uid"], set()) <= here

@@ -19,9 +19,9 @@ from rosproxy.ros1.protocol.uris import (
     parse_service_uri,
     parse_slave_uri,
     path_of,
-    placed,
     service_uri,
     slave_uri,
+    with_caller_address,
 )
 
 NAMES = st.from_regex(r"[a-zA-Z0-9_]([a-zA-Z0-9_.-]{0,30}[a-zA-Z0-9_])?", fullmatch=True)
@@ -268,6 +268,6 @@ def test_an_address_that_something_may_be_reached_at(text: str, address: str | N
     ],
 )
 def test_a_uri_without_a_host_is_where_it_came_from(uri: str, expected: str) -> None:
-    assert placed(uri, "10.0.0.5") == expected
+    assert with_caller_address(uri, "10.0.0.5") == expected
     if uri != expected:
-        assert placed(uri, "fd00::5") == expected.replace("10.0.0.5", "[fd00::5]")
+        assert with_caller_address(uri, "fd00::5") == expected.replace("10.0.0.5", "[fd00::5]")

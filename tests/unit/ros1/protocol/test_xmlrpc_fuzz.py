@@ -102,7 +102,7 @@ def swapped_booleans(value: Any) -> Any:
     return str(int(value)) if isinstance(value, bool) else value
 
 
-def exported(request: master_calls.Request) -> master_calls.Exported:
+def exported(request: master_calls.Request) -> master_calls.ExportedRequest:
     """The request for the master, of a node that is not admitted."""
     return master_api.export_request(request, [None] * len(request.calls), WORLD)
 

@@ -35,7 +35,7 @@ def test_slave_uris_by_topic() -> None:
         "/b": ["http://n:1/"],
     }
     assert graph.by_topic(Kind.SUBSCRIBER) == {"/a": ["http://m:1/"]}
-    assert Graph(graph.held, {}).by_topic(Kind.PUBLISHER) == {}
+    assert Graph(graph.registrations, {}).by_topic(Kind.PUBLISHER) == {}
 
 
 @pytest.mark.parametrize(

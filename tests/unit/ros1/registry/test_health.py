@@ -119,12 +119,12 @@ def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
     health = Health()
     health.note(A, 1.0)
     health.end(2.0)
-    assert (health.down, health.over) == (True, True)
+    assert (health.down, health.has_ended) == (True, True)
     assert health.clean_up(2.0, after=30.0)  # at the next look, if it could not be done at once
     assert not health.clean_up(2.0, after=0.0)
     health.note(S, 3.0)  # its address is silent, but it won't come back
-    assert (health.down, health.over) == (True, True)
+    assert (health.down, health.has_ended) == (True, True)
     assert not health.note(A, 4.0)
     assert not health.down
-    assert (health.down, health.over) == (False, False)
+    assert (health.down, health.has_ended) == (False, False)
     assert not health.clean_up(99.0, after=30.0)

@@ -8,7 +8,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import InsidePath
 from rosproxy.ros1.registry import memory
 from rosproxy.ros1.registry.endpoint import MOST_SERVICE_PORTS
-from rosproxy.ros1.registry.memory import Remembered, lease_at, parameter_of, remembered
+from rosproxy.ros1.registry.memory import RememberedLease, lease_at, parameter_of, read_leases
 from tests.unit.builders import add_node, make_addressing
 
 PORTS = PortMap(PortRange(45000, 45009), PortRange(30000, 30009))
@@ -32,18 +32,18 @@ def test_a_lease_is_a_line() -> None:
     add_node(addressing, "http://c6:40001/", "10.0.0.6")
     for port in (41234, 41235):
         first.note_service_port(port)
-    text = memory.to_remember(addressing.registry, addressing.ports)
+    text = memory.leases_text(addressing.registry, addressing.ports)
     assert text == "45000 /10.0.0.5:40001/ 41234 41235\n45001 /c6:40001/10.0.0.6/\n"
-    found = remembered(text, addressing.ports)
+    found = read_leases(text, addressing.ports)
     assert found == {
-        45000: Remembered(PLACE, (41234, 41235)),
-        45001: Remembered(InsidePath(HostPort("c6", 40001), "10.0.0.6")),
+        45000: RememberedLease(PLACE, (41234, 41235)),
+        45001: RememberedLease(InsidePath(HostPort("c6", 40001), "10.0.0.6")),
     }
 
 
 def test_the_ports_are_those_that_outside_sees() -> None:
-    assert remembered("30003 /10.0.0.5:40001/\n", PORTS) == {45003: Remembered(PLACE)}
-    assert remembered("45003 /10.0.0.5:40001/\n", PORTS) == {}
+    assert read_leases("30003 /10.0.0.5:40001/\n", PORTS) == {45003: RememberedLease(PLACE)}
+    assert read_leases("45003 /10.0.0.5:40001/\n", PORTS) == {}
 
 
 def test_so_many_ports_of_services_are_kept_the_newest() -> None:
@@ -52,14 +52,14 @@ def test_so_many_ports_of_services_are_kept_the_newest() -> None:
     news = [endpoint.note_service_port(port) for port in range(1, 40)]
     assert all(news)
     assert not endpoint.note_service_port(39)
-    text = memory.to_remember([endpoint], addressing.ports)
-    (lease,) = remembered(text, addressing.ports).values()
+    text = memory.leases_text([endpoint], addressing.ports)
+    (lease,) = read_leases(text, addressing.ports).values()
     assert lease.service_ports == tuple(range(40 - MOST_SERVICE_PORTS, 40))
 
 
 def test_what_any_proxy_has_at_an_address_is_told() -> None:
     held = {"leases_robot_30000": "30003 /10.0.0.5:40001/\n", "leases_robot_45000": "x", "y": 1}
-    assert lease_at(held, HostPort("robot", 30003)) == Remembered(PLACE)
+    assert lease_at(held, HostPort("robot", 30003)) == RememberedLease(PLACE)
     assert lease_at(held, HostPort("robot", 30004)) is None
     assert lease_at(held, HostPort("laptop", 30003)) is None
     assert lease_at("nothing", HostPort("robot", 30003)) is None
@@ -67,7 +67,7 @@ def test_what_any_proxy_has_at_an_address_is_told() -> None:
 
 @given(st.text() | st.integers() | st.lists(st.text()) | st.dictionaries(st.text(), st.text()))
 def test_nothing_that_somebody_writes_there_is_an_error(value: object) -> None:
-    remembered(value, PORTS)
+    read_leases(value, PORTS)
     lease_at(value, HostPort("robot", 30003))
 
 
@@ -81,7 +81,7 @@ LINES = st.builds(
 
 @given(st.lists(LINES).map("\n".join))
 def test_what_is_read_is_lawful(text: str) -> None:
-    for port, lease in remembered(text, PORTS).items():
+    for port, lease in read_leases(text, PORTS).items():
         assert port in PORTS.listen
         assert len(lease.service_ports) <= MOST_SERVICE_PORTS
         assert all(0 < service < 65536 for service in lease.service_ports)

@@ -164,9 +164,9 @@ def test_the_endpoint_that_was_idle_longest_is_given_up_first() -> None:
     idle(registry, 5, 30.0)
     longest = idle(registry, 6, 10.0)
     idle(registry, 7, 20.0)
-    assert registry.reclaimable() is longest
+    assert registry.longest_idle() is longest
     longest.connections = 1
-    found = registry.reclaimable()
+    found = registry.longest_idle()
     assert found
     assert found.node.host == "10.0.0.7"
 
@@ -175,7 +175,7 @@ def test_an_endpoint_that_waits_for_the_masters_reply_is_not_given_up() -> None:
     """It has no registration yet, and counted as the one that was idle longest."""
     registry = make_registry()
     node(registry, 5)
-    assert registry.reclaimable() is None
+    assert registry.longest_idle() is None
 
 
 def test_registrations_keep_an_endpoint_unless_it_was_cleaned_up() -> None:
@@ -184,13 +184,13 @@ def test_registrations_keep_an_endpoint_unless_it_was_cleaned_up() -> None:
     register(registry, endpoint, PUB, "/a")
     assert endpoint.idle_since is None
     endpoint.idle_since = 20.0
-    assert registry.reclaimable() is None
+    assert registry.longest_idle() is None
     endpoint.health = Health(failures=2, cleaned=True)
-    assert registry.reclaimable() is endpoint
+    assert registry.longest_idle() is endpoint
     endpoint.connections = 1
-    assert registry.reclaimable() is None
+    assert registry.longest_idle() is None
     endpoint.connections, endpoint.pending = 0, 1
-    assert registry.reclaimable() is None
+    assert registry.longest_idle() is None
 
 
 def test_a_call_under_way_keeps_an_endpoint() -> None:
@@ -198,7 +198,7 @@ def test_a_call_under_way_keeps_an_endpoint() -> None:
     endpoint = idle(registry, 5, 10.0)
     endpoint.pending = 1
     assert not endpoint.unused
-    assert registry.reclaimable() is None
+    assert registry.longest_idle() is None
 
 
 def test_restored_endpoints_have_the_port_that_they_had() -> None:
@@ -400,12 +400,12 @@ def test_an_endpoint_has_so_many_registrations_at_most() -> None:
     for number in range(MOST_REGISTRATIONS + 10):
         register(registry, endpoint, PUB, f"/t{number}")
     assert len(endpoint.registrations) == endpoint.callers["/node"] == MOST_REGISTRATIONS
-    assert "10000 registrations, at most 10000" in (endpoint.full or "")
+    assert "10000 registrations, at most 10000" in (endpoint.reason_full or "")
     held = Registration(PUB, "/t0", "/node", "std_msgs/String")
     registry.register(endpoint, held)
     assert endpoint.registrations[held.key] is held
     registry.unregister(PUB, "/t0", "/node")
-    assert endpoint.full is None
+    assert endpoint.reason_full is None
 
 
 def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
@@ -414,9 +414,9 @@ def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
     for number in range(2 * MOST_CHARACTERS // 1000):
         register(registry, endpoint, SRV, f"/{number}".ljust(1000, "x"), "/node")
     assert MOST_CHARACTERS <= endpoint.characters < MOST_CHARACTERS + 1100
-    assert "characters of registered names" in (endpoint.full or "")
+    assert "characters of registered names" in (endpoint.reason_full or "")
     registry.drop_caller(endpoint, "/node")
-    assert (endpoint.characters, endpoint.full) == (0, None)
+    assert (endpoint.characters, endpoint.reason_full) == (0, None)
 
 
 def test_a_registration_that_is_too_long_is_not_kept() -> None:
@@ -442,7 +442,7 @@ def failing(
     """A node that an address registered and that does not answer any more, or never did."""
     address = f"10.0.0.{number}"
     endpoint = admit(registry, own_uri(address), address, f"10.0.0.{source}")
-    endpoint.health.answered = 1.0 if proven else None
+    endpoint.health.answered_at = 1.0 if proven else None
     endpoint.health.failures, endpoint.health.failing_since = failures, float(number)
     register(registry, endpoint, PUB, f"/topic{number}", f"/node{number}")
     return endpoint
@@ -451,7 +451,7 @@ def failing(
 def given_up(registry: Registry) -> list[str]:
     """Who is given up for nodes that live, one after the other."""
     found = []
-    while (endpoint := registry.dead()) is not None:
+    while (endpoint := registry.dead_endpoint()) is not None:
         found.append(endpoint.location.address.removeprefix("10.0.0."))
         registry.remove(endpoint)
     return found
@@ -483,13 +483,16 @@ def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> 
     claim = registry.restore(own_uri("10.0.0.5"), where, place, 45000)
     assert claim
     register(registry, claim, PUB, "/a")
-    assert registry.dead() is None  # it is being asked
+    assert registry.dead_endpoint() is None  # it is being asked
     claim.health.failures = 1
-    assert registry.dead() is claim
-    claim.health.failures, claim.health.answered = 0, 5.0  # something answers that is not the node
-    assert registry.dead() is claim
+    assert registry.dead_endpoint() is claim
+    claim.health.failures, claim.health.answered_at = (
+        0,
+        5.0,
+    )  # something answers that is not the node
+    assert registry.dead_endpoint() is claim
     claim.trusted = True
-    assert registry.dead() is None
+    assert registry.dead_endpoint() is None
 
 
 def test_nodes_of_a_source_that_never_answered() -> None:
@@ -498,7 +501,7 @@ def test_nodes_of_a_source_that_never_answered() -> None:
     other = admit(registry, own_uri("10.0.0.6"), "10.0.0.6", "10.0.0.9")
     node(registry, 7)
     assert registry.unproven("10.0.0.9") == [one, other]
-    one.health.answered = 1.0
+    one.health.answered_at = 1.0
     assert registry.unproven("10.0.0.9") == [other]
     assert [make_registry(size).most_unproven for size in (1, 4, 8, 100)] == [1, 1, 2, 25]
 

@@ -11,7 +11,7 @@ NEAR = "172.30.1.2"
 
 def stand_in(number: int) -> StandIn:
     where = HostPort("robot", number)
-    return StandIn(HostPort(NEAR, 20_000 + number), f"http://{where}/", where, kept=False)
+    return StandIn(HostPort(NEAR, 20_000 + number), f"http://{where}/", where, is_uri_kept=False)
 
 
 def opened(all_of: StandIns, one: StandIn) -> HostPort:
@@ -36,12 +36,12 @@ def test_two_whose_ports_would_be_the_same_get_one_each() -> None:
 
 def test_who_finds_all_taken_has_none() -> None:
     all_of, one = make_stand_ins(direction="both"), stand_in(1)
-    for one.fast_try in range(TRIES):
+    for one.fast_attempts in range(TRIES):
         all_of.by_port[one.port] = stand_in(2)
     assert all_of.choose_fast_candidate(one) is None
 
 
 def test_a_service_has_none() -> None:
     where = HostPort("robot", 4000)
-    one = StandIn(HostPort(NEAR, 20_000), f"rosrpc://{where}", where, kept=False)
+    one = StandIn(HostPort(NEAR, 20_000), f"rosrpc://{where}", where, is_uri_kept=False)
     assert make_stand_ins(direction="both").choose_fast_candidate(one) is None

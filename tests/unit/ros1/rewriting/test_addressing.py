@@ -36,7 +36,7 @@ def test_an_advertised_uri_tells_the_port_alone(uri: str, address: str | None) -
     assert addressing.advertised_uri(endpoint) == OUTSIDE
     assert addressing.advertised_service(endpoint) == "rosrpc://robot-host:45000"
     assert addressing.lease_of(OUTSIDE) == 45000
-    assert addressing.stands_for(OUTSIDE) is endpoint
+    assert addressing.endpoint_of(OUTSIDE) is endpoint
     assert addressing.export_slave(uri, make_caller(endpoint.location.address)) == OUTSIDE
 
 
@@ -54,7 +54,7 @@ def test_an_advertised_uri_tells_the_port_alone(uri: str, address: str | None) -
 def test_a_uri_of_a_former_version_means_the_node_that_it_names(path: str, stands: bool) -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    found = addressing.stands_for(f"http://robot-host:45000{path}")
+    found = addressing.endpoint_of(f"http://robot-host:45000{path}")
     assert found is (endpoint if stands else None)
 
 
@@ -262,7 +262,7 @@ def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_els
 def test_uris_that_the_proxy_handed_out(uri: str, handed_out: bool) -> None:
     addressing = make_addressing()
     add_node(addressing)
-    assert addressing.handed_out(uri, STRANGER) is handed_out
+    assert addressing.is_own_uri(uri, STRANGER) is handed_out
 
 
 SERVICES = [

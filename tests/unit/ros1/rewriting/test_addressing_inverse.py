@@ -9,7 +9,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, service_uri, slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
-from rosproxy.ros1.registry.memory import remembered, to_remember
+from rosproxy.ros1.registry.memory import leases_text, read_leases
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from tests.unit.builders import make_addressing
 
@@ -92,7 +92,7 @@ def test_a_slave_uri_handed_out_comes_back_as_it_was(
         outside = addressing.advertised_uri(endpoint)
         inside = addressing.import_slave(outside, given)
         assert addressing.export_slave(inside, back) == outside
-        assert inside == endpoint.uri or addressing.handed_out(inside, back)
+        assert inside == endpoint.uri or addressing.is_own_uri(inside, back)
         assert parse_slave_uri(inside)
 
 
@@ -157,8 +157,8 @@ def test_the_master_can_be_asked_for_all_that_a_restarted_proxy_needs(
     topology: tuple[Addressing, list[Endpoint]],
 ) -> None:
     addressing, endpoints = topology
-    text = to_remember(endpoints, addressing.ports)
-    memory = remembered(text, addressing.ports)
+    text = leases_text(endpoints, addressing.ports)
+    memory = read_leases(text, addressing.ports)
     for endpoint in endpoints:
         port = addressing.lease_of(addressing.advertised_uri(endpoint))
         assert port == endpoint.port

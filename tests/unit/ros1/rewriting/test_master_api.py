@@ -320,7 +320,7 @@ def test_a_registration_with_a_uri_that_the_proxy_handed_out_ends_none() -> None
     )
     exported = master_api.export_request(request, [None], addressing)
     assert exported.body == py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_OUT)
-    assert master_calls.read_reply(exported, py_reply([1, "", []])).facts(7.0) == []
+    assert master_calls.read_reply(exported, py_reply([1, "", []])).registry_changes(7.0) == []
 
 
 def test_a_fault_is_passed_on_and_nothing_is_noted() -> None:

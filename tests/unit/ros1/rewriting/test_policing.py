@@ -16,7 +16,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.rewriting.hidden_graph import completed
+from rosproxy.ros1.rewriting.hidden_graph import with_hidden
 from tests.unit.builders import make_stand_ins
 
 PORTS = PortRange(11000, 11009)
@@ -112,7 +112,7 @@ def test_what_is_hidden_is_known_by_kind_and_name() -> None:
     registry.register(b, replace(b.registrations[Kind.SERVICE, "/s", "/b"], hidden=False))
     registry.remove(a)
     assert registry.hidden == {}
-    assert c.shown(Kind.SERVICE) == ["/shown"]
+    assert c.names_at_master(Kind.SERVICE) == ["/shown"]
 
 
 @given(
@@ -148,21 +148,21 @@ def test_the_graph_is_completed_once() -> None:
     )
     registry = addressing.registry
     state = [[["/t", ["/far"]]], [], []]
-    assert completed(Call("getSystemState", []), state, registry) == [
+    assert with_hidden(Call("getSystemState", []), state, registry) == [
         [["/t", ["/far", "/a"]]],
         [["/only/heard", ["/b"]]],
         [["/s", ["/c"]]],
     ]
     types = [["/t", "X"]]
-    assert completed(Call("getTopicTypes", []), types, registry) == [
+    assert with_hidden(Call("getTopicTypes", []), types, registry) == [
         ["/t", "X"],
         ["/only/heard", "T"],
     ]
-    assert completed(Call("getPublishedTopics", []), [], registry) == [["/t", "T"]]
+    assert with_hidden(Call("getPublishedTopics", []), [], registry) == [["/t", "T"]]
 
 
 @given(st.recursive(st.text() | st.integers(), st.lists))
 def test_a_malformed_graph_is_left_as_it_is_or_completed(said: object) -> None:
     registry = make(("/a", Kind.PUBLISHER, "/t", True)).registry
     for method in ("getSystemState", "getTopicTypes", "getPublishedTopics"):
-        completed(Call(method, []), said, registry)
+        with_hidden(Call(method, []), said, registry)

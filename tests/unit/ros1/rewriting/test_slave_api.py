@@ -234,8 +234,8 @@ def test_no_port_is_learned_for_no_topic(params: list[Any]) -> None:
     "method", ["publisherUpdate", "requestTopic", "getBusInfo", "getUri", "getMasterUri"]
 )
 def test_methods_that_are_rewritten_and_their_faults(method: str) -> None:
-    assert slave_api.rewritten(method)
-    assert not slave_api.passes(method)
+    assert slave_api.is_rewritten(method)
+    assert not slave_api.passes_unread(method)
     fault = dump_fault(1, OWN)
     assert outward(method, fault) == fault
     for reply in (py_reply(OWN), py_reply([OWN]), py_reply([1, OWN, OWN, 1])):
@@ -246,8 +246,8 @@ def test_methods_that_are_rewritten_and_their_faults(method: str) -> None:
 
 @pytest.mark.parametrize("method", ["getPid", "shutdown", "paramUpdate", "getPublications", "x"])
 def test_methods_that_are_not_rewritten(method: str) -> None:
-    assert not slave_api.rewritten(method)
-    assert slave_api.passes(method) is (method not in ("shutdown", "system.multicall"))
+    assert not slave_api.is_rewritten(method)
+    assert slave_api.passes_unread(method) is (method not in ("shutdown", "system.multicall"))
 
 
 def test_what_only_the_master_calls() -> None:

@@ -8,7 +8,7 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.tcpros import encode_header
 from rosproxy.ros1.protocol.xmlrpc import document
-from rosproxy.ros1.rewriting.udpros import lead_to, read_offers
+from rosproxy.ros1.rewriting.udpros import read_offers, redirect_offer
 
 HERE = HostPort("10.0.0.1", 25000)
 
@@ -29,13 +29,13 @@ def asked(*offers: list[Any]) -> bytes:
 def led(body: bytes, where: HostPort | None) -> Any:
     """The offers of a call, each led to somewhere."""
     call = document.parse_call(body)
-    edits = [edit for one in read_offers(call) for edit in lead_to(one, where)]
+    edits = [edit for one in read_offers(call) for edit in redirect_offer(one, where)]
     return xmlrpc.client.loads(document.apply(body, edits).decode())[0][2]
 
 
 def test_an_offer_is_read() -> None:
     (found,) = read_offers(document.parse_call(asked(["TCPROS"], offer("/other"))))
-    assert (found.topic, found.where) == ("/other", HostPort("laptop", 40000))
+    assert (found.topic, found.receiver) == ("/other", HostPort("laptop", 40000))
 
 
 def test_an_offer_leads_elsewhere_and_all_else_stays() -> None:
@@ -61,8 +61,8 @@ def test_an_offer_is_taken_out() -> None:
 )
 def test_what_can_not_be_read_is_taken_out(odd: list[Any]) -> None:
     (found,) = read_offers(document.parse_call(asked(odd)))
-    assert found.where is None or found.topic == ""
-    if found.where is None:
+    assert found.receiver is None or found.topic == ""
+    if found.receiver is None:
         assert led(asked(odd, ["TCPROS"]), HERE) == [["TCPROS"]]
 
 

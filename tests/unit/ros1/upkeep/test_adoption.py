@@ -11,7 +11,7 @@ from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.decisions import adoption as policy
 from rosproxy.ros1.upkeep.decisions.adoption import DirectNode
 from rosproxy.ros1.upkeep.decisions.recovery import confirmed_by
-from rosproxy.ros1.upkeep.decisions.registration import known_as
+from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 from tests.unit.builders import add_node, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
@@ -64,7 +64,7 @@ def test_a_container_on_two_networks_is_looked_for_on_both() -> None:
     graph = Graph({"/n": [held("/a")]}, {"/n": "http://c1:40001/"})
     both = [C1, ("10.1.0.5", C1[1]), C1]
     (found,) = policy.find_direct(graph, both, make_addressing())
-    assert found.places == places("10.0.0.5:40001", "10.1.0.5:40001")
+    assert found.slaves == places("10.0.0.5:40001", "10.1.0.5:40001")
 
 
 def direct(caller_id: str, topics: Sequence[str], *where: str, kind: Kind = PUB) -> DirectNode:
@@ -160,16 +160,16 @@ def test_two_names_of_one_process() -> None:
 def test_by_what_uris_an_endpoint_may_be_known() -> None:
     endpoint = add_node(make_addressing(), "http://c1:40001/", "10.0.0.5", True)
     endpoint.former_uris.add("http://robot-host:45000/c1:40001/10.0.0.4/")
-    assert known_as(endpoint, "http://c1:40001/")
-    assert known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.4/")
-    assert not known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.5/")
-    assert not known_as(endpoint, "http://c1:40002/")
+    assert is_known_as(endpoint, "http://c1:40001/")
+    assert is_known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.4/")
+    assert not is_known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.5/")
+    assert not is_known_as(endpoint, "http://c1:40002/")
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
 def test_a_loopback_address_is_everybodys_own(host: str) -> None:
     endpoint = add_node(make_addressing(), f"http://{host}:40001/", "10.0.0.5", False)
-    assert not known_as(endpoint, endpoint.uri)
+    assert not is_known_as(endpoint, endpoint.uri)
 
 
 REASONS = [
@@ -211,5 +211,5 @@ def test_who_is_to_be_shut_down(direct: bool, uri: str | None, its_own: bool) ->
     assert addressing.advertised_uri(endpoint) == ADVERTISED
     if direct:
         endpoint.former_uris.add(LITERAL)
-    assert endpoint.direct is direct
+    assert endpoint.has_registered_directly is direct
     assert policy.has_name_still(endpoint, uri, ADVERTISED) is its_own

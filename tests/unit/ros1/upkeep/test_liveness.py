@@ -17,7 +17,7 @@ def test_only_who_answers_is_alive() -> None:
     addressing = make_addressing()
     found = [add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(3)]
     probes = [ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT]
-    assert liveness.dead(dict(zip(found, probes, strict=True)), 0.0) == found[1:]
+    assert liveness.dead_endpoints(dict(zip(found, probes, strict=True)), 0.0) == found[1:]
 
 
 def test_restarted_container_keeps_its_new_node() -> None:
@@ -33,7 +33,7 @@ def test_restarted_container_keeps_its_new_node() -> None:
     answers = dict.fromkeys((fresh, old, calling), ProbeResult.SILENT) | {
         ended: ProbeResult.REFUSED
     }
-    assert liveness.dead(answers, 7.0) == [old, ended]
+    assert liveness.dead_endpoints(answers, 7.0) == [old, ended]
 
 
 def test_who_may_have_moved() -> None:
@@ -66,7 +66,7 @@ def test_who_may_have_moved() -> None:
 def test_the_place_of_a_node_that_has_moved(uri: str, stale: bool, confirmed: bool) -> None:
     endpoint = add_node(make_addressing(), uri, "10.0.0.5", True, confirmed)
     expected = NodeLocation("10.0.0.9", named=False, confirmed=confirmed, stale=stale)
-    assert liveness.new_place(endpoint, "10.0.0.9") == expected
+    assert liveness.moved_location(endpoint, "10.0.0.9") == expected
 
 
 SAME = [
@@ -97,10 +97,10 @@ def test_whether_it_is_the_same_process(
 TIMES = st.none() | st.integers(0, 12).map(float)
 HEALTHS = st.builds(
     Health,
-    answered=TIMES,
+    answered_at=TIMES,
     failures=st.integers(0, 3),
     cleaned=st.booleans(),
-    checked=TIMES,
+    checked_at=TIMES,
     pid=st.sampled_from([None, -1, 7]),
 )
 

@@ -27,7 +27,7 @@ def graph(uris: dict[str, str]) -> Graph:
     return Graph({node: [held("/a", node)] for node in uris}, uris)
 
 
-MEMORY = memory.remembered(
+MEMORY = memory.read_leases(
     "45003 /10.0.0.5:40001/\n"
     "45004 /c5:40001/10.0.0.5/ 41234 41235\n"
     "45005 /127.0.0.1:40001/10.0.0.5/\n"
@@ -60,7 +60,7 @@ URIS = [
 def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
     uri: str, expected: tuple[int, str, str] | None
 ) -> None:
-    found, forgotten = policy.claims(graph({"/n": uri}), make_addressing(), MEMORY)
+    found, forgotten = policy.find_claims(graph({"/n": uri}), make_addressing(), MEMORY)
     claims = [(one.port, one.uri, str(one.slave), one.topics) for one in found]
     assert forgotten == {}
     if expected is None:
@@ -72,13 +72,13 @@ def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
 
 def test_the_ports_of_services_are_remembered() -> None:
     uris = {"/n": "http://robot-host:45004/", "/m": "http://robot-host:45003/"}
-    found, _ = policy.claims(graph(uris), make_addressing(), MEMORY)
+    found, _ = policy.find_claims(graph(uris), make_addressing(), MEMORY)
     assert [claim.service_ports for claim in found] == [(41234, 41235), ()]
 
 
 def test_of_some_nothing_is_remembered() -> None:
     uri = "http://robot-host:45008/"
-    found, forgotten = policy.claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
+    found, forgotten = policy.find_claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
     assert found == []
     assert {one.caller_id for one in forgotten[uri]} == {"/n", "/m"}
 
@@ -86,22 +86,22 @@ def test_of_some_nothing_is_remembered() -> None:
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
     addressing = make_addressing(advertise=(30000, 30009))
     uris = {"/n": "http://robot-host:30003/", "/m": "http://robot-host:45003/"}
-    kept = memory.remembered("30003 /10.0.0.5:1/\n", addressing.ports)
-    assert [claim.port for claim in policy.claims(graph(uris), addressing, kept)[0]] == [45003]
+    kept = memory.read_leases("30003 /10.0.0.5:1/\n", addressing.ports)
+    assert [claim.port for claim in policy.find_claims(graph(uris), addressing, kept)[0]] == [45003]
 
 
 def test_names_that_share_a_uri_are_one_claim() -> None:
     uri = "http://robot-host:45003/"
-    (claim,), _ = policy.claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
+    (claim,), _ = policy.find_claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
     assert {one.caller_id for one in claim.registrations} == {"/n", "/m"}
 
 
 def test_a_node_without_registrations_or_without_a_uri() -> None:
     addressing = make_addressing()
     uri = "http://robot-host:45003/"
-    (claim,), _ = policy.claims(Graph({}, {"/n": uri}), addressing, MEMORY)
+    (claim,), _ = policy.find_claims(Graph({}, {"/n": uri}), addressing, MEMORY)
     assert claim.registrations == []
-    assert policy.claims(Graph({"/n": [held("/a")]}, {}), addressing, MEMORY) == ([], {})
+    assert policy.find_claims(Graph({"/n": [held("/a")]}, {}), addressing, MEMORY) == ([], {})
 
 
 def claim(
@@ -140,7 +140,7 @@ SETTLED = [
 def test_one_claim_is_kept_for_each_port_and_each_node(
     found: list[Claim], kept: list[tuple[int, str]]
 ) -> None:
-    assert sorted((one.port, one.slave.host) for one in policy.settle(found)) == kept
+    assert sorted((one.port, one.slave.host) for one in policy.choose_claims(found)) == kept
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_one_claim_is_kept_for_each_port_and_each_node(
 def test_claims_to_the_same_port_or_node_are_contested(
     found: list[Claim], ports: list[int]
 ) -> None:
-    assert [one.port for one in policy.contested(found)] == ports
+    assert [one.port for one in policy.contested_claims(found)] == ports
 
 
 TOPICS = st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True)
@@ -166,9 +166,9 @@ CLAIMS = st.builds(claim, st.integers(1, 4), ADDRESSES, TOPICS, st.none() | TOPI
 
 @given(st.lists(CLAIMS, max_size=6))
 def test_settling_leaves_no_contest_and_forgets_nobody_without_one(found: list[Claim]) -> None:
-    settled = policy.settle(found)
-    assert policy.contested(settled) == []
-    rivals = policy.contested(found)
+    settled = policy.choose_claims(found)
+    assert policy.contested_claims(settled) == []
+    rivals = policy.contested_claims(found)
     assert all(one in settled for one in found if one not in rivals)
 
 
@@ -234,14 +234,17 @@ def test_names_that_are_not_the_node_s_are_told_apart() -> None:
     own, former = held("/a", "/own"), held("/b", "/former")
     service = Registration(SRV, "/s", "/former")
     everything = [own, former, service, Registration(SRV, "/t", "/untold"), held("/c", "/own")]
-    assert policy.others(everything, NodeInfo(7, {"/a": "t"}, {})) == [former, service]
-    assert policy.others(everything, NodeInfo(7, {"/a": "t"}, None)) == []
+    assert policy.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, {})) == [
+        former,
+        service,
+    ]
+    assert policy.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, None)) == []
 
 
 def test_a_node_is_asked_for_a_few_of_its_topics_and_services() -> None:
     topics = [held(name) for name in ("/rosout", "/d", "/c", "/b", "/a")]
     services = [Registration(SRV, name, "/n") for name in ("/y", "/x")]
     heard = [Registration(Kind.SUBSCRIBER, "/heard", "/n")]
-    asked = policy.to_ask([*topics, *services, *heard])
+    asked = policy.topics_and_services_to_ask([*topics, *services, *heard])
     assert asked == (["/a", "/b", "/c"], [*reversed(services)])
-    assert policy.to_ask(topics[:2])[0] == ["/d", "/rosout"]
+    assert policy.topics_and_services_to_ask(topics[:2])[0] == ["/d", "/rosout"]

@@ -97,7 +97,7 @@ def test_what_still_holds_of_a_node_that_is_back(
     endpoint = add_node(addressing)
     for kind, name in HELD:
         add_registration(addressing, endpoint, kind, name)
-    found = decisions.still_held(endpoint, said(published, subscribed), same_process)
+    found = decisions.valid_registrations(endpoint, said(published, subscribed), same_process)
     assert [(held.kind, held.name) for held in found] == kept
 
 
@@ -105,8 +105,10 @@ def test_a_service_alone_holds_if_the_process_is_the_same() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
     service = add_registration(addressing, endpoint, SRV, "/s")
-    assert decisions.still_held(endpoint, said({"/rosout"}), same_process=True) == [service]
-    assert decisions.still_held(endpoint, said({"/rosout"}), same_process=False) == []
+    assert decisions.valid_registrations(endpoint, said({"/rosout"}), same_process=True) == [
+        service
+    ]
+    assert decisions.valid_registrations(endpoint, said({"/rosout"}), same_process=False) == []
 
 
 OLD = [(PUB, "/rosout", "/old", 1.0), (PUB, "/a", "/old", 1.0), (SRV, "/s", "/old", 1.0)]
@@ -138,19 +140,19 @@ def test_what_a_process_that_is_gone_has_left_behind(
     endpoint = add_node(addressing)
     for kind, name, caller_id, since in registered:
         addressing.registry.register(endpoint, Registration(kind, name, caller_id, since=since))
-    found = decisions.left_over(endpoint, said(published, subscribed), before=10.0)
+    found = decisions.left_over_registrations(endpoint, said(published, subscribed), before=10.0)
     assert [held.key for held in found] == [row[:3] for row in left]
 
 
 def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    assert decisions.unregistered(endpoint, said({"/a"})) == []  # whose would they be?
+    assert decisions.unregistered_topics(endpoint, said({"/a"})) == []  # whose would they be?
     add_registration(addressing, endpoint, PUB, "/a", "/n")
-    found = decisions.unregistered(endpoint, said({"/a", "/b"}, {"/a"}))
+    found = decisions.unregistered_topics(endpoint, said({"/a", "/b"}, {"/a"}))
     assert found == [Registration(PUB, "/b", "/n", "t/b"), Registration(SUB, "/a", "/n", "t/a")]
     add_registration(addressing, endpoint, SUB, "/c", "/m")
-    assert decisions.unregistered(endpoint, said({"/b"})) == []
+    assert decisions.unregistered_topics(endpoint, said({"/b"})) == []
 
 
 def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
@@ -215,7 +217,7 @@ def test_topics_that_a_node_no_longer_has() -> None:
         (PARAM, "/rate", 1.0),
     ]:
         addressing.registry.register(endpoint, held(name, kind=kind, since=since))
-    gone = decisions.vanished(endpoint, said(["/kept"], ["/kept"]), before=5.0)
+    gone = decisions.vanished_topics(endpoint, said(["/kept"], ["/kept"]), before=5.0)
     assert [(one.kind, one.name) for one in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
 
 
@@ -246,4 +248,4 @@ def test_what_the_master_has_lost(
     state: dict[str, list[Registration]] = {}
     for one in masters:
         state.setdefault(one.caller_id, []).append(one)
-    assert decisions.lost(ours, state, before=10.0) == lost
+    assert decisions.lost_registrations(ours, state, before=10.0) == lost

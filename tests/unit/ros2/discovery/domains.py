@@ -37,7 +37,7 @@ def domain(
         number=0,
         hosts=(HOST,),
         ports=ports,
-        near=lambda _: NEAR,
+        proxy_address_for=lambda _: NEAR,
         note=lambda *_: None,
         judge=judge,
         both_ways=both_ways,
@@ -83,4 +83,4 @@ def meet(one: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgoing
 
 
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
-    return [sent.datagram for sent in outgoing if sent.to.host == host]
+    return [sent.datagram for sent in outgoing if sent.target.host == host]

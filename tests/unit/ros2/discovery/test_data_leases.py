@@ -18,7 +18,7 @@ def both(one: Domain) -> DataLeases:
 
 
 def led(leases: DataLeases) -> dict[int, HostPort]:
-    return {lease.port: lease.where for lease in leases}
+    return {lease.port: lease.target for lease in leases}
 
 
 def test_only_user_data_is_forwarded() -> None:
@@ -31,7 +31,7 @@ def test_only_user_data_is_forwarded() -> None:
     assert one.inside.leases[port][1].kind is LeaseKind.DATA
     (lease,) = leases
     assert destination(lease, HostForwarding()) == LOCATOR
-    assert destination(lease, HostForwarding(own=(INSIDE,))) != LOCATOR
+    assert destination(lease, HostForwarding(own_addresses=(INSIDE,))) != LOCATOR
 
 
 def test_a_locator_that_turns_out_to_be_of_metatraffic_is_not_forwarded() -> None:
@@ -53,7 +53,7 @@ def test_who_keeps_a_lease_is_the_same_and_who_comes_after_is_not() -> None:
     one.heard_inside(farewell(A), INSIDE, 100)
     assert set(led(leases).values()) == {HostPort(OTHER, 7411)}
     meet(one)
-    (again,) = (lease for lease in leases if lease.where == LOCATOR)
+    (again,) = (lease for lease in leases if lease.target == LOCATOR)
     assert again.port == first.port
 
 

@@ -48,18 +48,18 @@ def test_inside_is_told_of_stand_ins_alone() -> None:
 
 def test_locators_of_readers_and_writers_get_one_too() -> None:
     one = both_ways()
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     (sent,) = one.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     (where,) = reached_at(sent.datagram)
     assert where.host == NEAR
     (passed,) = one.at_stand_in(where.port, USER, INSIDE, NOW)
-    assert passed.to == HostPort(ROBOT, 7000)
+    assert passed.target == HostPort(ROBOT, 7000)
 
 
 def test_what_inside_sends_goes_on_as_it_is() -> None:
     one = both_ways()
     (sent,) = one.at_stand_in(stand_in(one, LeaseKind.DATA), USER, INSIDE, NOW)
-    assert (sent.to, sent.datagram) == (HostPort(ROBOT, 7411), USER)
+    assert (sent.target, sent.datagram) == (HostPort(ROBOT, 7411), USER)
     assert one.at_stand_in(stand_in(one, LeaseKind.DATA), USER, OTHER, NOW) == []
 
 
@@ -68,7 +68,7 @@ def test_no_locator_leads_to_another_host() -> None:
     meet(one)
     datagram = spdp(B, ROBOT).replace(bytes([10, 0, 0, 9]), bytes([10, 0, 0, 8]))
     one.heard_outside(datagram, ROBOT, NOW)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     (sent,) = one.at_lease(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
     assert reached_at(sent.datagram) == []
@@ -76,7 +76,7 @@ def test_no_locator_leads_to_another_host() -> None:
 
 def test_after_a_restart_the_observer_learns_which_ones_there_are() -> None:
     before, after = both_ways(), both_ways()
-    (port,) = [p for p, (_, lease) in before.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [p for p, (_, lease) in before.inside.leases.items() if lease.target.port == 7410]
     before.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     after.heard_outside(sedp(B, ROBOT, 7000, to=after.own.observer.prefix), ROBOT, NOW)
     assert after.outside.stand_ins.keys() == before.outside.stand_ins.keys()
@@ -107,7 +107,7 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(MOST_SHARING + 1):
         one.heard_outside(spdp(bytes([9, number]) + B[2:], ROBOT, 7410 + 10 * number), ROBOT, NOW)
     assert {
-        sent.to.port for sent in one.at_stand_in(20_000, sedp(A, INSIDE, 7000), INSIDE, NOW)
+        sent.target.port for sent in one.at_stand_in(20_000, sedp(A, INSIDE, 7000), INSIDE, NOW)
     } == {
         7410,
         7411,

@@ -52,7 +52,7 @@ def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
     assert told == carried
     meta, user = reached_at(told)
     assert {meta.host, user.host} == {HOST}
-    leases = {lease.where.port: lease for _, lease in one.inside.leases.values()}
+    leases = {lease.target.port: lease for _, lease in one.inside.leases.values()}
     assert (meta.port - 1000, user.port - 1000) == (leases[7410].port, leases[7411].port)
     assert [leases[7410].kind, leases[7411].kind] == [LeaseKind.METATRAFFIC, LeaseKind.DATA]
 
@@ -113,7 +113,7 @@ def test_a_participant_at_two_networks_is_served_at_the_first() -> None:
     one = domain()
     meet(one)
     assert one.heard_inside(spdp(A, OTHER), OTHER, NOW) == []
-    assert {lease.where.host for _, lease in one.inside.leases.values()} == {INSIDE}
+    assert {lease.target.host for _, lease in one.inside.leases.values()} == {INSIDE}
 
 
 def test_nobody_gets_a_way_to_somebody_elses_address() -> None:
@@ -126,7 +126,7 @@ def test_nobody_gets_a_way_to_somebody_elses_address() -> None:
 def test_what_outside_sends_goes_to_the_locator() -> None:
     one = domain()
     meet(one)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7411]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7411]
     datagram = message(submessage(0x07, 0, bytes(28)), prefix=B)
     assert one.at_lease(port, datagram, STRANGER, NOW) == [
         Outgoing(HostPort(INSIDE, 7411), datagram)
@@ -136,9 +136,9 @@ def test_what_outside_sends_goes_to_the_locator() -> None:
 def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
     one = domain()
     meet(one)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     (sent,) = one.at_lease(port, spdp(B, ROBOT), ROBOT, NOW)
-    assert sent.to == HostPort(INSIDE, 7410)
+    assert sent.target == HostPort(INSIDE, 7410)
     meta, user = reached_at(sent.datagram)
     (stand_in,) = one.outside.stand_ins
     assert (meta, user) == (HostPort(NEAR, stand_in), HostPort(ROBOT, 7411))
@@ -155,10 +155,10 @@ def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
 )
 def test_loopback_is_for_those_on_this_machine(near: str, robot: str, told: list[HostPort]) -> None:
     one = domain(peers=[robot])
-    one.settings.near = lambda _: near
+    one.settings.proxy_address_for = lambda _: near
     meet(one)
     one.heard_outside(spdp(B, robot), robot, NOW)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     (sent,) = one.at_lease(port, sedp(B, "127.0.1.10", 7000), robot, NOW)
     assert reached_at(sent.datagram) == told
 
@@ -176,11 +176,11 @@ def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
     meet(one)
     (stand_in,) = one.outside.stand_ins
     *reminders, sent = one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
-    assert sent.to == HostPort(ROBOT, 7410)
-    assert {reminder.to for reminder in reminders} == {HostPort(INSIDE, 7410)}
+    assert sent.target == HostPort(ROBOT, 7410)
+    assert {reminder.target for reminder in reminders} == {HostPort(INSIDE, 7410)}
     (where,) = reached_at(sent.datagram)
     assert where.host == HOST
-    assert one.inside.leases[where.port - 1000][1].where.port == 7000
+    assert one.inside.leases[where.port - 1000][1].target.port == 7000
     (endpoint,) = one.inside.by_prefix[A].endpoints.values()
     assert (endpoint.topic, endpoint.type_name) == ("rt/chatter", "Str")
 
@@ -188,7 +188,7 @@ def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
 def test_a_stranger_is_not_answered() -> None:
     one = domain()
     meet(one)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     assert one.at_lease(port, spdp(B, STRANGER), STRANGER, NOW) == []
     assert one.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
     assert not one.outside.by_prefix
@@ -224,9 +224,9 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
     sent = 0
     for _ in range(20):
         for outgoing in one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW):
-            sent += len(outgoing.datagram) if outgoing.to.host == ROBOT else 0
+            sent += len(outgoing.datagram) if outgoing.target.host == ROBOT else 0
     assert 0 < sent <= len(heard)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     one.at_lease(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
     assert one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
 
@@ -245,8 +245,8 @@ def test_a_range_that_is_too_short_is_told() -> None:
             spdp(number.to_bytes(12, "big"), f"172.30.0.{number}"), f"172.30.0.{number}", NOW
         )
     assert len(one.inside.leases) == 15  # of sixteen, one is for discovery
-    assert all("--port-range" in text for text in one.inside.lacking.values())
-    assert one.inside.lacking
+    assert all("--port-range" in text for text in one.inside.port_shortages.values())
+    assert one.inside.port_shortages
 
 
 def test_who_has_gone_gives_everything_back() -> None:
@@ -269,7 +269,7 @@ def test_who_has_gone_gives_everything_back() -> None:
 def test_ports_are_given_once_it_is_known_who_had_which() -> None:
     one = domain()
     told, asked = one.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    assert {told.to, asked.to} == {HostPort(INSIDE, 7410)}
+    assert {told.target, asked.target} == {HostPort(INSIDE, 7410)}
     assert len(to(one.settle(0.5), INSIDE)) == 2  # asked again
     assert not one.inside.leases
     assert to(one.settle(0.1 + ANSWER_TIME), ROBOT)
@@ -284,10 +284,10 @@ def test_a_participant_says_which_ports_it_had() -> None:
     meant = submessage(0x0E, 0, one.own.keeper.prefix)
     answer = message(meant, submessage(0x06, 2, body), prefix=A)
     one.heard_inside(answer, OTHER, 0.2)
-    assert not one.own.keeper.kept  # from somewhere else it is nobody's word
+    assert not one.own.keeper.number_by_prefix  # from somewhere else it is nobody's word
     one.heard_inside(answer, INSIDE, 0.2)
     one.settle(SETTLING)
-    ports = {lease.where.port: port for port, (_, lease) in one.inside.leases.items()}
+    ports = {lease.target.port: port for port, (_, lease) in one.inside.leases.items()}
     assert ports == {7410: 45009, 7411: 45004}
 
 
@@ -308,12 +308,12 @@ def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
     one = domain()
     meet(one)
-    told, reminder = one.own.keeping()
-    assert {told.to, reminder.to} == {HostPort(INSIDE, 7410)}
-    assert one.own.keeping()
+    told, reminder = one.own.port_reminders()
+    assert {told.target, reminder.target} == {HostPort(INSIDE, 7410)}
+    assert one.own.port_reminders()
     ports = [lease.port for lease in one.inside.by_prefix[A].leases.values()]
-    one.own.keeper.kept[A] = one.own.keeper.number(ports)
-    assert one.own.keeping() == []
+    one.own.keeper.number_by_prefix[A] = one.own.keeper.number(ports)
+    assert one.own.port_reminders() == []
 
 
 @given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, EAR.host]))
@@ -386,7 +386,7 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
 
     sent = one.gone({INSIDE})
 
-    assert [outgoing.to for outgoing in sent] == one.settings.told()
+    assert [outgoing.target for outgoing in sent] == one.settings.announcement_targets()
     (found,) = read_discovery(sent[0].datagram).announcements
     assert (found.ended, found.sample.prefix, found.sample.sequence) == (True, A, LAST_SEQUENCE)
     assert source_vendor(sent[0].datagram) == A[:2]

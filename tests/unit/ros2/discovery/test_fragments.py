@@ -52,7 +52,7 @@ def hidden(told: DiscoveryMessage) -> bytes:
 def through(
     store: FragmentStores, datagram: bytes, rewrite: fragments.Rewrite = led
 ) -> list[bytes]:
-    return store.rewritten(PORT, read_discovery(datagram), READER, rewrite).on
+    return store.rewritten(PORT, read_discovery(datagram), READER, rewrite).forwarded
 
 
 @given(
@@ -153,7 +153,7 @@ def test_so_much_is_remembered_of_a_participant_and_no_more(
     assert stores.size == sum(one.size for one in stores.by_prefix.values())
     (store,) = stores.by_prefix.values()
     assert len(store._samples) <= 3
-    assert len(store._held) <= 3
+    assert len(store._waiting_datagrams) <= 3
     stores.forget(PREFIX)
     assert (stores.size, stores.by_prefix) == (0, {})
 

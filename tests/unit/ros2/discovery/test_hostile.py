@@ -10,7 +10,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain_settings import MOST_INSIDE, MOST_PER_ADDRESS, MOST_PER_HOST
-from rosproxy.ros2.discovery.partings import APART
+from rosproxy.ros2.discovery.partings import APART_TIME
 from rosproxy.ros2.discovery.returning import ANSWER_TIME
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
@@ -97,7 +97,7 @@ def test_fragments_are_judged_anew_by_another_policy() -> None:
     assert b"chatter" in sent.datagram
     allowed = False
     one.apply_policy(NOW)
-    one.settle(NOW + APART)
+    one.settle(NOW + APART_TIME)
     (sent,) = one.at_stand_in(stand_in, datagram, INSIDE, NOW)
     assert b"chatter" not in sent.datagram
 
@@ -136,7 +136,7 @@ def test_announcements_and_topics_have_a_length() -> None:
 
 
 def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(participants, "MOST_ENDPOINTS_HERE", 5)
+    monkeypatch.setattr(participants, "MOST_ENDPOINTS_PER_ADDRESS", 5)
     notes, many = EndpointNotes(), [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
     end = DdsEndpoint(EndpointKind.READER, "t", "T")
     for one in many:
@@ -145,10 +145,15 @@ def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.Mon
     assert [len(one.endpoints) for one in many] == [1] * 5 + [0] * 4
     notes.note(many[0], b"0001", None)
     notes.note(many[8], b"0001", end)
-    assert notes.total == notes.here[INSIDE] == sum(len(one.endpoints) for one in many) == 5
+    assert (
+        notes.total
+        == notes.count_by_address[INSIDE]
+        == sum(len(one.endpoints) for one in many)
+        == 5
+    )
     for one in many:
         notes.forget(one)
-    assert (notes.total, notes.here) == (0, {})
+    assert (notes.total, notes.count_by_address) == (0, {})
 
 
 def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
@@ -171,7 +176,7 @@ def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
     one.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
     assert B in one.outside.by_prefix
     one.expire(NOW + 21)
-    assert not one.outside.here
+    assert not one.outside.count_by_address
 
 
 def test_nobody_proves_anything_by_the_ear() -> None:
@@ -226,4 +231,4 @@ def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     one.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
     for port in one.inside.leases:
         one.at_lease(port, message(prefix=B), STRANGER, NOW)
-    assert STRANGER not in one.rates._left
+    assert STRANGER not in one.rates._remaining

@@ -21,8 +21,8 @@ def keeper(started: float = 0.0) -> Keeper:
 @given(some_ports)
 def test_a_number_holds_ports(ports: list[int]) -> None:
     one = keeper()
-    one.kept[PEER] = one.number(ports)
-    assert one.had(PEER) == ports
+    one.number_by_prefix[PEER] = one.number(ports)
+    assert one.former_ports(PEER) == ports
 
 
 @given(some_ports)
@@ -34,8 +34,8 @@ def test_a_port_more_is_a_greater_number(ports: list[int]) -> None:
 @given(st.integers(0, 2**63 - 1), st.integers(1, 3000))
 def test_no_number_names_a_port_outside_of_the_range(number: int, size: int) -> None:
     one = Keeper.of("10.0.0.1", PortRange(11400, 11399 + size), 0, 0.0)
-    one.kept[PEER] = number
-    assert all(port in one.ports for port in one.had(PEER))
+    one.number_by_prefix[PEER] = number
+    assert all(port in one.ports for port in one.former_ports(PEER))
 
 
 def test_the_next_process_is_the_same_keeper_and_counts_on() -> None:
@@ -65,8 +65,8 @@ def test_how_many_others_were_asked_is_nothing_to_a_participant() -> None:
 def test_a_longer_range_has_the_same_keeper(ports: list[int], more: int) -> None:
     one, longer = keeper(), Keeper.of("10.0.0.1", PortRange(11400, 11463 + more), 0, 0.0)
     assert one.prefix == longer.prefix
-    longer.kept[PEER] = one.number(ports)
-    assert longer.had(PEER) == ports
+    longer.number_by_prefix[PEER] = one.number(ports)
+    assert longer.former_ports(PEER) == ports
 
 
 def test_it_asks_and_reminds_by_heartbeats() -> None:

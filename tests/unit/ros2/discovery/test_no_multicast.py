@@ -5,8 +5,8 @@ import pytest
 from rosproxy.admin.requests import BodyError, ContainerNews, read_body
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.outside import PARTED_AGAIN
-from rosproxy.ros2.discovery.partings import APART, EAR_TIME
+from rosproxy.ros2.discovery.outside import FAREWELL_INTERVAL
+from rosproxy.ros2.discovery.partings import APART_TIME, EAR_TIME
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -63,7 +63,7 @@ def test_who_is_heard_by_multicast_needs_no_introduction() -> None:
 
 def test_those_on_other_networks_are_not_introduced() -> None:
     one = domain()
-    one.settings.near = lambda address: address
+    one.settings.proxy_address_for = lambda address: address
     meet(one, A, INSIDE)
     assert by(B, to(meet(one, B, OTHER), INSIDE)) == []
 
@@ -88,7 +88,7 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     sent = meet(one)
     assert is_farewell(by(one.own.keeper.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
-    parting, meeting = one.settle(NOW), one.settle(NOW + APART)
+    parting, meeting = one.settle(NOW), one.settle(NOW + APART_TIME)
 
     for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
         assert [is_farewell(each) for each in told] == [True]
@@ -123,11 +123,11 @@ def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
     one = moved()
     meet(one)
     one.settle(NOW)
-    one.settle(NOW + APART)
+    one.settle(NOW + APART_TIME)
     later = by(B, to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
     assert [is_farewell(each) for each in later] == [True, False]
     one.heard_outside(farewell(B), ROBOT, NOW + 1)
-    assert one.inside.by_prefix[A].parted == {C: NOW}
+    assert one.inside.by_prefix[A].farewell_times == {C: NOW}
 
 
 def test_who_does_not_take_it_in_is_told_again() -> None:
@@ -135,17 +135,17 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
     one = moved()
     meet(one)
     one.settle(NOW)
-    one.settle(NOW + APART)
+    one.settle(NOW + APART_TIME)
 
     def told(later: float) -> list[bool]:
         sent = one.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
         return [is_farewell(each) for each in by(C, to(sent, INSIDE))]
 
-    assert told(PARTED_AGAIN - 0.1) == [False]
-    assert told(PARTED_AGAIN) == [True, False]
+    assert told(FAREWELL_INTERVAL - 0.1) == [False]
+    assert told(FAREWELL_INTERVAL) == [True, False]
     (stand_in,) = one.outside.stand_ins
-    one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + PARTED_AGAIN)
-    assert told(3 * PARTED_AGAIN) == [False]
+    one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + FAREWELL_INTERVAL)
+    assert told(3 * FAREWELL_INTERVAL) == [False]
 
 
 def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
@@ -166,7 +166,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     one.returning.note_former({A: ports}, one.inside.by_prefix)
     meet(one)
     assert not set(one.inside.by_prefix[A].ports) & set(ports)
-    parting, meeting = one.settle(NOW), one.settle(NOW + APART)
+    parting, meeting = one.settle(NOW), one.settle(NOW + APART_TIME)
     assert [is_farewell(each) for each in by(A, to(parting, ROBOT))] == [True]
     assert [is_farewell(each) for each in by(A, to(meeting, ROBOT))] == [False]
 

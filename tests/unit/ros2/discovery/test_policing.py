@@ -4,7 +4,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
-from rosproxy.ros2.discovery.partings import APART
+from rosproxy.ros2.discovery.partings import APART_TIME
 from rosproxy.ros2.protocol.rtps import SubmessageId, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery import domains
@@ -36,7 +36,7 @@ def outwards(one: Domain) -> list[Outgoing]:
 
 
 def inwards(one: Domain) -> list[Outgoing]:
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
     return one.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
 
 
@@ -80,8 +80,8 @@ def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
     rules.denied = {RuleKind.PUBLISH}
     parting = one.apply_policy(NOW)
     assert outwards(one) == inwards(one) == []
-    assert one.settle(NOW + APART / 2) == []
-    meeting = one.settle(NOW + APART)
+    assert one.settle(NOW + APART_TIME / 2) == []
+    meeting = one.settle(NOW + APART_TIME)
     for host in (ROBOT, INSIDE):
         told = [
             (announced.ended, announced.sample.sequence)

@@ -125,15 +125,15 @@ class Neighbours(RuleBasedStateMachine):
         leased = self.one.inside.leases.get(port)
         self.came[source] += len(datagram)
         sent = self.one.at_lease(port, datagram, source, self.now)
-        where = leased[1].where if leased else None
-        assert {out.to for out in sent} <= {where}
+        where = leased[1].target if leased else None
+        assert {out.target for out in sent} <= {where}
         assert not leased or len(sent) <= 1 or leased[0].prefix in self.one.inside.by_prefix
 
     @rule(datagram=datagrams(), source=ADDRESS, index=st.integers(0, 9))
     def a_stand_in_gets_something(self, datagram: bytes, source: str, index: int) -> None:
         ports = sorted(self.one.outside.stand_ins) or [STAND_INS.first]
         sent = self.one.at_stand_in(ports[index % len(ports)], datagram, source, self.now)
-        assert not sent or source in self.one.inside.here
+        assert not sent or source in self.one.inside.count_by_address
         self.check(sent)
 
     @rule(prefix=PREFIX, address=ADDRESS)
@@ -164,7 +164,7 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule()
     def the_proxy_observes(self) -> None:
-        self.check(self.one.own.keeping() + self.one.own.announced_outside())
+        self.check(self.one.own.port_reminders() + self.one.own.announced_outside())
 
     @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
     def another_program_has_a_port(self, port: int, for_good: bool) -> None:
@@ -177,11 +177,14 @@ class Neighbours(RuleBasedStateMachine):
             there.address for there in self.one.outside.by_prefix.values() if there.proven
         }
         for out in sent:
-            assert 0 < out.to.port < 65536
-            if out.to == EAR or out.to.host in self.proven:
+            assert 0 < out.target.port < 65536
+            if out.target == EAR or out.target.host in self.proven:
                 continue
-            if out.to.host not in NEAR_BY or out.to.host not in self.one.inside.here:
-                self.went[out.to.host] += len(out.datagram)
+            if (
+                out.target.host not in NEAR_BY
+                or out.target.host not in self.one.inside.count_by_address
+            ):
+                self.went[out.target.host] += len(out.datagram)
         waiting = {source for source, *_ in self.one.returning.waiting.values()}
         for host, size in self.went.items():
             assert host in waiting | set(NEAR_BY) or size <= self.came[host]
@@ -194,11 +197,11 @@ class Neighbours(RuleBasedStateMachine):
         assert len(held) == len(inside.leases)
         for port, (one, lease) in inside.leases.items():
             assert inside.by_prefix[one.prefix] is one
-            assert one.leases[lease.where] is lease
-            assert (lease.port, lease.where.host) == (port, one.address)
+            assert one.leases[lease.target] is lease
+            assert (lease.port, lease.target.host) == (port, one.address)
             assert not pool.is_free(port)
-        assert inside.here == Counter(one.address for one in inside.by_prefix.values())
-        assert inside.lacking.keys() <= inside.by_prefix.keys()
+        assert inside.count_by_address == Counter(one.address for one in inside.by_prefix.values())
+        assert inside.port_shortages.keys() <= inside.by_prefix.keys()
 
     @invariant()
     def stand_ins_are_of_those_outside(self) -> None:
@@ -208,11 +211,13 @@ class Neighbours(RuleBasedStateMachine):
             assert 0 < len(users) <= MOST_SHARING
             for there, lease in users:
                 assert outside.by_prefix[there.prefix] is there
-                assert there.leases[lease.where] is lease
-                assert (lease.port, lease.where.host) == (port, there.address)
+                assert there.leases[lease.target] is lease
+                assert (lease.port, lease.target.host) == (port, there.address)
         held = sum(len(there.leases) for there in outside.by_prefix.values())
         assert held == sum(map(len, outside.stand_ins.values()))
-        assert outside.here == Counter(one.address for one in outside.by_prefix.values())
+        assert outside.count_by_address == Counter(
+            one.address for one in outside.by_prefix.values()
+        )
         assert not outside.by_prefix.keys() & self.one.inside.by_prefix.keys()
 
     @invariant()
@@ -223,14 +228,14 @@ class Neighbours(RuleBasedStateMachine):
             everybody = side.by_prefix.values()
             assert all(len(there.leases) <= MOST_LEASES for there in everybody)
             assert side.notes.total == sum(len(there.endpoints) for there in everybody)
-            assert side.notes.total == side.notes.here.total()
-        assert {prefix for prefix, _ in one.own.observer._got} <= known
-        assert one.own.keeper.kept.keys() <= known | one.returning.waiting.keys()
+            assert side.notes.total == side.notes.count_by_address.total()
+        assert {prefix for prefix, _ in one.own.observer._received} <= known
+        assert one.own.keeper.number_by_prefix.keys() <= known | one.returning.waiting.keys()
         assert one.fragments.by_prefix.keys() <= known
         sizes = [store.size for store in one.fragments.by_prefix.values()]
         assert one.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL
-        assert len(one.rates._left) <= MOST_SOURCES
-        assert all(left <= BURST for left, _ in one.rates._left.values())
+        assert len(one.rates._remaining) <= MOST_SOURCES
+        assert all(left <= BURST for left, _ in one.rates._remaining.values())
 
 
 TestNeighbours = Neighbours.TestCase

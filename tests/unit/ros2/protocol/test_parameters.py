@@ -51,7 +51,7 @@ def test_a_locator_is_replaced_and_nothing_else(
     (parameter,) = found.all(Pid.METATRAFFIC_UNICAST_LOCATOR)
     locator = read_locator(datagram, found, parameter)
     assert locator is not None
-    assert locator.where == HostPort(before, port)
+    assert locator.host_port == HostPort(before, port)
     changed = apply(datagram, [replaced(found, parameter, HostPort(host, lease))])
     span = parameter.value
     assert changed[: span.start] + changed[span.end :] == (
@@ -59,7 +59,7 @@ def test_a_locator_is_replaced_and_nothing_else(
     )
     after = read_locator(changed, read(changed)[1], parameter)
     assert after is not None
-    assert after.where == HostPort(host, lease)
+    assert after.host_port == HostPort(host, lease)
 
 
 @BOTH
@@ -138,7 +138,7 @@ def test_any_payload_is_read_or_refused(content: bytes, little: bool) -> None:
     assert found is not None
     for one in found.parameters:
         assert sample.payload is not None
-        assert sample.payload.start <= one.at < one.value.end <= sample.payload.end
+        assert sample.payload.start <= one.offset < one.value.end <= sample.payload.end
         read_locator(datagram, found, one)
         found.text(datagram, one.pid)
 
@@ -156,7 +156,7 @@ def test_any_payload_is_read_or_refused(content: bytes, little: bool) -> None:
     ],
 )
 def test_where_a_locator_leads(locator: Locator, where: HostPort | None) -> None:
-    assert locator.where == where
+    assert locator.host_port == where
 
 
 def test_a_locator_that_is_too_short() -> None:

@@ -43,7 +43,7 @@ def test_a_sample_is_found_with_its_writer_and_its_place(little: bool) -> None:
     )
     (found,) = samples(whole)
     assert (found.prefix, found.writer, found.sequence) == (PREFIX, SPDP_WRITER, 2**33 + 5)
-    assert (found.little, found.inline_qos, found.key) == (little, None, False)
+    assert (found.little, found.inline_qos, found.is_key_only) == (little, None, False)
     assert found.payload is not None
     assert whole[found.payload.start : found.payload.end] == content
 
@@ -53,7 +53,7 @@ def test_inline_qos_stands_before_the_payload(little: bool) -> None:
     qos, content = parameter_list([(0x71, b"\0\0\0\3")], little), payload([], little)
     whole = message(data(content, qos=qos, little=little, key=True))
     (found,) = samples(whole)
-    assert found.key
+    assert found.is_key_only
     assert found.inline_qos is not None
     assert found.payload is not None
     assert whole[found.inline_qos.start : found.inline_qos.end] == qos

@@ -53,7 +53,7 @@ def test_no_port_is_given_twice(wanted: list[tuple[bytes, int]]) -> None:
 def test_who_is_meant_at_a_port_gets_it(one: bytes, other: bytes) -> None:
     pool = ports()
     (first, *_) = order_for(f"{one.hex()} {where(0)}", RANGE)
-    pool.note_meant(first, other, DATA, 0.5)
+    pool.note_former_user(first, other, DATA, 0.5)
     if one != other:
         assert pool.take(one, where(0), DATA, SETTLING) != first
     assert pool.take(other, where(3), DATA, SETTLING) == first
@@ -68,14 +68,14 @@ def test_who_says_what_it_had_gets_it(prefix: bytes, had: int) -> None:
 
 def test_what_outside_says_counts_more_than_ones_own_word() -> None:
     pool, one, other = ports(), bytes(12), bytes(range(12))
-    pool.note_meant(45007, other, DATA, 0.5)
+    pool.note_former_user(45007, other, DATA, 0.5)
     assert pool.take(one, where(0), DATA, SETTLING, 45007) != 45007
     assert pool.take(other, where(0), DATA, SETTLING, 45003) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
     pool, prefix = ports(), bytes(12)
-    pool.note_meant(45007, prefix, METATRAFFIC, 0.5)
+    pool.note_former_user(45007, prefix, METATRAFFIC, 0.5)
     assert pool.take(prefix, where(1), DATA, SETTLING) != 45007
     assert pool.take(prefix, where(0), METATRAFFIC, SETTLING) == 45007
 
@@ -83,8 +83,8 @@ def test_a_port_for_metatraffic_is_none_for_data() -> None:
 def test_what_was_heard_is_forgotten_after_a_time() -> None:
     pool, one, other = ports(), bytes(12), bytes(range(12))
     (first, *_) = order_for(f"{one.hex()} {where(0)}", RANGE)
-    pool.note_meant(first, other, DATA, 0.5)
-    pool.note_meant(45000, other, DATA, REMEMBERED + 1)
+    pool.note_former_user(first, other, DATA, 0.5)
+    pool.note_former_user(45000, other, DATA, REMEMBERED + 1)
     assert pool.take(one, where(0), DATA, REMEMBERED) == first
 
 
@@ -117,7 +117,7 @@ def test_a_stand_in_is_found_behind_a_long_range_that_is_held(key: str, length: 
 def test_what_the_kernel_forwarded_leads_there_again(one: bytes, other: bytes, port: int) -> None:
     pool = ports()
     pool.note_forwarded({port: where(1), 9: where(1)})
-    pool.note_meant(port, other, DATA, 0.5)
+    pool.note_former_user(port, other, DATA, 0.5)
     assert pool.take(other, where(0), DATA, SETTLING, had=port) != port
     assert pool.take(one, where(1), METATRAFFIC, SETTLING, had=port) != port
     assert pool.take(one, where(1), DATA, SETTLING) == port

@@ -48,12 +48,12 @@ def test_who_is_selected_is_let_in_and_nobody_else() -> None:
 def test_what_is_held_is_bounded() -> None:
     one = SelectedAddresses(NEWS_TIMEOUT)
     one.hold(HERE, said(1, bytes(LONGEST_HELD)))
-    assert not one.held
+    assert not one.held_announcements
     for number in range(2 * MOST_HELD_EACH):
         one.hold(HERE, said(number))
-    assert len(one.held[HERE]) == MOST_HELD_EACH
+    assert len(one.held_announcements[HERE]) == MOST_HELD_EACH
     for number in range(2 * MOST_HELD):
         one.hold(f"172.31.{number // 256}.{number % 256}", said(1))
-    assert len(one.held) == MOST_HELD
+    assert len(one.held_announcements) == MOST_HELD
     with pytest.raises(RtpsError):
         one.hold(HERE, b"nonsense")

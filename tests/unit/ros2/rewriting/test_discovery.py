@@ -81,10 +81,10 @@ def test_each_locator_leads_to_a_lease_and_what_can_not_be_led_is_gone(little: b
         (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(HOST, 45000)),
         (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(HOST, 45001)),
     ]
-    pids = [one.pid for one in found.held.parameters]
+    pids = [one.pid for one in found.parameters.parameters]
     assert pids.count(Pid.PAD) == 3
     assert not set(MULTICAST) & set(pids)
-    (vendor,) = found.held.all(0x8007)
+    (vendor,) = found.parameters.all(0x8007)
     assert after[vendor.value.start : vendor.value.end] == b"vendor's"
 
 
@@ -134,9 +134,9 @@ def test_nothing_but_locators_changes(
     after = rewritten(read_discovery(before), lambda pid, where: HostPort(HOST, 45000), nothing)
     (found,) = read_discovery(before).announcements
     kept = bytearray(after)
-    for one in found.held.all(*UNICAST, *MULTICAST):
-        kept[one.at : one.value.end] = before[one.at : one.value.end]
+    for one in found.parameters.all(*UNICAST, *MULTICAST):
+        kept[one.offset : one.value.end] = before[one.offset : one.value.end]
     assert bytes(kept) == before
     (changed,) = read_discovery(after).announcements
     assert {where for _, where in changed.reached_at(after)} <= {HostPort(HOST, 45000)}
-    assert not changed.held.all(*MULTICAST)
+    assert not changed.parameters.all(*MULTICAST)

@@ -100,19 +100,19 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
     container, key = request.container, request.key
     if key.is_ros2:
         return request, ""
-    needs, text = values.looks_for(container, key)
+    needs, text = values.proxy_alias(container, key)
     by_address = values.master_by_address(container, key, observed.masters)
     if by_address is None:
-        return replace(request, needs=needs), text
+        return replace(request, wanted_alias=needs), text
     internal = {network.name for network in observed.networks if network.internal}
     if not settings.redirect:
         text += "; the operator's --no-redirect keeps it from being led to the proxy"
     elif request.redirect is False:
         text += f"; without {values.named(REDIRECT, container.labels)} it is led to the proxy"
-    elif (joined := values.owner(container, observed).networks) and joined <= internal:
+    elif (joined := values.network_owner(container, observed).networks) and joined <= internal:
         text += "; it is not led to the proxy, since its networks have no way outwards"
     else:
-        return replace(request, by_address=by_address), ""
+        return replace(request, redirected_master=by_address), ""
     return request, text
 
 

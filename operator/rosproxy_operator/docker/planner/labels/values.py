@@ -155,7 +155,7 @@ def advertise_host(labels: Labels, settings: PlanSettings) -> str:
 
 def networks(container: Container, observed: HostState, uplink: str) -> frozenset[str]:
     """The container's user-defined networks but the uplink, or the one that its label names."""
-    net_owner = owner(container, observed)
+    net_owner = network_owner(container, observed)
     own = (net_owner.networks or _future_network(net_owner, observed)) - BUILT_IN - {uplink}
     if NETWORK in container.labels:
         return frozenset({_named_network(container.labels, own)})
@@ -220,10 +220,10 @@ def _named_network(labels: Labels, own: frozenset[str]) -> str:
     )
 
 
-def owner(container: Container, observed: HostState) -> Container:
+def network_owner(container: Container, observed: HostState) -> Container:
     """The container whose networks it has: itself, or the one that it shares them with."""
     visited = {container.id}
-    while (target := container.shares) is not None:
+    while (target := container.network_container) is not None:
         sharer = next((c for c in observed.containers if target in (c.id, c.name)), None)
         if sharer is None or sharer.id in visited:
             raise UnusableLabel(
@@ -269,7 +269,7 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
     )
 
 
-def looks_for(container: Container, key: Key) -> tuple[str, str]:
+def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
     """The name by which a container's nodes look for their proxy, and what is wrong with it.
 
     The name is empty if no alias can help. The second text is empty if nothing is wrong.

@@ -44,7 +44,7 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
     """
     refused: dict[str, InvalidRosProxy] = {}
     for rosproxy in observed.rosproxies:
-        text = "" if rosproxy.deleting else objection(rosproxy, observed.consents, settings)
+        text = "" if rosproxy.deleting else bounds_violation(rosproxy, observed.consents, settings)
         if text:
             refused[rosproxy.uid] = InvalidRosProxy(
                 rosproxy.id, rosproxy.uid, rosproxy.generation, text, rosproxy.status, NOT_ALLOWED
@@ -58,7 +58,7 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
     )
 
 
-def objection(rosproxy: RosProxy, consents: Consents, settings: ClusterSettings) -> str:
+def bounds_violation(rosproxy: RosProxy, consents: Consents, settings: ClusterSettings) -> str:
     """What a RosProxy asks for that it may not have: field, value, what to do. Empty if nothing."""
     objections = (
         *_violations(rosproxy.spec, settings),
@@ -67,7 +67,7 @@ def objection(rosproxy: RosProxy, consents: Consents, settings: ClusterSettings)
     return next(filter(None, objections), "")
 
 
-def may_name(master: str, allowed: tuple[str, ...]) -> bool:
+def is_allowed_master(master: str, allowed: tuple[str, ...]) -> bool:
     """Whether a master's URI, without its path, fits one of some patterns.
 
     A pattern of digits and stars fits addresses only: 192.0.2.* is not for 192.0.2.7.example.com.
@@ -85,7 +85,7 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
     bounds = settings.bounds
     if bounds.masters and spec.ros1:
         for uri in _masters(spec):
-            if not may_name(uri, bounds.masters):
+            if not is_allowed_master(uri, bounds.masters):
                 field = "spec.master.uri" if spec.master.uri else "spec.master.service"
                 yield _refusal(field, uri, "choose an allowed master", "allow.masters")
     if spec.ros2:
@@ -106,7 +106,7 @@ def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
     """What goes beyond them of what it asks for of ROS 2."""
     for peer in spec.peers if bounds.peers else ():
         uri = slave_uri(HostPort(read_peer(peer).host, 1))
-        if not may_name(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
+        if not is_allowed_master(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
             yield _refusal("spec.peers", peer, "choose an allowed peer", "allow.peers")
     if spec.multicast and not bounds.multicast:
         fix = "leave it out, and name who is outside in spec.peers"

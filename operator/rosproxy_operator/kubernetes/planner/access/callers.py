@@ -8,7 +8,7 @@ well, since it may have been wired before that one was created.
 from collections.abc import Mapping
 
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
-from rosproxy_operator.kubernetes.planner.view import grouped
+from rosproxy_operator.kubernetes.planner.view import group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 
 
@@ -19,13 +19,13 @@ def callers(observed: ClusterSnapshot) -> Mapping[str, tuple[str, ...]]:
     """
     rosproxies = {r.uid: r for r in observed.rosproxies if not r.deleting}
     live_pods = (pod for pod in observed.pods if not (pod.ended or pod.host_network))
-    pods = grouped(((pod.id.namespace, pod.node), pod) for pod in live_pods)
+    pods = group_by_key(((pod.id.namespace, pod.node), pod) for pod in live_pods)
     addresses: dict[str, tuple[str, ...]] = {}
     for proxy in observed.proxies:
         rosproxy = rosproxies.get(proxy.owner)
         if rosproxy is not None:
             selected = (
-                p for p in pods.get((rosproxy.id.namespace, proxy.on), ()) if selects(rosproxy, p)
+                p for p in pods.get((rosproxy.id.namespace, proxy.node), ()) if selects(rosproxy, p)
             )
             addresses[proxy.pod.uid] = tuple(
                 sorted({ip for pod in selected for ip in (pod.ip, *pod.ips) if ip})

@@ -2,8 +2,8 @@
 
 Wired is a pod whose containers have ROS_MASTER_URI, which leads to its RosProxy's Service and so to
 the proxy on its own node, and ROS_IP; for ROS 2 ROS_STATIC_PEERS leads there. `wire` is for the
-webhook, `unwired` (and for ROS 2 `ros2_pods`) for the planner, which finds pods that no webhook has
-seen.
+webhook, `wiring_finding` (and for ROS 2 `ros2_pods`) for the planner, which finds pods that no
+webhook has seen.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,7 +14,7 @@ import msgspec
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.kubernetes.resources.model import (
-    ELSEWHERE,
+    VALUE_AT_RUNTIME,
     ClusterFinding,
     Json,
     Name,
@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     service_id,
 )
 from rosproxy_operator.kubernetes.resources.objects import VARIABLE
-from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
+from rosproxy_operator.kubernetes.resources.values import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"
@@ -75,7 +75,7 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
 
     A pod in its node's own network must not be passed here: see `selection.chosen`.
     """
-    annotations = words(pod, "metadata", "annotations")
+    annotations = texts_at(pod, "metadata", "annotations")
     if MIRROR in annotations:
         warning = (
             "is a static pod, made from a file on its node, which can't be wired: set "
@@ -83,13 +83,13 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
             "run it as an ordinary pod"
         )
         return Wiring(warnings=(warning,))
-    spec = part(pod, "spec")
+    spec = submap(pod, "spec")
     wired: dict[str, Any] = {
-        kind: [_wired(container, target, annotations) for container in parts(spec, kind)]
+        kind: [_wired(container, target, annotations) for container in submaps(spec, kind)]
         for kind in _KINDS
         if spec.get(kind)
     }
-    aliases = _merged(parts(spec, "hostAliases"), host_aliases)
+    aliases = _merged(submaps(spec, "hostAliases"), host_aliases)
     if aliases:
         wired["hostAliases"] = aliases
     changed = any(spec.get(key) != value for key, value in wired.items())
@@ -101,7 +101,7 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
     return Wiring({**spec, **wired} if changed else None, new_annotations)
 
 
-def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | None:
+def wiring_finding(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | None:
     """What is wrong with a selected pod's ROS_MASTER_URI (reason NotWired); None if nothing is.
 
     ``cluster_ip`` is that of the RosProxy's Service.
@@ -115,7 +115,11 @@ def has_come_unwired(pod: Pod, cluster_ip: str) -> bool:
 
     A pod whose template sets ROS_MASTER_URI itself would not, nor would a pod without the label.
     """
-    return INJECT in pod.labels and not pod.own_masters and pod.wired != master_uri(cluster_ip)
+    return (
+        INJECT in pod.labels
+        and not pod.own_masters
+        and pod.wired_master_uri != master_uri(cluster_ip)
+    )
 
 
 def _wrong_master(pod: Pod, rosproxy_id: Name, cluster_ip: str) -> str:
@@ -125,17 +129,17 @@ def _wrong_master(pod: Pod, rosproxy_id: Name, cluster_ip: str) -> str:
             f"sets ROS_MASTER_URI={clean(foreign[0])[:200]} itself, which is not its proxy: take "
             "the variable out of its template, then create the pod anew"
         )
-    if pod.wired and pod.wired != master_uri(cluster_ip):
+    if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
         return (
-            f"was wired to {clean(pod.wired)[:200]}, but its proxy is at {master_uri(cluster_ip)} "
-            "now: create the pod anew"
+            f"was wired to {clean(pod.wired_master_uri)[:200]}, but its proxy is at "
+            f"{master_uri(cluster_ip)} now: create the pod anew"
         )
-    if pod.wired or pod.own_masters:
+    if pod.wired_master_uri or pod.own_masters:
         return ""
-    return never_told("ROS_MASTER_URI", pod, rosproxy_id)
+    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy_id)
 
 
-def never_told(variable: str, pod: Pod, rosproxy_id: Name) -> str:
+def missing_variable_text(variable: str, pod: Pod, rosproxy_id: Name) -> str:
     """Why a pod has not got a variable of its proxy, and what to do about it."""
     text = f"has no {variable} of its proxy"
     if INJECT not in pod.labels:
@@ -147,7 +151,7 @@ def never_told(variable: str, pod: Pod, rosproxy_id: Name) -> str:
 
 def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name."""
-    if uri == ELSEWHERE:
+    if uri == VALUE_AT_RUNTIME:
         return True
     master, service = parse_slave_uri(uri.strip()), service_id(rosproxy_id)
     if master is None or master.port != MASTER_PORT:
@@ -166,8 +170,8 @@ def _addresses(target: Target) -> list[tuple[str, str, str]]:
 
 
 def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> Json:
-    variables = list(parts(container, "env"))
-    names = {word(v, "name") for v in variables}
+    variables = list(submaps(container, "env"))
+    names = {text_at(v, "name") for v in variables}
     added: list[Json] = []
     for annotation, name, value in _addresses(target):
         former = annotations.get(annotation)
@@ -187,8 +191,8 @@ def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> J
 
 def _value(container: Json, name: str) -> str:
     """A variable of a container; of several that count it is the last."""
-    env = parts(container, "env")
-    return next((word(v, "value") for v in reversed(env) if v.get("name") == name), "")
+    env = submaps(container, "env")
+    return next((text_at(v, "value") for v in reversed(env) if v.get("name") == name), "")
 
 
 def _merged(own: Iterable[Json], added: Iterable[Json]) -> list[Json]:

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.ros2 import is_dds
-from rosproxy_operator.kubernetes.planner.pods.injection import never_told
+from rosproxy_operator.kubernetes.planner.pods.injection import missing_variable_text
 from rosproxy_operator.kubernetes.resources.model import (
-    ELSEWHERE,
+    VALUE_AT_RUNTIME,
     ClusterFinding,
     Pod,
     PodContainer,
@@ -28,7 +28,7 @@ _RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
 """Values of ROS_AUTOMATIC_DISCOVERY_RANGE with which static peers are not used."""
 
 
-def unmet(pod: Pod, rosproxy: RosProxy, address: str) -> Iterator[ClusterFinding]:
+def ros2_findings(pod: Pod, rosproxy: RosProxy, address: str) -> Iterator[ClusterFinding]:
     """What is wrong with a pod's variables; ``address`` is that of the RosProxy's Service."""
     if rosproxy.spec.ros2 is None:
         return
@@ -50,7 +50,7 @@ def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str) -> str:
         )
     if pod.static_peers or any("ROS_STATIC_PEERS" in c.variables for c in pod.containers):
         return ""
-    return never_told("ROS_STATIC_PEERS", pod, rosproxy.id)
+    return missing_variable_text("ROS_STATIC_PEERS", pod, rosproxy.id)
 
 
 def _problems(
@@ -63,11 +63,15 @@ def _problems(
         text = f"sets RMW_IMPLEMENTATION={_shown(rmw)}, which is no DDS and can't be proxied"
         yield "NoDds", f"{text}: use rmw_fastrtps_cpp or rmw_cyclonedds_cpp"
     peers = get("ROS_STATIC_PEERS")
-    if peers is not None and peers != ELSEWHERE and not _names_service(peers, rosproxy, address):
+    if (
+        peers is not None
+        and peers != VALUE_AT_RUNTIME
+        and not _names_service(peers, rosproxy, address)
+    ):
         text = f"sets ROS_STATIC_PEERS={_shown(peers)} itself, without its proxy"
         yield "NotWired", f"{text}: take the variable out of its template, or add {address} to it"
     domain, number = get("ROS_DOMAIN_ID"), rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
-    if domain not in (None, ELSEWHERE) and str(domain).strip() not in (str(number), ""):
+    if domain not in (None, VALUE_AT_RUNTIME) and str(domain).strip() not in (str(number), ""):
         text = (
             f"sets ROS_DOMAIN_ID={_shown(str(domain))}, "
             f"but RosProxy {rosproxy.id.name} is for domain"

@@ -12,7 +12,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
-OFF = ("", "false")
+LABEL_OFF_VALUES = ("", "false")
 """Values of the label with which a pod is left alone, whatever a podSelector says."""
 _ANY = "true"
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
@@ -33,7 +33,7 @@ def own_values(name: str) -> tuple[str, str]:
     return _ANY, name
 
 
-def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
+def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
     """The RosProxy of a pod, of those of any namespace that are not being deleted.
 
     Of several it is the one that the pod's label names. A finding (reason Ambiguous or HostNetwork)
@@ -60,14 +60,14 @@ def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFindin
     return rosproxy
 
 
-def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
+def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     """Why no RosProxy takes a pod that is labelled, for a warning at admission.
 
     Empty if the pod is not labelled, or its label says that it is to be left alone.
     """
     label = pod.labels.get(INJECT, "")
     names = sorted(r.id.name for r in rosproxies if r.id.namespace == pod.id.namespace)
-    if label in OFF:
+    if label in LABEL_OFF_VALUES:
         return ""
     lost = "its ROS nodes are not reachable from outside"
     if not names:
@@ -95,7 +95,7 @@ def selects(rosproxy: RosProxy, pod: Pod) -> bool:
     """Whether a RosProxy that is not being deleted selects a pod, perhaps along with others."""
     label, selector = pod.labels.get(INJECT), rosproxy.spec.pod_selector
     same_namespace = rosproxy.id.namespace == pod.id.namespace
-    if not same_namespace or rosproxy.deleting or label in OFF or _is_ours(pod.labels):
+    if not same_namespace or rosproxy.deleting or label in LABEL_OFF_VALUES or _is_ours(pod.labels):
         return False
     if selector is None:
         return label in own_values(rosproxy.id.name)

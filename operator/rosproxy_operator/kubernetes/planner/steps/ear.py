@@ -12,8 +12,8 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.ros2 import EAR_COMMAND, ear_variables
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateEar, DeleteEar
 from rosproxy_operator.kubernetes.planner.manifests import (
-    NOBODY,
-    Site,
+    POD_SECURITY_CONTEXT,
+    ProxySite,
     bound_to,
     fingerprint_of,
     fingerprinted,
@@ -22,7 +22,7 @@ from rosproxy_operator.kubernetes.planner.manifests import (
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext, site_of
-from rosproxy_operator.kubernetes.planner.view import grouped
+from rosproxy_operator.kubernetes.planner.view import group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import EarPod
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, ProxyPlace, RosProxy
 from rosproxy_operator.kubernetes.resources.names import EAR, NODE, ear_id
@@ -33,7 +33,7 @@ _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"me
 """An ear has 30 MiB and one thread."""
 
 
-def ear_pod(site: Site, ear: HostPort, proxy_address: str, settings: ClusterSettings) -> Json:
+def ear_pod(site: ProxySite, ear: HostPort, proxy_address: str, settings: ClusterSettings) -> Json:
     """The pod of an ear that listens at ``ear``, for the proxy at ``proxy_address``."""
     rosproxy, ros2 = site.rosproxy, site.rosproxy.spec.ros2
     annotations = {NODE: site.node.name}
@@ -61,7 +61,7 @@ def ear_pod(site: Site, ear: HostPort, proxy_address: str, settings: ClusterSett
         **bound_to(site.node.name, rosproxy.spec),
         "hostNetwork": True,
         "terminationGracePeriodSeconds": 1,
-        "securityContext": dict(NOBODY),
+        "securityContext": dict(POD_SECURITY_CONTEXT),
         "containers": [container],
     }
     return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
@@ -73,7 +73,9 @@ def reconcile_ears(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Acti
     The ear of a proxy that is just being made anew stays until the proxy has another address.
     """
     places = {*context.view.places.get(rosproxy.id, ())}
-    ears_by_node = grouped((e.on, e) for e in context.observed.ears if e.owner == rosproxy.uid)
+    ears_by_node = group_by_key(
+        (e.node, e) for e in context.observed.ears if e.owner == rosproxy.uid
+    )
     for node_name in sorted({*ears_by_node, *(place.node for place in places)}):
         place = ProxyPlace(rosproxy.id, node_name)
         ears, node = ears_by_node.get(node_name, ()), context.observed.nodes.get(node_name)
@@ -89,7 +91,7 @@ def ear_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Cluste
     """Where a RosProxy's proxy can't have an ear though it ought to."""
     for place in context.view.places.get(rosproxy.id, ()) if rosproxy.spec.multicast else ():
         site = site_of(context, place) if place in context.view.wanted else None
-        if isinstance(site, Site) and site.ear is None:
+        if isinstance(site, ProxySite) and site.ear is None:
             text = (
                 f"node {place.node} has no IPv4 address of type InternalIP, so its LAN is not "
                 "heard: name who is outside in spec.peers, and take spec.multicast off"
@@ -103,18 +105,18 @@ def _ensure_ear(
     current, wanted = context.view.current.get(place), place in context.view.wanted
     site = site_of(context, place) if wanted else None
     address = current.pod.ip if current is not None and not current.pod.ended else ""
-    if not isinstance(site, Site) or site.ear is None or not address:
+    if not isinstance(site, ProxySite) or site.ear is None or not address:
         return
     body = ear_pod(site, site.ear, address, context.settings)
     expected, id = fingerprint_of(body), ear_id(place.of, place.node)
     outdated = [ear for ear in ears if ear.fingerprint != expected or ear.pod.ended]
     yield from _delete_ears(context, outdated, "made anew: its proxy or its settings have changed")
-    if not ears and context.retries.ask(Task(place.of, "create", id)):
+    if not ears and context.retries.is_due(Task(place.of, "create", id)):
         yield CreateEar(place.of, body)
 
 
 def _delete_ears(context: ClusterContext, ears: Iterable[EarPod], why: str) -> Iterator[Action]:
     for ear in ears:
         task = Task(ear.of, "delete", ear.pod.id, ear.pod.uid)
-        if not ear.pod.deleting and context.retries.ask(task):
+        if not ear.pod.deleting and context.retries.is_due(task):
             yield DeleteEar(ear.of, ear.pod.id, ear.pod.uid, why)

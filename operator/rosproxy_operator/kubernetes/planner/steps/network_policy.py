@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetPolicy,
 )
 from rosproxy_operator.kubernetes.planner.manifests import metadata
-from rosproxy_operator.kubernetes.planner.pods.selection import OFF, own_values
+from rosproxy_operator.kubernetes.planner.pods.selection import LABEL_OFF_VALUES, own_values
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPolicy
@@ -90,7 +90,7 @@ def wanted_policies(rosproxy: RosProxy, settings: ClusterSettings) -> dict[Name,
 
 def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """Make, mend or remove the NetworkPolicies of a RosProxy."""
-    if context.observed.no_policies:
+    if context.observed.policies_error:
         return
     wanted = wanted_policies(rosproxy, context.settings)
     existing = {name: p for name, p in context.observed.policies.items() if p.of == rosproxy.id}
@@ -108,7 +108,7 @@ def _keep(
     context: ClusterContext, rosproxy: RosProxy, body: Json, current: ProxyPolicy | None
 ) -> Iterator[Action]:
     """Make a policy that is not there, or mend the one that is."""
-    name, ask = name_of(body["metadata"]), context.retries.ask
+    name, ask = name_of(body["metadata"]), context.retries.is_due
     if current is None:
         if ask(Task(rosproxy.id, "create policy", name)):
             yield CreatePolicy(rosproxy.id, body)
@@ -128,7 +128,7 @@ def reconcile_orphaned_policies(context: ClusterContext) -> Iterator[Action]:
 
 def _delete(context: ClusterContext, current: ProxyPolicy, why: str) -> Iterator[Action]:
     task = Task(current.of, "delete policy", current.id, current.uid)
-    if not current.deleting and context.retries.ask(task):
+    if not current.deleting and context.retries.is_due(task):
         yield DeletePolicy(current.of, current.id, current.uid, why)
 
 
@@ -202,6 +202,6 @@ def _pod_selector(rosproxy: RosProxy) -> Json:
         {"key": key, "operator": operator, **({"values": sorted(values)} if values else {})}
         for key, operator, values in selector.expressions
     ]
-    off = {"key": INJECT, "operator": "NotIn", "values": sorted(OFF)}
+    off = {"key": INJECT, "operator": "NotIn", "values": sorted(LABEL_OFF_VALUES)}
     labels = {"matchLabels": dict(selector.labels)} if selector.labels else {}
     return {**labels, "matchExpressions": [*expressions, off]}

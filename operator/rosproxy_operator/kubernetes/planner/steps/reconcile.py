@@ -26,7 +26,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
-from rosproxy_operator.kubernetes.planner.manifests import Site
+from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.view import View, serves
@@ -64,7 +64,7 @@ class ClusterContext(msgspec.Struct, frozen=True):
     ranges: ClusterRanges
     retries: Retries
     now: float
-    sites: dict[ProxyPlace, Site | Obstacle] = {}
+    sites: dict[ProxyPlace, ProxySite | Obstacle] = {}
 
     @property
     def observed(self) -> ClusterSnapshot:
@@ -114,14 +114,14 @@ def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
     )
 
 
-def site_of(context: ClusterContext, place: ProxyPlace) -> Site | Obstacle:
+def site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
     """The proxy that a place is to have where pods want one, or why it can't."""
     if place not in context.sites:
         context.sites[place] = _site_of(context, place)
     return context.sites[place]
 
 
-def _site_of(context: ClusterContext, place: ProxyPlace) -> Site | Obstacle:
+def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
     rosproxy, node = context.view.rosproxies[place.of], context.observed.nodes[place.node]
     if not node.ready:
         text = "is not ready: nothing is changed there until it is: kubectl describe node"
@@ -138,14 +138,14 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> Site | Obstacle:
     if place in context.ranges.exhausted:
         return Obstacle("PortsExhausted", context.ranges.exhausted[place])
     name = proxy_id(place.of, place.node)
-    if name in context.view.others:
+    if name in context.view.other_pod_names:
         text = "is there already, and is not the operator's: delete or rename it"
         return Obstacle("NameTaken", f"a pod called {name} {text}")
     publish = master.publish if place in context.ranges.published else 0
     token = token_of(context.observed.key, name, node.name)
     ports, published = context.ranges.given[place], replace(master, publish=publish)
     token_hash = hash_token(token) if token else ""
-    return Site(rosproxy, node, host, ports, published, token_hash, peers_of(context, place))
+    return ProxySite(rosproxy, node, host, ports, published, token_hash, peers_of(context, place))
 
 
 def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
@@ -177,16 +177,16 @@ def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:
 
 def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """The Service of a RosProxy, made if it is not there, made anew if it is not right."""
-    pods = context.view.taken.get(rosproxy.id, ())
-    wired = (master.host for pod in pods if (master := parse_slave_uri(pod.wired)))
-    static_peers = (pod.static_peers for pod in pods if not pod.wired)
+    pods = context.view.selected_pods.get(rosproxy.id, ())
+    wired = (master.host for pod in pods if (master := parse_slave_uri(pod.wired_master_uri)))
+    static_peers = (pod.static_peers for pod in pods if not pod.wired_master_uri)
     hosts = Counter(host for host in (*wired, *static_peers) if is_address(host))
     # The address that its pods have been given already, if any.
     common = min(hosts, key=lambda host: (-hosts[host], host), default="")
     body = manifests.service(rosproxy, rosproxy.cluster_ip or common)
     service = context.observed.services.get(rosproxy.id)
     if service is None:
-        if context.retries.ask(Task(rosproxy.id, "create", service_id(rosproxy.id))):
+        if context.retries.is_due(Task(rosproxy.id, "create", service_id(rosproxy.id))):
             yield CreateService(rosproxy.id, body)
     elif service.owner != rosproxy.uid:
         yield from _delete_service(context, service, "it is that of a RosProxy that is gone")
@@ -197,7 +197,9 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
 def _delete_service(context: ClusterContext, service: ProxyService, why: str) -> Iterator[Action]:
     """Delete a Service, unless it is being deleted already."""
     name = service_id(service.of)
-    if not service.deleting and context.retries.ask(Task(service.of, "delete", name, service.uid)):
+    if not service.deleting and context.retries.is_due(
+        Task(service.of, "delete", name, service.uid)
+    ):
         yield DeleteService(service.of, name, service.uid, why)
 
 
@@ -244,7 +246,9 @@ def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> 
             yield from _delete_pod(context, proxy, why, retire=True)
 
 
-def _ensure(context: ClusterContext, place: ProxyPlace, site: Site, busy: bool) -> Iterator[Action]:
+def _ensure(
+    context: ClusterContext, place: ProxyPlace, site: ProxySite, busy: bool
+) -> Iterator[Action]:
     """The next action for a proxy that is wanted, and can be had as the site says."""
     name, current = proxy_id(place.of, place.node), context.view.current.get(place)
     misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
@@ -255,11 +259,13 @@ def _ensure(context: ClusterContext, place: ProxyPlace, site: Site, busy: bool) 
         _note_creation(context, place)
         if current is not None:  # else its pod is about to go
             yield from _update(context, current, site, busy)
-    elif context.retries.ask(_creation(place)):
+    elif context.retries.is_due(_creation(place)):
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
-def _update(context: ClusterContext, proxy: ProxyPod, site: Site, busy: bool) -> Iterator[Action]:
+def _update(
+    context: ClusterContext, proxy: ProxyPod, site: ProxySite, busy: bool
+) -> Iterator[Action]:
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
     task = Task(proxy.of, "image", proxy.pod.id, f"{proxy.pod.uid} {image}")
@@ -267,15 +273,15 @@ def _update(context: ClusterContext, proxy: ProxyPod, site: Site, busy: bool) ->
         yield from _delete_pod(context, proxy, f"it has ended: {proxy.message or proxy.pod.phase}")
     elif proxy.fingerprint != fingerprint:
         moved = proxy.range.first != site.ports.first
-        lost = moved or not manifests.finds_again(proxy.fingerprint, fingerprint)
+        lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
         diff = "its RosProxy, its node or the operator's options have changed"
         if proxy.range != site.ports:
             diff = f"its ports are to be {site.ports} instead of {proxy.range}"
         elif busy and serves(proxy) and not lost:
-            context.retries.later(IN_TURN)
+            context.retries.look_again_in(IN_TURN)
             return
         yield from _delete_pod(context, proxy, f"made anew: {diff}", retire=serves(proxy) and lost)
-    elif proxy.image != image and context.retries.ask(task):
+    elif proxy.image != image and context.retries.is_due(task):
         yield SetImage(proxy.of, proxy.pod.id, proxy.pod.uid, image)
 
 
@@ -286,10 +292,10 @@ def _delete_pod(
 
     One that is to be retired may be so: the garbage collector is quick.
     """
-    node = context.observed.nodes.get(proxy.on)
+    node = context.observed.nodes.get(proxy.node)
     runs = serves(proxy) and node is not None and node.ready
     useful = not proxy.pod.deleting or (retire and runs)
-    if useful and context.retries.ask(Task(proxy.of, "delete", proxy.pod.id, proxy.pod.uid)):
+    if useful and context.retries.is_due(Task(proxy.of, "delete", proxy.pod.id, proxy.pod.uid)):
         yield DeleteProxy(proxy.of, proxy.pod.id, proxy.pod.uid, why, retire)
 
 
@@ -297,7 +303,7 @@ def _note_creation(context: ClusterContext, place: ProxyPlace) -> None:
     """Keep count of how often a proxy was made, as long as it is not well."""
     current = context.view.current.get(place)
     if current is None or not serves(current):
-        context.retries.effect(_creation(place))
+        context.retries.note_effect(_creation(place))
 
 
 def _creation(place: ProxyPlace) -> Task:

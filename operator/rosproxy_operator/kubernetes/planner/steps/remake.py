@@ -16,7 +16,7 @@ from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext
 from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
 
-MAKERS = ("ReplicaSet", "ReplicationController", "StatefulSet", "DaemonSet")
+RECREATING_CONTROLLERS = ("ReplicaSet", "ReplicationController", "StatefulSet", "DaemonSet")
 """Kinds of controllers that make a pod anew. A Job would count its pod as failed."""
 
 
@@ -25,13 +25,13 @@ def remake_unwired(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Acti
     if not rosproxy.remakes:
         return
     task = Task(rosproxy.id, "remake", rosproxy.id)
-    context.retries.effect(task)  # the count is kept as long as this is asked for
+    context.retries.note_effect(task)  # the count is kept as long as this is asked for
     address = context.cluster_ip(rosproxy)
-    pods = context.view.taken.get(rosproxy.id, ())
+    pods = context.view.selected_pods.get(rosproxy.id, ())
     candidates = [pod for pod in pods if address and is_to_be_remade(pod, rosproxy, address)]
     selected = [pod for pod in context.observed.pods if not pod.ended and selects(rosproxy, pod)]
     busy = any(pod.deleting or pod.phase == "Pending" for pod in selected)
-    if candidates and not busy and context.retries.ask(task):
+    if candidates and not busy and context.retries.is_due(task):
         pod = min(candidates, key=lambda p: p.id)
         why = f"it is not wired to its proxy; its {pod.controller} makes it anew"
         yield EvictPod(rosproxy.id, pod.id, pod.uid, why)
@@ -42,5 +42,5 @@ def is_to_be_remade(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
 
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
-    makes_anew = pod.controller in MAKERS and not pod.deleting and not pod.ended
+    makes_anew = pod.controller in RECREATING_CONTROLLERS and not pod.deleting and not pod.ended
     return makes_anew and rosproxy.spec.ros1 and has_come_unwired(pod, cluster_ip)

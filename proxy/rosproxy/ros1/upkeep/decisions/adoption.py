@@ -21,7 +21,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
 from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.upkeep.decisions.registration import known_as
+from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 
 Container = tuple[str, Collection[str]]
 """A container on an inside network: its IP address there, and its host names in lower case."""
@@ -35,7 +35,7 @@ class DirectNode(msgspec.Struct, frozen=True):
 
     caller_id: str
     uri: str
-    places: tuple[HostPort, ...]
+    slaves: tuple[HostPort, ...]
     registrations: tuple[Registration, ...]
 
     @property
@@ -58,7 +58,9 @@ def find_direct(
         addresses = dict.fromkeys(a for a, names in containers if host in (a, *names))
         if addresses:
             slaves = tuple(HostPort(address, slave.port) for address in addresses)
-            direct_nodes.append(DirectNode(name, uri, slaves, tuple(graph.held.get(name, ()))))
+            direct_nodes.append(
+                DirectNode(name, uri, slaves, tuple(graph.registrations.get(name, ())))
+            )
     return direct_nodes
 
 
@@ -75,7 +77,7 @@ def locate(
     located: dict[HostPort, list[DirectNode]] = {}
     doubts: dict[str, str] = {}
     for node in nodes:
-        slaves = [s for s in node.places if s in infos and (node.caller_id, s) in verified]
+        slaves = [s for s in node.slaves if s in infos and (node.caller_id, s) in verified]
         scores = {slave: _score(node, infos[slave]) for slave in slaves}
         best = [slave for slave, score in scores.items() if score == max(scores.values())]
         if len(best) == 1:
@@ -98,8 +100,8 @@ def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool
     one of the same node, which registered around the proxy, or the advertised one again by now.
     """
     if uri is None:
-        return endpoint.direct
-    return uri == advertised or known_as(endpoint, uri)
+        return endpoint.has_registered_directly
+    return uri == advertised or is_known_as(endpoint, uri)
 
 
 def _score(node: DirectNode, info: NodeInfo) -> int:
@@ -109,10 +111,10 @@ def _score(node: DirectNode, info: NodeInfo) -> int:
 
 
 def _doubt(node: DirectNode, best: list[HostPort], infos: Mapping[HostPort, NodeInfo]) -> str:
-    slaves = ", ".join(map(str, node.places))
+    slaves = ", ".join(map(str, node.slaves))
     if best:
         reason = f"could be at {' and '.join(map(str, best))}; left alone"
-    elif any(slave in infos for slave in node.places):
+    elif any(slave in infos for slave in node.slaves):
         reason = f"the node at {slaves} is another"
     else:
         reason = f"no node answers at {slaves}"

@@ -27,8 +27,8 @@ def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> li
     return [
         e
         for e in endpoints
-        if (health := e.health).checked is None
-        or now - health.checked >= interval
+        if (health := e.health).checked_at is None
+        or now - health.checked_at >= interval
         or health.failures
         or health.cleaned
         or e.idle_since is not None
@@ -40,12 +40,18 @@ def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> li
 def may_be_kept(endpoint: Endpoint) -> bool:
     """Whether a node may be asked over a connection that is kept: nothing follows if it answers."""
     health = endpoint.health
-    return health.steady and endpoint.trusted and not (health.hangs_up or endpoint.direct)
+    return (
+        health.steady
+        and endpoint.trusted
+        and not (health.hangs_up or endpoint.has_registered_directly)
+    )
 
 
 def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
     """Whether it is time to probe a node; ``interval`` is that of idle nodes in seconds."""
-    return endpoint.health.due(now, min(interval, DIRECT_INTERVAL) if endpoint.direct else interval)
+    return endpoint.health.due(
+        now, min(interval, DIRECT_INTERVAL) if endpoint.has_registered_directly else interval
+    )
 
 
 def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
@@ -54,7 +60,7 @@ def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
     One that registered around the proxy has unregistered there as well, to no effect; so it
     keeps nothing once it has ended.
     """
-    if endpoint.direct and endpoint.health.refused:
+    if endpoint.has_registered_directly and endpoint.health.refused:
         after = min(after, NO_PATIENCE)
     return endpoint.health.clean_up(now, after)
 
@@ -62,10 +68,10 @@ def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
 def lease_lasts(endpoint: Endpoint, linger: float) -> float:
     """Seconds for which an unused lease lasts; a node that was just silent may come back."""
     health = endpoint.health
-    return FORGET_AFTER if health.cleaned and not (health.refused or health.over) else linger
+    return FORGET_AFTER if health.cleaned and not (health.refused or health.has_ended) else linger
 
 
-def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
+def dead_endpoints(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
     """Those of the endpoints at addresses that are gone whose node does not answer.
 
     Where one answers, the address is in use again, or the event was late. One that is silent but
@@ -94,7 +100,7 @@ def movable(
     }
 
 
-def new_place(endpoint: Endpoint, address: str) -> NodeLocation:
+def moved_location(endpoint: Endpoint, address: str) -> NodeLocation:
     """Where a node is that has moved to another address.
 
     Neighbours are sent through the proxy from now on, even if the node's host name leads there:

@@ -2,8 +2,8 @@
 
 The advertised URIs at the master tell the ports, and what the proxy remembers where their nodes
 are; those of former versions carry that in their path. Anybody can write both to the master, so
-what is found there is only a claim. Where several claim one port, or one node, the one
-that its node bears out best is kept (`settle`); the node of one that is kept is asked before it is
+what is found there is only a claim. Where several claim one port, or one node, the one that its
+node bears out best is kept (`choose_claims`); the node of one that is kept is asked before it is
 served (`confirmed_by`).
 """
 
@@ -16,7 +16,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_inside_path, slave_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
-from rosproxy.ros1.registry.memory import Remembered
+from rosproxy.ros1.registry.memory import RememberedLease
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
@@ -30,14 +30,14 @@ class Claim:
 
     ``node`` is the host and port that the node calls itself, ``path`` its URI's, ``slave`` where to
     look for it, ``advertised`` the URI that the master has.
-    ``said`` is what it says of itself; None if it was not asked or gave no answer.
+    ``node_info`` is what it says of itself; None if it was not asked or gave no answer.
     """
 
     port: int
     node: HostPort
     slave: HostPort
     registrations: list[Registration] = field(default_factory=list)
-    said: NodeInfo | None = None
+    node_info: NodeInfo | None = None
     advertised: str = ""
     path: str = "/"
     service_ports: tuple[int, ...] = ()
@@ -53,8 +53,8 @@ class Claim:
         return slave_uri(self.node, self.path)
 
 
-def claims(
-    graph: Graph, addressing: Addressing, memory: Mapping[int, Remembered]
+def find_claims(
+    graph: Graph, addressing: Addressing, memory: Mapping[int, RememberedLease]
 ) -> tuple[list[Claim], dict[str, list[Registration]]]:
     """The endpoints of this proxy among the nodes of a master, by what it remembers of each port.
 
@@ -65,7 +65,7 @@ def claims(
         port = addressing.lease_of(uri)
         if port is None:
             continue
-        lease, registrations = memory.get(port), graph.held.get(node, [])
+        lease, registrations = memory.get(port), graph.registrations.get(node, [])
         inside = parse_inside_path(uri) or (lease.node if lease else None)
         if inside is None:
             forgotten.setdefault(uri, []).extend(registrations)
@@ -76,20 +76,20 @@ def claims(
     return list(claims_by_uri.values()), forgotten
 
 
-def contested(candidates: Sequence[Claim]) -> list[Claim]:
+def contested_claims(candidates: Sequence[Claim]) -> list[Claim]:
     """The claims that share their port or their inside address with another."""
     ports, slaves = Counter(c.port for c in candidates), Counter(c.slave for c in candidates)
     return [claim for claim in candidates if ports[claim.port] > 1 or slaves[claim.slave] > 1]
 
 
-def settle(candidates: Sequence[Claim]) -> list[Claim]:
+def choose_claims(candidates: Sequence[Claim]) -> list[Claim]:
     """One claim per port and inside address: the one that its node bears out best."""
 
     def merit(claim: Claim) -> tuple[int, int]:
         count = len(claim.registrations)
-        if claim.said is None:
+        if claim.node_info is None:
             return NO_MERIT, count
-        counts = Counter(claim.said.has(topic) for topic in claim.topics)
+        counts = Counter(claim.node_info.has(topic) for topic in claim.topics)
         return counts[True] - counts[False], count
 
     claims_by_port: dict[int, Claim] = {}
@@ -126,13 +126,17 @@ def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registratio
     return registrations_by_name
 
 
-def others(registrations: Iterable[Registration], info: NodeInfo) -> list[Registration]:
+def unconfirmed_registrations(
+    registrations: Iterable[Registration], info: NodeInfo
+) -> list[Registration]:
     """The registrations of names that a node does not bear out by what it says of itself."""
     groups = by_name(registrations).values()
     return [r for group in groups if confirmed_by(group, info) is False for r in group]
 
 
-def to_ask(registrations: Iterable[Registration]) -> tuple[list[str], list[Registration]]:
+def topics_and_services_to_ask(
+    registrations: Iterable[Registration],
+) -> tuple[list[str], list[Registration]]:
     """The topics and services by which a node can show that it is the one that registered them.
 
     It is asked for a few at most, everybody's /rosout last.

@@ -61,7 +61,7 @@ def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegis
     return list(topics.values())
 
 
-def known_as(endpoint: Endpoint, uri: str) -> bool:
+def is_known_as(endpoint: Endpoint, uri: str) -> bool:
     """Whether a URI at the master is a former one of this endpoint, or its node's own.
 
     A loopback address does not count: it is every node's own.
@@ -110,7 +110,9 @@ def read_release(
     return [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in ended], known_uris
 
 
-def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
+def left_over_registrations(
+    endpoint: Endpoint, info: NodeInfo, before: float
+) -> list[Registration]:
     """Which of an endpoint's registrations a process that is gone has left behind.
 
     A topic is left behind if the node says that it does not have it; all of a node name is, if
@@ -125,7 +127,7 @@ def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registr
         return is_conclusive and info.holds(registration) is not False
 
     live_names = {r.caller_id for r in registrations if r is newest or may_hold(r)}
-    gone = vanished(endpoint, info, before)
+    gone = vanished_topics(endpoint, info, before)
     return [
         r
         for r in registrations
@@ -133,7 +135,7 @@ def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registr
     ]
 
 
-def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
+def vanished_topics(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
     """The topics registered before a time that the node says it does not have.
 
     A node that registers around the proxy unregisters there too, where its URI means nothing.
@@ -142,7 +144,9 @@ def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registra
     return [r for r in registrations if info.holds(r) is False and r.since < before]
 
 
-def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[Registration]:
+def valid_registrations(
+    endpoint: Endpoint, info: NodeInfo, same_process: bool
+) -> list[Registration]:
     """Which of an endpoint's registrations hold for a node that has come back.
 
     A topic does unless the node says that it does not have it; services and parameters, which it
@@ -156,7 +160,7 @@ def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[R
     return kept + [r for r in registrations if r.kind not in TOPIC_KINDS]
 
 
-def unregistered(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
+def unregistered_topics(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
     """The topics that a node has, with their types, and the master does not know of.
 
     rospy gives up a registration for which it found no master. Of a slave API that several
@@ -173,7 +177,7 @@ def unregistered(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
     ]
 
 
-def lost(
+def lost_registrations(
     ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
 ) -> list[Registration]:
     """Which of our registrations the master no longer has.

@@ -51,7 +51,7 @@ def subscriptions(
         location = endpoint.location
         uses_own_uri = location.named and not location.stale
         networks = _networks_of(location.address, addressing) if uses_own_uri else frozenset()
-        for topic in dict.fromkeys(endpoint.shown(Kind.PUBLISHER)):
+        for topic in dict.fromkeys(endpoint.names_at_master(Kind.PUBLISHER)):
             topics.setdefault(topic, {}).setdefault(networks, []).append(endpoint)
     distant: list[TopicSubscription] = []
     for node, registrations in registrations_by_node.items():
