@@ -239,10 +239,13 @@ class World:
             assert there is not None
             assert there.spec == policy(one, SETTINGS)["spec"]
         self.check_addresses(unready)
-        self.check_ears(unready)
+        self.check_ears(found, unready)
 
-    def check_ears(self, unready: set[str]) -> None:
-        """Each proxy that hears the LAN has an ear, which knows its address; nobody else has."""
+    def check_ears(self, found: ClusterPlan, unready: set[str]) -> None:
+        """Each proxy that hears the LAN has an ear, which knows its address; nobody else has.
+
+        A proxy stays as it was where an obstacle is told of, and gets no ear before that is gone.
+        """
         there = {}
         for pod in self.own():
             if ear := objects.ear_pod(pod):
@@ -254,7 +257,7 @@ class World:
                 wanted[ProxyPlace(proxy.of, proxy.node)] = proxy
         assert {p for p in there if p.node not in unready} <= wanted.keys()
         for place, proxy in wanted.items():
-            if place.node in unready or not proxy.pod.ip:
+            if place.node in unready or not proxy.pod.ip or self.obstacles(found, place):
                 continue
             env = {one["name"]: one["value"] for one in container_of(there[place][0])["env"]}
             assert env["ROSPROXY_EAR_PROXY"] == f"{proxy.pod.ip}:{proxy.range.first}"
