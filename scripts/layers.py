@@ -191,7 +191,11 @@ LAYERS = (
 
 BESIDE_PREPARATION = (UNIT,)
 ALONE_FIRST = (INTEGRATION,)
-LONGEST = (DOCKER_ENGINE, CLUSTER)
-SIDE_BY_SIDE = (ROS_NODES, IMAGE, ROS2_NODES, ISOLATED, ROS1_CLIENTS, BROWSER, CHART)
+ON_THE_ENGINE = (DOCKER_ENGINE, IMAGE, CLUSTER)
+SIDE_BY_SIDE = (ROS_NODES, ROS2_NODES, ISOLATED, ROS1_CLIENTS, BROWSER, CHART)
 ALONE_LAST = (ABUSE, ROS2_CLUSTER)
-"""When which layers run, in this order; LONGEST and SIDE_BY_SIDE begin together."""
+"""When which layers run, in this order; ON_THE_ENGINE and SIDE_BY_SIDE begin together.
+
+Layers on the one Docker engine take turns: an operator with `--expose-by-default` takes over
+whatever containers run there.
+"""

@@ -10,8 +10,8 @@ How it works (`layers` says which there are):
      their work is done already. Beside it the unit tests, which mind nobody.
   2. The integration tests, alone: they count in tenths of seconds.
   3. Layers with real nodes, engines and browsers, two side by side; three were at a load of 30 to
-     55 on two processors, where what takes a second takes a minute. Docker begins and is followed
-     by Kubernetes: they are the longest, and mostly wait.
+     55 on two processors, where what takes a second takes a minute. Those with a Docker engine are
+     one side, and take turns: they share it, are the longest, and mostly wait.
   4. Alone: those with bad neighbours, which hold how long an answer may take, and ROS 2 in a
      cluster. There two dozen participants meet anew each time when a proxy's pod is replaced, for
      which Fast DDS takes all of two processors for seconds, and minutes beside others.
@@ -93,7 +93,7 @@ class Run:
         rest = deque(layers.SIDE_BY_SIDE)
         with ThreadPoolExecutor() as pool:
             lanes = [
-                pool.submit(self._some, deque(layers.LONGEST), rest),
+                pool.submit(self._some, deque(layers.ON_THE_ENGINE), rest),
                 pool.submit(self._some, rest),
             ]
         outcomes += [outcome for lane in lanes for outcome in lane.result()]

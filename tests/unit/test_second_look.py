@@ -98,13 +98,17 @@ def test_a_run_in_which_all_fails_ends_soon() -> None:
 
 def test_each_layer_runs_once_and_what_is_pure_has_no_second_look() -> None:
     phases = (
-        *(layers.BESIDE_PREPARATION, layers.ALONE_FIRST, layers.LONGEST),
+        *(layers.BESIDE_PREPARATION, layers.ALONE_FIRST, layers.ON_THE_ENGINE),
         *(layers.SIDE_BY_SIDE, layers.ALONE_LAST),
     )
     assert sorted(layer.name for phase in phases for layer in phase) == sorted(
         layer.name for layer in LAYERS
     )
     assert {layer.name for layer in LAYERS if not layer.second_look} == {"unit", "chart"}
+
+
+def test_layers_on_the_one_docker_engine_take_turns() -> None:
+    assert not [layer.name for layer in layers.SIDE_BY_SIDE if layers.ENGINE in layer.setup]
 
 
 def test_the_gate_is_the_short_one() -> None:
