@@ -71,6 +71,12 @@ class Proxy:
         found = inspect(self.sandbox)
         return set(found["NetworkSettings"]["Networks"][network]["Aliases"]) - {found["Id"][:12]}
 
+    def flowing(self) -> set[str]:
+        """Of which topics and services something has gone out through it, on connections it has."""
+        status = json.loads(docker("exec", self.name, "rosproxy", "status", "--json", check=False))
+        links = [link for node in status["nodes"] for link in node["connections"]]
+        return {link["name"] for link in links if link["sent"]}
+
     def address(self, network: str) -> str:
         return str(inspect(self.sandbox)["NetworkSettings"]["Networks"][network]["IPAddress"])
 

@@ -123,6 +123,9 @@ def test_container_moves_to_another_network(
     ear = named.node("ear", library, "sub", "--topic", "/out")
     try:
         ear.wait_for("inside")
+        # rospy's one thread that accepts connections reads each one's header, without a time-out:
+        # a connection cut before its header came leaves the node deaf for good.
+        wait_until(lambda: proxy.flowing() == {"/out", "/rosout"}, 60, "both topics flow")
 
         docker("network", "disconnect", old, node.name)
         docker("network", "connect", new, node.name)
