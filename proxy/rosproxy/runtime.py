@@ -5,7 +5,6 @@ Made once, before the parts.
 
 import asyncio
 import uuid
-from collections.abc import Collection
 
 from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.net.tasks import Tasks
@@ -19,14 +18,14 @@ class Runtime:
     """The tools of one proxy; needs a running event loop.
 
     ``instance`` is a random name of this process. ``refusals`` tells what is over some bound;
-    ``policy``: what outside may see and do. ``known_methods`` are those that metrics name.
+    ``policy``: what outside may see and do.
     """
 
-    def __init__(self, settings: Settings, known_methods: Collection[str] = ()) -> None:
+    def __init__(self, settings: Settings) -> None:
         self.settings, self.instance = settings, uuid.uuid4().hex
         self._loop = asyncio.get_running_loop()
         self._started = self.now()
-        self.metrics, self.tasks, self.problems = Metrics(known_methods), Tasks(), Problems()
+        self.metrics, self.tasks, self.problems = Metrics(), Tasks(), Problems()
         self.refusals = Refusals(self.metrics, self.problems, self.now)
         self.policy = AccessPolicy(
             settings.policy, settings.policy_layers, self.metrics, self.refusals

@@ -104,7 +104,7 @@ async def make_proxy(
 
     They are stopped before the nodes: a node can't close connections that are just being made.
     """
-    monkeypatch.setattr("rosproxy.app.ros1.PROBE_TICK", 0.03)
+    monkeypatch.setattr("rosproxy.ros1.stack.PROBE_TICK", 0.03)
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:

@@ -7,10 +7,10 @@ from typing import Any
 from examples.demo.fake_http import Where, free_ports, where
 from examples.demo.fake_node import FakeNode
 from rosproxy.app.proxy import App
-from rosproxy.app.ros1 import Ros1
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.stack import Ros1
 from rosproxy.settings import Settings
 from tests.integration.net import HOST, PATIENCE, PROXY, refuses, until
 from tests.run_options import parse_settings
@@ -67,8 +67,7 @@ class Proxy:
     @property
     def ros1(self) -> Ros1:
         """Its part for ROS 1."""
-        assert self.app.ros1
-        return self.app.ros1
+        return next(stack for stack in self.app.stacks if isinstance(stack, Ros1))
 
     async def start(self) -> None:
         """Begin."""

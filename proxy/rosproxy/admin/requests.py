@@ -116,6 +116,14 @@ class PolicyNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     layers: tuple[WrittenLayer, ...]
 
 
+class EnforcementCounts(msgspec.Struct, frozen=True):
+    """What a change of the policy led to: registrations hidden and shown, connections cut."""
+
+    hidden: int = 0
+    shown: int = 0
+    cut: int = 0
+
+
 class PortProbe(msgspec.Struct, frozen=True):
     """How a port of the range was reached, by the proxy itself and by the master.
 

@@ -27,9 +27,8 @@ from rosproxy.admin.requests import BodyError
 from rosproxy.admin.status_changes import StatusChanges, TooManyWaiting
 from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.net.http_client import TooLong, read_bounded
+from rosproxy.net.http_client import CallFailed, TooLong, read_bounded
 from rosproxy.net.sockets import BACKLOG, end_if_stalled
-from rosproxy.ros1.clients.master import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +48,7 @@ FORBIDDEN = (
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 Action = Callable[[Any], Awaitable[dict[str, Any]]]
-"""Does what a POST asks for, given its JSON body. Raises BodyError, Unreachable, MasterError."""
+"""Does what a POST asks for, given its JSON body. Raises BodyError, CallFailed."""
 
 
 @dataclass(slots=True, eq=False)
@@ -158,7 +157,7 @@ class AdminServer:
             return web.json_response(await self._actions[request.path](body))
         except BodyError as error:
             return web.Response(status=400, text=f"rosproxy: {error}\n")
-        except (Unreachable, MasterError) as error:
+        except CallFailed as error:
             log.warning("POST %s could not be carried out: %s", request.path, error)
             return web.Response(status=503, text=f"rosproxy: {error}; try again\n")
 

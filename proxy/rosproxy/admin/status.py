@@ -1,247 +1,71 @@
-"""The state of a running proxy: as the document that ``/status`` serves, and as metrics."""
+"""What ``/status`` tells of any proxy; each version of ROS adds what it knows."""
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-
-import msgspec
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from collections.abc import Sequence
 
 from rosproxy import __version__
-from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.admin import status_document as document
-from rosproxy.admin.status_bounds import bounded, first_hidden
-from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.relay import Relay
-from rosproxy.leases import fast_ports
-from rosproxy.net import signs
-from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import STATES, Endpoint
-from rosproxy.ros1.rewriting.policing import KINDS
-from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.standins.ports import StandInPorts
-from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.telemetry.metrics import NamedNodes
+from rosproxy.admin.status_bounds import first_hidden
+from rosproxy.admin.status_document import (
+    HiddenStatus,
+    LayerStatus,
+    PolicyStatus,
+    PortsStatus,
+    ProblemStatus,
+    ProxyStatus,
+    StatusSettings,
+)
+from rosproxy.runtime import Runtime
 from rosproxy.telemetry.problems import Problems
 
 
-@dataclass(eq=False)
-class ProxyState(Collector):
-    """What there is to tell of a proxy, read when somebody asks."""
-
-    _context: Context
-    _monitor: MasterMonitor
-    _tcpros: TcprosServer
-    _stand_ins: StandInPorts
-    _plane: KernelPlane
-    _down: NamedNodes = field(default_factory=NamedNodes)
-
-    def status(self) -> document.ProxyStatus:
-        """Everything that ``rosproxy status`` and ``rosproxy doctor`` show, within bounds."""
-        context = self._context
-        relays: dict[int, list[Relay]] = {}
-        for relay in self._tcpros.relays:
-            relays.setdefault(relay.port, []).append(relay)
-        endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
-        whole = document.ProxyStatus(
-            version=__version__,
-            pid=os.getpid(),
-            instance=context.instance,
-            retired=context.retired,
-            uptime=round(context.uptime(), 1),
-            settings=self._settings(),
-            master=self._master(),
-            ports=self._ports(),
-            data_plane=msgspec.convert(self._plane.status(), document.DataPlaneStatus),
-            udpros=tuple(
-                document.UdprosStatus(
-                    subscription.topic,
-                    subscription.caller_id,
-                    subscription.peer,
-                    relay.port,
-                    subscription.inside_asks,
-                    relay.sent,
-                    relay.dropped,
-                )
-                for subscription, relay in self._stand_ins.udpros
-            ),
-            stand_ins=msgspec.convert(self._stand_ins.status(), tuple[document.StandInStatus, ...]),
-            policy=self._policy(),
-            nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
-            problems=problem_statuses(context.problems),
-        )
-        return bounded(whole)
-
-    def collect(self) -> Iterable[Metric]:
-        """The state as metrics: gauges, and counters of bytes."""
-        for name, text, value in self._numbers():
-            yield GaugeMetricFamily(f"rosproxy_{name}", text, value=value)
-        if self._context.selected is not None:
-            text = "Addresses that may use the proxy as their master."
-            count = len(self._context.selected)
-            yield GaugeMetricFamily("rosproxy_selected_addresses", text, value=count)
-        states = [endpoint.state for endpoint in self._context.registry]
-        by_state = GaugeMetricFamily(
-            "rosproxy_endpoints", "Inside nodes by state.", labels=["state"]
-        )
-        for state in STATES:
-            by_state.add_metric([state], states.count(state))
-        yield by_state
-        yield self._nodes_down()
-        yield from self._bytes()
-
-    def _numbers(self) -> Iterator[tuple[str, str, float]]:
-        """Name, meaning and value of each gauge without labels."""
-        context, endpoints = self._context, self._context.registry
-        pool, buffered = endpoints.pool, context.buffered
-        yield "leases_used", "Ports held by inside nodes.", len(endpoints)
-        yield "leases_free", "Ports left for inside nodes.", fast_ports.ports_left(pool, endpoints)
-        text = "Of the ports left, those that serve topics meanwhile."
-        yield "fast_ports", text, fast_ports.fast_port_count(endpoints)
-        yield "leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)
-        yield "open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)
-        text = "Ports that stand in for nodes outside."
-        yield "stand_ins", text, len(context.stand_ins.by_local)
-        text = "Subscriptions by UDPROS that the proxy passes on."
-        yield "udpros_relays", text, len(self._stand_ins.udpros)
-        text = "Memory that calls and replies hold while they are read."
-        yield "buffered_bytes", text, buffered.used
-        yield "buffered_bytes_limit", "Memory that they may hold.", buffered.most
-        yield "master_up", "Whether the master answers.", bool(self._monitor.up)
-        text = "Whether the kernel forwards topics."
-        yield "kernel_plane", text, self._plane.syncer.usable
-        forwarded = sum(holder.fast_connections for holder in self._plane.holders)
-        yield "kernel_connections", "TCPROS connections that the kernel forwards.", forwarded
-
-    def _nodes_down(self) -> Metric:
-        """The nodes that do not answer, by name, for whoever is on call."""
-        text = "Inside nodes that do not answer, by name."
-        gauge = GaugeMetricFamily("rosproxy_nodes_down", text, labels=["node"])
-        down = [endpoint for endpoint in self._context.registry if endpoint.is_down]
-        names = [name for endpoint in down for name in endpoint.caller_ids]
-        for name, count in self._down.tally(names).items():
-            gauge.add_metric([name], count)
-        return gauge
-
-    def _bytes(self) -> Iterable[Metric]:
-        relayed = CounterMetricFamily(
-            "rosproxy_relayed_bytes",
-            "Bytes relayed by topic or service and direction.",
-            labels=["kind", "name", "direction"],
-        )
-        for labels, size in self._tcpros.traffic().totals():
-            relayed.add_metric(labels, size)
-        forwarded = CounterMetricFamily(
-            "rosproxy_kernel_bytes",
-            "Bytes of IP packets, headers included, that the kernel forwarded, by node.",
-            labels=["node", "direction"],
-        )
-        for labels, size in self._plane.traffic.totals():
-            forwarded.add_metric(labels[1:], size)
-        return relayed, forwarded
-
-    def _settings(self) -> document.StatusSettings:
-        settings, selected = self._context.settings, self._context.selected
-        return document.StatusSettings(
+def common_status(runtime: Runtime) -> ProxyStatus:
+    """The state of a proxy as far as it depends on no version of ROS."""
+    settings = runtime.settings
+    ports = settings.ports
+    return ProxyStatus(
+        version=__version__,
+        pid=os.getpid(),
+        instance=runtime.instance,
+        uptime=round(runtime.uptime(), 1),
+        settings=StatusSettings(
             ros=settings.ros,
-            master_port=settings.master_port,
-            publish_master=settings.publish_master,
             advertise_host=settings.advertise_host,
             bind=settings.bind,
-            inside_networks=tuple(map(str, self._context.addressing.networks)),
             direction=settings.direction,
-            udp=settings.udp,
-            cleanup_after=settings.cleanup_after,
-            linger=settings.linger,
-            selected=None if selected is None else len(selected),
-        )
-
-    def _master(self) -> document.MasterStatus:
-        context, monitor = self._context, self._monitor
-        return document.MasterStatus(
-            uri=context.settings.master_uri,
-            address=context.upstream.reached_at,
-            pinned=context.upstream.master_address is not None,
-            up=bool(monitor.up),
-            error=monitor.error,
-            pid=monitor.pid,
-            since=round(context.now() - monitor.since, 1),
-            round_trip=monitor.round_trip,
-        )
-
-    def _ports(self) -> document.PortsStatus:
-        ports, registry = self._context.settings.ports, self._context.registry
-        return document.PortsStatus(
-            listen=str(ports.listen),
-            advertise=str(ports.advertise),
-            used=len(registry),
-            free=fast_ports.ports_left(registry.pool, registry),
-            blocked=len(registry.pool.blocked),
-            held_by=self._held_by() if registry.pool.blocked else (),
-        )
-
-    def _held_by(self) -> tuple[str, ...]:
-        """The other proxies on this machine that have ports of the range."""
-        settings = self._context.settings
-        ports = settings.ports.listen
-        return tuple(
-            map(str, signs.overlapping_proxies("1", ports.first, ports.last, settings.admin))
-        )
-
-    def _policy(self) -> document.PolicyStatus:
-        policy = self._context.policy
-        hidden = []
-        for (kind, name), holders in sorted(self._context.registry.hidden.items(), key=str):
-            for node, endpoint in sorted(holders.items()):
-                rule_kind = KINDS[kind]
-                verdict = policy.judge(rule_kind, name, [node], endpoint.address)
-                hidden.append(document.HiddenStatus(rule_kind.value, name, node, verdict.reason))
-        return policy_status(policy, hidden)
-
-    def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
-        problems = self._context.problems.at(endpoint.port)
-        return document.EndpointStatus(
-            nodes=tuple(endpoint.caller_ids),
-            uri=endpoint.uri,
-            address=str(endpoint.slave),
-            advertised_uri=self._context.addressing.advertised_uri(endpoint),
-            port=endpoint.port,
-            state=endpoint.state,
-            publishes=tuple(endpoint.names(Kind.PUBLISHER)),
-            subscribes=tuple(endpoint.names(Kind.SUBSCRIBER)),
-            services=tuple(endpoint.names(Kind.SERVICE)),
-            parameters=tuple(endpoint.names(Kind.PARAM)),
-            connections=msgspec.convert(
-                relays, tuple[document.ConnectionStatus, ...], from_attributes=True
-            ),
-            problems=tuple(problem.text for problem in problems),
-            data_plane=msgspec.convert(self._plane.status_of(endpoint), document.NodePlaneStatus),
-        )
-
-
-def policy_status(
-    policy: AccessPolicy, hidden: Sequence[document.HiddenStatus], left_out: int = 0
-) -> document.PolicyStatus:
-    """The layers in force and what they hide, besides what was ``left_out`` before."""
-    layers = tuple(
-        document.LayerStatus(
-            layer.name,
-            layer.mode.value,
-            tuple(map(str, layer.rules)),
-            None if layer.addresses is None else len(layer.addresses),
-        )
-        for layer in policy.layers
+        ),
+        ports=PortsStatus(str(ports.listen), str(ports.advertise)),
+        policy=_layers(runtime),
+        problems=_problems(runtime.problems),
     )
-    shown = first_hidden(hidden)
-    return document.PolicyStatus(layers, tuple(shown), left_out + len(hidden) - len(shown))
 
 
-def problem_statuses(problems: Problems) -> tuple[document.ProblemStatus, ...]:
+def with_hidden(policy: PolicyStatus | None, hidden: Sequence[HiddenStatus]) -> PolicyStatus:
+    """The policy, with what it hides besides what is told already."""
+    policy = policy or PolicyStatus()
+    every = (*policy.hidden, *hidden)
+    shown = first_hidden(every)
+    left_out = policy.left_out + len(every) - len(shown)
+    return PolicyStatus(policy.layers, tuple(shown), left_out)
+
+
+def _layers(runtime: Runtime) -> PolicyStatus:
+    return PolicyStatus(
+        tuple(
+            LayerStatus(
+                layer.name,
+                layer.mode.value,
+                tuple(map(str, layer.rules)),
+                None if layer.addresses is None else len(layer.addresses),
+            )
+            for layer in runtime.policy.layers
+        )
+    )
+
+
+def _problems(problems: Problems) -> tuple[ProblemStatus, ...]:
     """The problems that were noted, each with how long ago."""
     return tuple(
-        document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
+        ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
         for p in problems.all()
     )

@@ -3,8 +3,8 @@
 import asyncio
 import logging
 
-from rosproxy.app.binding import setting_error_if_taken
 from rosproxy.app.signals import stop_event
+from rosproxy.binding import setting_error_if_taken
 from rosproxy.ros2.servers.ear import Ear, EarSettings
 
 log = logging.getLogger(__name__)

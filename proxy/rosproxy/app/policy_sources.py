@@ -5,6 +5,8 @@ for that by themselves; what an operator posts they apply before it is answered.
 """
 
 import time
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 from rosproxy.access.access_policy import AccessPolicy
@@ -12,9 +14,7 @@ from rosproxy.access.layers import read_layer
 from rosproxy.access.policy_file import LOOK_INTERVAL, OPTION, PolicyFile
 from rosproxy.admin.requests import BodyError, PolicyNews, read_body
 from rosproxy.admin.status_document import to_json
-from rosproxy.app.ros1 import Ros1
-from rosproxy.app.ros2 import Ros2
-from rosproxy.ros1.upkeep.policy_enforcer import EnforcementCounts
+from rosproxy.app.stacks import Stack
 from rosproxy.runtime import Runtime
 from rosproxy.settings import SettingError, Settings
 from rosproxy.telemetry.metrics import Metrics
@@ -28,8 +28,8 @@ OPERATOR_POLICY = "the operator's policy"
 class PolicySources:
     """Takes in rules while the proxy runs."""
 
-    def __init__(self, runtime: Runtime, ros1: Ros1 | None, ros2: Ros2 | None) -> None:
-        self._runtime, self._ros1, self._ros2 = runtime, ros1, ros2
+    def __init__(self, runtime: Runtime, stacks: Sequence[Stack]) -> None:
+        self._runtime, self._stacks = runtime, stacks
 
     def start(self) -> None:
         """Read the file, and look at it from now on. Raises SettingError."""
@@ -45,7 +45,7 @@ class PolicySources:
     async def post(self, body: Any) -> dict[str, Any]:
         """``POST /policy``: how many registrations are hidden and shown now, and what was cut.
 
-        Raises BodyError, Unreachable, MasterError.
+        Raises BodyError, CallFailed.
         """
         problems = self._runtime.problems
         try:
@@ -55,9 +55,10 @@ class PolicySources:
             problems.add(OPERATOR_POLICY, f"refused, that of before stays in force: {error}")
             raise
         problems.solved(OPERATOR_POLICY)
-        if self._ros2:
-            await self._ros2.apply_policy()
-        return to_json(await self._ros1.enforce_policy() if self._ros1 else EnforcementCounts())
+        counts = Counter[str]()
+        for stack in reversed(self._stacks):  # ROS 1 may fail, where its master is away
+            counts.update(to_json(await stack.apply_policy()))
+        return dict(counts)
 
     def _use_operator_layers(self, body: Any) -> None:
         """Take in the rules of a post. Raises BodyError."""

@@ -3,37 +3,25 @@
 import asyncio
 import contextlib
 import logging
-import os
 import resource
 import socket
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
 from typing import Any
 
-import msgspec
-
-from rosproxy import __version__
 from rosproxy.admin.client import default_url
 from rosproxy.admin.server import Action, AdminServer
-from rosproxy.admin.status import problem_statuses
-from rosproxy.admin.status_document import (
-    DomainStatus,
-    PortsStatus,
-    ProxyStatus,
-    StatusSettings,
-    to_json,
-)
-from rosproxy.app.binding import setting_error_if_taken
+from rosproxy.admin.status import common_status
+from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.app.policy_sources import PolicySources
-from rosproxy.app.ros1 import Ros1
-from rosproxy.app.ros2 import Ros2
 from rosproxy.app.self_check import SelfCheck
 from rosproxy.app.signals import stop_event
+from rosproxy.app.stacks import make_stacks
+from rosproxy.binding import setting_error_if_taken
 from rosproxy.net import signs, sockets
 from rosproxy.page.feed import Feed, PageWatch
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
-from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.runtime import Runtime
 from rosproxy.settings import Settings
 
@@ -49,11 +37,10 @@ class App:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.runtime = runtime = Runtime(settings, KNOWN_METHODS)
-        self.ros1 = Ros1(runtime) if settings.for_ros1 else None
-        self.ros2 = Ros2(runtime) if settings.for_ros2 else None
-        self._policy = PolicySources(runtime, self.ros1, self.ros2)
-        self._check = SelfCheck(runtime, self.ros1, self.ros2)
+        self.runtime = runtime = Runtime(settings)
+        self.stacks = make_stacks(runtime)
+        self._policy = PolicySources(runtime, self.stacks)
+        self._check = SelfCheck(runtime, self.stacks)
         self._sign: socket.socket | None = None
         self.page = self._make_page()
         self._admin = AdminServer(
@@ -85,15 +72,14 @@ class App:
         with setting_error_if_taken("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
         self._policy.start()
-        stacks = [stack for stack in (self.ros1, self.ros2) if stack]
-        for stack in stacks:
+        for stack in self.stacks:
             await stack.start()
         with setting_error_if_taken("--admin-bind", settings.admin):
             await self._admin.start(settings.admin)
         ports = settings.ports.listen
         self._sign = signs.publish_sign(settings.ros, ports.first, ports.last, settings.admin)
         await self._check.start()
-        log.info("ready: %s", "; ".join(stack.greeting for stack in stacks))
+        log.info("ready: %s", "; ".join(stack.greeting for stack in self.stacks))
 
     async def stop(self) -> None:
         """End everything."""
@@ -101,11 +87,8 @@ class App:
             self._sign.close()
         await self.page.close()
         await self._admin.stop()
-        if self.ros1:
-            await self.ros1.stop()
-        await self.runtime.tasks.cancel()
-        if self.ros2:
-            await self.ros2.stop()
+        for stack in self.stacks:
+            await stack.stop()
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
@@ -113,46 +96,22 @@ class App:
 
     def state(self) -> ProxyStatus:
         """The state."""
-        domains = self.ros2.state.status() if self.ros2 else ()
-        status = self.ros1.status() if self.ros1 else self._bare_status(domains)
-        if self.ros2:
-            policy = self.ros2.state.policy(self.runtime.policy, status.policy)
-            status = msgspec.structs.replace(status, domains=domains, policy=policy)
+        status = common_status(self.runtime)
+        for stack in self.stacks:
+            status = stack.add_to(status)
         return status
 
     def _actions(self) -> dict[str, Action]:
-        """What posts at the admin endpoint do: in ROS 1 and ROS 2 where both know them."""
-        action_maps = [stack.actions for stack in (self.ros2, self.ros1) if stack]
+        """What posts at the admin endpoint do: in ROS 1 and ROS 2 where both know them.
+
+        ROS 2 goes first: ROS 1 may fail, where its master is away.
+        """
+        action_maps = [stack.actions for stack in reversed(self.stacks)]
         paths = {path for actions in action_maps for path in actions}
         return {path: _together([a[path] for a in action_maps if path in a]) for path in paths}
 
     def _unready(self) -> str | None:
-        return self.ros1.unready() if self.ros1 else None
-
-    def _bare_status(self, domains: tuple[DomainStatus, ...]) -> ProxyStatus:
-        """The state of a proxy without ROS 1."""
-        runtime, settings = self.runtime, self.settings
-        return ProxyStatus(
-            version=__version__,
-            pid=os.getpid(),
-            instance=runtime.instance,
-            uptime=round(runtime.uptime(), 1),
-            settings=StatusSettings(
-                ros=settings.ros,
-                advertise_host=settings.advertise_host,
-                bind=settings.bind,
-                inside_networks=tuple(map(str, self.ros2.networks)) if self.ros2 else (),
-                direction=settings.direction,
-            ),
-            ports=PortsStatus(
-                str(settings.ports.listen),
-                str(settings.ports.advertise),
-                sum(domain.ports_used for domain in domains),
-                sum(domain.ports_free for domain in domains),
-            ),
-            data_plane=domains[0].data_plane if domains else None,
-            problems=problem_statuses(runtime.problems),
-        )
+        return next(filter(None, (stack.unready() for stack in self.stacks)), None)
 
 
 def _together(actions: list[Action]) -> Action:

@@ -1,7 +1,7 @@
 """What a proxy finds out about itself at its start: whether outside can reach it as it is told to.
 
 The advertised host is looked up before the proxy says that it is ready. Then, once the rush of a
-start is over and the master answers, the range is tried from outside (`rosproxy.admin.range_probe`;
+start is over and the master answers, the range is tried from outside (`rosproxy.ros1.range_probe`;
 of ROS 2 by UDP, which can prove that all is well, and not that it is not). What is wrong is told in
 the log and in ``rosproxy status``, in the doctor's words, and tried again at times until it is
 mended. It keeps nothing from working: who can reach the proxy does.
@@ -9,16 +9,14 @@ mended. It keeps nothing from working: who can reach the proxy does.
 
 import asyncio
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rosproxy.admin.findings import DoctorFinding, Severity
-from rosproxy.admin.range_probe import probe_range
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, published_range
 from rosproxy.admin.status_document import PortsStatus, to_json
-from rosproxy.app.ros1 import Ros1
-from rosproxy.app.ros2 import Ros2
+from rosproxy.app.stacks import Stack
 from rosproxy.net.addresses import is_loopback, parse_authority
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
@@ -35,8 +33,8 @@ its three threads for two minutes."""
 class SelfCheck:
     """Looks into the setting-up of a running proxy and notes what is wrong."""
 
-    def __init__(self, runtime: Runtime, ros1: Ros1 | None, ros2: Ros2 | None) -> None:
-        self._runtime, self._ros1, self._ros2 = runtime, ros1, ros2
+    def __init__(self, runtime: Runtime, stacks: Sequence[Stack]) -> None:
+        self._runtime, self._stacks = runtime, stacks
         self._findings: dict[str, list[DoctorFinding]] = {}
         self._probing = asyncio.Lock()
         self._addresses: list[str] = []
@@ -57,9 +55,9 @@ class SelfCheck:
 
     async def _keep_trying(self) -> None:
         await asyncio.sleep(SETTLE_TIME)
-        if self._ros1:  # the master tries it; while that is away, it is the first cause
-            await self._ros1.master_monitor.answered.wait()
-        while not (self._ros1 and self._ros1.context.retired):
+        for stack in self._stacks:
+            await stack.settle()
+        while not any(stack.retired for stack in self._stacks):
             try:
                 await self._try_range(or_fast=False)
             except OSError as error:  # a port that was free a moment ago
@@ -90,12 +88,8 @@ class SelfCheck:
     async def _try_range(self, or_fast: bool) -> RangeProbe:
         """Try ports of the range, and note what is wrong. Raises OSError if one was just taken."""
         async with self._probing:
-            ros1, ros2 = self._ros1, self._ros2
-            probed = RangeProbe()
-            if ros1:
-                probed = await probe_range(ros1.context, ros1.leases, or_fast)
-            if ros2:
-                probed = RangeProbe((*probed.probes, *await ros2.probe()))
+            probes = [await stack.probe(or_fast) for stack in self._stacks]
+        probed = RangeProbe(tuple(probe for of_stack in probes for probe in of_stack))
         settings = self._runtime.settings
         ports = PortsStatus(str(settings.ports.listen), str(settings.ports.advertise))
         if self._addresses:  # else the host's name is reported, which leads nowhere

@@ -1,9 +1,7 @@
 """Gathering the facts for ``rosproxy doctor``: asks the proxy, the master and the nodes.
 
 First the proxy (`AdminClient`), which knows its nodes and whether its ports can be reached; then
-the master for who publishes, subscribes to and provides what (``getSystemState``, ``lookupNode``);
-then every node whether it answers; then, where names were given, those nodes for their topics and
-connections (``getBusInfo``) and their data ports. Of ROS 2 it asks who is on the networks inside
+the master and nodes of ROS 1 (`graph_survey`). Of ROS 2 it asks who is on the networks inside
 (`domain_survey`). The rules judge what was found.
 
 It changes nothing, apart from the short-lived parameter by which the proxy has the master try its
@@ -12,48 +10,17 @@ the proxy runs.
 """
 
 import asyncio
-import contextlib
-import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from typing import Any, TypeVar
-from urllib.parse import urlsplit
+from collections.abc import Callable
 
-import aiohttp
 from msgspec.structs import replace
 
 from rosproxy.admin.client import AdminClient, AdminError
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.domain_survey import ask_participants
-from rosproxy.doctor.facts import (
-    Attempt,
-    DoctorFacts,
-    HeardParticipant,
-    MasterFacts,
-    NodeFacts,
-    Reach,
-    SystemState,
-    data_port,
-    slave_report,
-    system_state,
-)
-from rosproxy.doctor.rules.pair import is_connected
-from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
+from rosproxy.doctor.facts import DoctorFacts, HeardParticipant, SystemState
+from rosproxy.doctor.graph_survey import ask_graph
+from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.net.resolver import resolve
-from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
-from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
-from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
-from rosproxy.ros1.registry.memory import NAMESPACE, lease_at
-from rosproxy.telemetry.metrics import Metrics
-
-PARALLEL = 32
-"""Questions under way at once; fewer than the look-ups of names that are allowed."""
-FEW_PARALLEL = 4
-"""The same for questions that are asked again and again."""
-WITHIN = 3.0
-"""Seconds that a node has to answer."""
-
-Key = TypeVar("Key")
-Result = TypeVar("Result")
 
 
 async def collect(
@@ -74,12 +41,12 @@ async def collect(
         advertise_host=advertise_host, advertised_addresses=tuple(addresses), names=names
     )
     if admin is None:
-        return await _ask_graph(facts, master_uri)
+        return await ask_graph(facts, master_uri)
     try:
         return await _ask_proxy(facts, admin)
     except AdminError as error:
         facts = replace(facts, admin_error=str(error))
-        return await _ask_graph(facts, master_uri, master_address)
+        return await ask_graph(facts, master_uri, master_address)
 
 
 async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
@@ -99,7 +66,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
         facts = replace(facts, heard_participants=heard, status=status)
     address = master.address if master.pinned else None
     uri = master.uri if status.settings.for_ros1 else ""
-    graph_task = asyncio.create_task(_ask_graph(facts, uri, address))
+    graph_task = asyncio.create_task(ask_graph(facts, uri, address))
     probe, reason = None, ""
     try:
         probe = await asyncio.to_thread(admin.probe)
@@ -133,16 +100,7 @@ async def collect_running(
         advertised_addresses=tuple(await resolve(host)),
     )
     uri = master.uri if status.settings.for_ros1 else ""
-    return await _ask_graph(facts, uri, master.address if master.pinned else None, choose)
-
-
-async def look_at_master(uri: str, name: str, address: str | None) -> MasterFacts:
-    """The master, asked in the name of a proxy; at an IP address if one is given."""
-    client = MasterClient(uri, name, Metrics(), address)
-    try:
-        return await _Collector(client, client).master()
-    finally:
-        await client.close()
+    return await ask_graph(facts, uri, master.address if master.pinned else None, choose)
 
 
 async def _survey(status: ProxyStatus) -> tuple[HeardParticipant, ...]:
@@ -152,249 +110,3 @@ async def _survey(status: ProxyStatus) -> tuple[HeardParticipant, ...]:
     surveys = (asyncio.to_thread(ask_participants, network, domains) for network in networks)
     by_prefix = {p.guid_prefix: p for answers in await asyncio.gather(*surveys) for p in answers}
     return tuple(by_prefix.values())
-
-
-async def _ask_graph(
-    facts: DoctorFacts,
-    uri: str,
-    address: str | None = None,
-    choose: Callable[[SystemState], tuple[str, ...]] | None = None,
-) -> DoctorFacts:
-    """What the master and the nodes say.
-
-    The master is asked in the proxy's name, so that a proxy that is its own master shows itself;
-    nodes are not, since those behind the proxy are asked through it.
-    """
-    if not uri:
-        return facts
-    master, nodes = (
-        MasterClient(uri, name, Metrics(), address) for name in (facts.proxy.instance, "doctor")
-    )
-    try:
-        collector = _Collector(master, nodes, choose)
-        published = await collector.published_master(facts)
-        facts = replace(facts, master=await collector.master(), published_master=published)
-        if facts.master and facts.master.attempt.reach is Reach.ANSWERED:
-            with contextlib.suppress(Unreachable, MasterError):
-                facts = await collector.master_state(facts)
-    finally:
-        await asyncio.gather(master.close(), nodes.close())
-    return facts
-
-
-class _Collector:
-    """Questions to the master and to nodes, a bounded number at once."""
-
-    def __init__(
-        self,
-        master: MasterClient,
-        nodes: MasterClient,
-        choose: Callable[[SystemState], tuple[str, ...]] | None = None,
-    ) -> None:
-        self._master, self._nodes, self._choose = master, nodes, choose
-        self._limit = asyncio.Semaphore(FEW_PARALLEL if choose else PARALLEL)
-
-    async def master(self) -> MasterFacts:
-        """Look at the master: its name, its answer, its path, and whether it is the proxy."""
-        uri = self._master.master_uri
-        addresses = tuple(await self._master.master_addresses())
-        if not addresses:
-            return MasterFacts(uri, Attempt(Reach.UNRESOLVABLE))
-        started = time.monotonic()
-        attempt, _ = await _attempt(self._master.call_master("getPid"))
-        trip = time.monotonic() - started
-        looped = "leads back to the proxy itself" in attempt.reason
-        master = MasterFacts(uri, attempt, addresses, is_this_proxy=looped, round_trip=trip)
-        root = parse_slave_uri(uri)
-        if attempt.reach is Reach.STRANGER and root and urlsplit(uri).path not in ("", "/"):
-            at_root = await self._ask_pid(root)
-            master = replace(master, at_root=at_root.reach is Reach.ANSWERED)
-        return master
-
-    async def published_master(self, facts: DoctorFacts) -> Attempt:
-        """Try the master as outside is offered it (``--publish-master``)."""
-        port = facts.proxy.settings.publish_master
-        return await self._ask_pid(HostPort(facts.advertise_host, port)) if port else Attempt()
-
-    async def master_state(self, facts: DoctorFacts) -> DoctorFacts:
-        """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
-        graph = system_state(await self._master.call_master("getSystemState"))
-        names = sorted(graph.names())
-        uris = await self._master.look_up("lookupNode", names)
-        _, leases = await _attempt(self._master.call_master("getParam", NAMESPACE))
-        nodes = {name: _node_facts(name, uris.get(name, ""), leases) for name in names}
-        facts = replace(
-            facts,
-            graph=graph,
-            uses_simulated_time=await self._simulated_time(),
-            service_uris=await self._master.look_up("lookupService", graph.services),
-        )
-        to_try = facts.scope.nodes if facts.names else names
-        nodes |= await _gather(to_try, lambda name: self._try_node(facts, nodes[name]))
-        facts = replace(facts, nodes=nodes)
-        if self._choose:
-            facts = replace(facts, names=self._choose(graph))
-        return await self._examine_named(facts) if facts.names else facts
-
-    async def _examine_named(self, facts: DoctorFacts) -> DoctorFacts:
-        """Ask the nodes and services that the user named."""
-        scope, nodes = facts.scope, facts.nodes
-        asked_nodes = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
-        facts = replace(facts, nodes={**nodes, **asked_nodes})
-        unconnected = {
-            (publisher, topic)
-            for topic, publisher, subscriber in scope.pairs
-            if not is_connected(topic, facts.nodes[publisher], facts.nodes[subscriber])
-        }
-        return replace(
-            facts,
-            data_ports=await _gather(unconnected, lambda pair: self._try_data_port(facts, *pair)),
-            services=await _gather(scope.services, lambda name: self._try_service(facts, name)),
-        )
-
-    async def _simulated_time(self) -> bool:
-        _, answer = await _attempt(self._master.call_master("getParam", "/use_sim_time"))
-        return answer in ("1", "true", 1)
-
-    async def _try_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
-        """Try a node at its address; one behind this proxy is the proxy's to judge.
-
-        A node at a port of this proxy that no node here holds may be behind another proxy that
-        advertises the same: it is tried at that port, and at its address inside.
-        """
-        slave = node.slave
-        if slave is None or facts.lease(slave):
-            return node
-        if facts.is_ours(slave):
-            async with self._limit:
-                attempts = [await self._ask_pid(s) for s in (slave, node.inside) if s]
-            answered = next((a for a in attempts if a.reach is Reach.ANSWERED), None)
-            return replace(node, attempt=answered) if answered else node
-        async with self._limit:
-            addresses = tuple(await resolve(self._nodes.reach(slave).host))
-            attempt = await self._ask_pid(slave) if addresses else Attempt(Reach.UNRESOLVABLE)
-        return replace(node, addresses=addresses, attempt=attempt)
-
-    async def _ask_pid(self, target: HostPort) -> Attempt:
-        attempt, pid = await _attempt(self._nodes.call_node(target, WITHIN, "getPid"))
-        if attempt.failed or isinstance(pid, int):
-            return attempt
-        return Attempt(Reach.STRANGER, "its answer is not a node's")
-
-    async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
-        """What a node says of itself, asked through the proxy if it is behind it."""
-        slave, ask = _reached_at(facts, node.slave), self._nodes.call_node
-        if slave is None or node.attempt.failed:
-            return node
-        methods = ("getPublications", "getSubscriptions", "getBusInfo")
-        try:
-            async with self._limit:
-                pubs, subs, bus = [await ask(slave, WITHIN, method) for method in methods]
-                at = time.monotonic()
-                # Not every library counts; who does not is asked for nothing else.
-                _, stats = await _attempt(ask(slave, WITHIN, "getBusStats"))
-        except (Unreachable, MasterError):
-            return node
-        return replace(node, report=slave_report(pubs, subs, bus, stats, at))
-
-    async def _try_data_port(
-        self, facts: DoctorFacts, publisher: str, topic: str
-    ) -> tuple[str, Attempt]:
-        """Where a publisher serves a topic, and whether a subscriber gets through to there."""
-        node = facts.nodes[publisher]
-        slave = _reached_at(facts, node.slave)
-        if slave is None or node.report is None:
-            return "", Attempt()
-        attempt, answer = await _attempt(
-            self._nodes.call_node(slave, WITHIN, "requestTopic", topic, [["TCPROS"]])
-        )
-        target = data_port(answer)
-        if attempt.failed:
-            return "", attempt
-        if target is None:
-            return "", Attempt(Reach.STRANGER, "no TCPROS address")
-        if facts.is_ours(node.slave):
-            return str(target), Attempt()
-        header = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
-        return str(target), await _shake_hands(self._nodes.reach(target), header)
-
-    async def _try_service(self, facts: DoctorFacts, service: str) -> Attempt:
-        """Ask a service for its type, as rosservice does."""
-        provider = parse_service_uri(facts.service_uris.get(service, ""))
-        if provider is None:
-            return Attempt(Reach.STRANGER, "no address")
-        target = _reached_at(facts, provider)
-        if target is None:
-            return Attempt(Reach.REFUSED, "its port is not held by a node")
-        header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
-        return await _shake_hands(self._nodes.reach(target), header)
-
-
-def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
-    """Where to ask a target; one behind this proxy at the proxy's own port, past the host's NAT.
-
-    None if no node holds that port.
-    """
-    if not facts.is_ours(target):
-        return target
-    lease, admin = facts.lease(target), parse_host_port(facts.admin.removeprefix("http://"))
-    if lease is None or admin is None:
-        return None
-    bound = facts.proxy.settings.bind
-    return HostPort(admin.host if bound in ("0.0.0.0", "::") else bound, lease.port)
-
-
-async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
-    """Exchange TCPROS connection headers."""
-    addresses = await resolve(target.host)
-    if not addresses:
-        return Attempt(Reach.UNRESOLVABLE)
-    try:
-        async with asyncio.timeout(WITHIN):
-            reply = await _exchange(HostPort(addresses[0], target.port), header)
-    except (ConnectionError, EOFError):
-        return Attempt(Reach.REFUSED)
-    except OSError:
-        return Attempt(Reach.SILENT)
-    except HeaderError as error:
-        return Attempt(Reach.STRANGER, str(error))
-    return Attempt(Reach.STRANGER, reply["error"]) if "error" in reply else Attempt(Reach.ANSWERED)
-
-
-async def _exchange(target: HostPort, header: Mapping[str, str]) -> dict[str, str]:
-    reader, writer = await asyncio.open_connection(target.host, target.port)
-    try:
-        writer.write(encode_header(header))
-        length = header_length(await reader.readexactly(4))
-        return decode_header(await reader.readexactly(length))
-    finally:
-        writer.close()
-
-
-def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
-    """A node as the master tells of it; ``leases`` is what all proxies remember there."""
-    slave = parse_slave_uri(uri)
-    lease = lease_at(leases, slave) if slave else None
-    inside = parse_inside_path(uri) or (lease.node if lease else None)
-    return NodeFacts(name, uri, inside.slave if inside else None)
-
-
-async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
-    """How a question ended, and the answer, None unless a node or master gave one."""
-    try:
-        return Attempt(Reach.ANSWERED), await question
-    except (Unreachable, MasterError) as error:
-        if isinstance(error, Unreachable) and error.refused:
-            return Attempt(Reach.REFUSED), None
-        if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
-            return Attempt(Reach.SILENT), None
-        reason = str(error).partition("\n")[0].partition(": ")[2][:200]
-        return Attempt(Reach.STRANGER, reason or "no sense"), None
-
-
-async def _gather(
-    keys: Iterable[Key], work: Callable[[Key], Awaitable[Result]]
-) -> dict[Key, Result]:
-    """The results of ``work`` on each key, all at the same time."""
-    wanted = list(keys)
-    return dict(zip(wanted, await asyncio.gather(*map(work, wanted)), strict=True))

@@ -293,6 +293,10 @@ class BadResponse(ValueError):
     """A response in HTTP that is not the one that was asked for: another status, another form."""
 
 
+class CallFailed(Exception):
+    """Another program that was needed could not be asked, or refused; says why."""
+
+
 class TooLong(BadResponse):
     """A body of more bytes than there may be."""
 

@@ -6,7 +6,6 @@ those of a participant's ports.
 
 from collections.abc import Iterator
 
-from rosproxy.admin.domain_problems import DomainProblem, domain_problems, mismatch_problems
 from rosproxy.admin.findings import DoctorFinding
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus, ProxyStatus
 from rosproxy.doctor.facts import DoctorFacts
@@ -27,6 +26,7 @@ from rosproxy.page.document import (
     shown_name,
     shown_text,
 )
+from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, mismatch_problems
 from rosproxy.ros2.registry.participants import LeaseKind
 
 _QUIET_ENDINGS = (

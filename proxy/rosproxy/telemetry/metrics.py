@@ -86,8 +86,9 @@ class Metrics:
     Calls are counted by method for ``known_methods``, those of other names together.
     """
 
-    def __init__(self, known_methods: Collection[str] = ()) -> None:
-        self._known_methods = known_methods
+    known_methods: Collection[str] = ()
+
+    def __init__(self) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         build = Info("rosproxy_build", "The proxy's version.", registry=self.registry)
@@ -129,5 +130,5 @@ class Metrics:
 
     def count(self, api: str, method: str, outcome: str) -> None:
         """Count a call; method names that nobody defined share one label."""
-        label = method if method in self._known_methods else "other"
+        label = method if method in self.known_methods else "other"
         self._of_calls(api, label, outcome).inc()

@@ -5,11 +5,11 @@ from typing import Any
 import pytest
 
 from examples.demo.fake_http import Where
-from rosproxy.app import ros1 as app
 from rosproxy.forwarding.kernel import decisions, syncer
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
+from rosproxy.ros1 import stack
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import (
@@ -34,7 +34,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
     async def nothing(mode: str, tools: Tools) -> None:
         return None
 
-    monkeypatch.setattr(app, "Tools", lambda: made)
+    monkeypatch.setattr(stack, "Tools", lambda: made)
     monkeypatch.setattr(kernel_plane, "find_obstacle", nothing)
     monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
     monkeypatch.setattr(syncer, "address_towards", lambda address: "192.0.2.1")
@@ -67,7 +67,7 @@ async def test_a_subscriber_is_sent_to_the_fast_port(make_proxy, make_node, kern
     assert kernel.forwards == {lease + 4: (NODE, node.tcpros_port)}
     assert (await greet((host, lease + 4), topic_header()))["callerid"] == "/a"
     assert (await greet((host, lease), topic_header()))["callerid"] == "/a"
-    status = proxy.app.status()
+    status = proxy.stack.status()
     assert status["ports"]["free"] == 7
     assert status["data_plane"]["plane"] == "kernel"
     assert status["nodes"][0]["data_plane"]["port"] == lease + 4
@@ -120,7 +120,7 @@ async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
     make_proxy, make_node, kernel, monkeypatch
 ):
     """They counted as taken: nothing was tried."""
-    monkeypatch.setattr("rosproxy.admin.range_probe.MASTER_WAIT", 0.3)
+    monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
     proxy = await make_proxy(data_plane="auto", ports=4)
     nodes = [await make_node("/a"), await make_node("/b", OTHER_NODE)]
     for node in nodes:
@@ -130,7 +130,7 @@ async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
     told = await tell(proxy, "/probe")
     assert [(p["port"], p["from_proxy"]) for p in told["probes"]] == [(lost, "ok")]
     assert set(kernel.forwards) == {kept}
-    assert proxy.app.status()["ports"]["free"] == 2
+    assert proxy.stack.status()["ports"]["free"] == 2
     for node in nodes:
         assert (await ask(proxy, node))[1] == proxy.lease(node)[1] + 2
     assert set(kernel.forwards) == {lost, kept}
@@ -149,7 +149,7 @@ async def test_without_the_kernel_nobody_is_sent_to_a_fast_port(make_proxy, make
     proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
     await node.publish(proxy.master)
     assert await ask(proxy, node) == proxy.lease(node)
-    assert proxy.app.status()["data_plane"]["reason"] == "not in this test"
+    assert proxy.stack.status()["data_plane"]["reason"] == "not in this test"
 
 
 async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
@@ -163,7 +163,7 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     await until(lambda: len(proxy.ros1.context.registry), "the node is found")
     await until(lambda: proxy.serves(node), "the node is served")
     assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
-    assert proxy.app.status()["ports"]["free"] == 3
+    assert proxy.stack.status()["ports"]["free"] == 3
     others = [await make_node(f"/n{number}", OTHER_NODE) for number in range(3)]
     for other in others:
         assert (await other.publish(proxy.master))[0] == 1

@@ -12,8 +12,8 @@ from examples.demo.fake_http import End
 from examples.demo.fake_http import value as answer
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.app import ros1 as app
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1 import stack
 from rosproxy.ros1.upkeep import resubscriber
 from tests.integration.net import (
     OTHER_NODE,
@@ -38,7 +38,7 @@ AFTERWARDS = 22
 @pytest.fixture(autouse=True)
 def _early(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resubscriber, "LOOK_DELAYS", LOOKS)
-    monkeypatch.setattr(app, "RESUBSCRIBE_TICK", 0.05)
+    monkeypatch.setattr(stack, "RESUBSCRIBE_TICK", 0.05)
 
 
 @pytest.fixture

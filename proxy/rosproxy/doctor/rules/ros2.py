@@ -1,15 +1,15 @@
 """Rules about ROS 2: whether participants of both sides can meet, as far as the proxy sees it.
 
-Most of it the proxy knows itself (`rosproxy.admin.domain_problems`). The doctor knows besides who
+Most of it the proxy knows itself (`rosproxy.ros2.domain_problems`). The doctor knows besides who
 is on the networks inside but not heard by the proxy, and which topics and services were asked for.
 """
 
 from collections.abc import Iterator
 
-from rosproxy.admin.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.admin.findings import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.telemetry.text import listed, plural
 
 RECENT = 120.0

@@ -20,7 +20,14 @@ import aiohttp
 import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy.net.http_client import MAX_BODY, BadResponse, HttpClient, LongBody, LongReply
+from rosproxy.net.http_client import (
+    MAX_BODY,
+    BadResponse,
+    CallFailed,
+    HttpClient,
+    LongBody,
+    LongReply,
+)
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
@@ -46,7 +53,7 @@ NODE_KEEPALIVE = 2.0
 NODE_TIMEOUT = 15.0
 
 
-class Unreachable(Exception):
+class Unreachable(CallFailed):
     """A call that got no XML-RPC reply.
 
     ``probe`` is what that means for the health of whoever was called: the connection was refused,
@@ -64,7 +71,7 @@ class Unreachable(Exception):
         return self.probe is ProbeResult.REFUSED
 
 
-class MasterError(Exception):
+class MasterError(CallFailed):
     """The master or a node answered, but not with status 1."""
 
 

@@ -11,9 +11,8 @@ import asyncio
 import logging
 from dataclasses import dataclass, field
 
-import msgspec
-
 from rosproxy.access.rules import RuleKind
+from rosproxy.admin.requests import EnforcementCounts
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases.leases import Leases
@@ -30,14 +29,6 @@ log = logging.getLogger(__name__)
 
 ENFORCE_TICK = 0.5
 """Seconds between looks whether the policy has changed."""
-
-
-class EnforcementCounts(msgspec.Struct, frozen=True):
-    """What a change has led to: registrations hidden and shown, connections cut."""
-
-    hidden: int = 0
-    shown: int = 0
-    cut: int = 0
 
 
 @dataclass(slots=True, eq=False)

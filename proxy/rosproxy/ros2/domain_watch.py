@@ -6,8 +6,8 @@ whose readers and writers are not all known. When it is mended, the problem goes
 
 import logging
 
-from rosproxy.admin.domain_problems import DomainProblem, domain_problems
-from rosproxy.admin.ros2_status import Ros2State
+from rosproxy.ros2.domain_problems import DomainProblem, domain_problems
+from rosproxy.ros2.status import Ros2State
 from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)

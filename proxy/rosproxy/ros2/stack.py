@@ -6,15 +6,20 @@ import secrets
 from collections.abc import Mapping
 from typing import Any
 
+from msgspec.structs import replace
+
 from rosproxy.access.rules import RuleKind
-from rosproxy.admin.domain_plane import DomainPlane
-from rosproxy.admin.requests import ContainerNews, EmptyBody, PortProbe, read_body
-from rosproxy.admin.ros2_status import Ros2State
+from rosproxy.admin.requests import (
+    ContainerNews,
+    EmptyBody,
+    EnforcementCounts,
+    PortProbe,
+    read_body,
+)
 from rosproxy.admin.server import Action
-from rosproxy.admin.udp_probe import try_udp
-from rosproxy.app.binding import setting_error_if_taken
-from rosproxy.app.domain_watch import DomainWatch
-from rosproxy.app.holders import report_taken_ports
+from rosproxy.admin.status import with_hidden
+from rosproxy.admin.status_document import PortsStatus, ProxyStatus
+from rosproxy.binding import report_taken_ports, setting_error_if_taken
 from rosproxy.forwarding.kernel.nft import Table, Transport
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
@@ -27,9 +32,13 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
+from rosproxy.ros2.domain_plane import DomainPlane
+from rosproxy.ros2.domain_watch import DomainWatch
 from rosproxy.ros2.registry.ports import REMEMBERED
 from rosproxy.ros2.registry.selected import NEWS_TIMEOUT
 from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
+from rosproxy.ros2.status import Ros2State
+from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
 from rosproxy.settings import SettingError
 
@@ -118,7 +127,10 @@ class Ros2:
                 taken += server.start()
         report_taken_ports("2", settings, taken, self._runtime.problems)
 
-    async def probe(self) -> tuple[PortProbe, ...]:
+    async def settle(self) -> None:
+        """Its ports can be probed at once."""
+
+    async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
         """Whether the discovery port of each domain is reached by UDP where outside finds it."""
         return tuple([await self._probe(server) for server in self.servers])
 
@@ -130,8 +142,13 @@ class Ros2:
         advertised = str(HostPort(self._settings.advertise_host, port))
         return PortProbe(settings.discovery_port, advertised, outcome, "unknown", "udp")
 
+    async def try_ports(self) -> tuple[PortProbe, ...]:
+        """Instead of a start: take the range, try it, and let go. Raises SettingError."""
+        return await try_ports(self._runtime)
+
     async def stop(self) -> None:
-        """End everything; no task may run any more."""
+        """End everything."""
+        await self._runtime.tasks.cancel()
         await self.plane.stop()
         for server in self.servers:
             server.close()
@@ -208,11 +225,41 @@ class Ros2:
         """
         return not self._awaiting and self._runtime.policy.ask(kind, name, (), address).allowed
 
-    async def apply_policy(self) -> None:
+    async def apply_policy(self) -> EnforcementCounts:
         """Match participants anew of whom the policy says something else than before."""
         self._applied = self._runtime.policy.version
         for server in self.servers:
             server.apply_policy()
+        return EnforcementCounts()
+
+    retired = False
+    """Participants that it forgets are heard again."""
+
+    def unready(self) -> str | None:
+        """It needs no master, and is ready once it has begun."""
+        return None
+
+    def add_to(self, status: ProxyStatus) -> ProxyStatus:
+        """The status of the proxy, with what there is to tell of ROS 2.
+
+        Beside ROS 1, the networks, the ports and the data plane are those of ROS 1.
+        """
+        domains = self.state.status()
+        hidden = list(self.state.hidden(self._runtime.policy))
+        status = replace(status, domains=domains, policy=with_hidden(status.policy, hidden))
+        if self._settings.for_ros1:
+            return status
+        return replace(
+            status,
+            settings=replace(status.settings, inside_networks=tuple(map(str, self.networks))),
+            ports=PortsStatus(
+                status.ports.listen,
+                status.ports.advertise,
+                sum(domain.ports_used for domain in domains),
+                sum(domain.ports_free for domain in domains),
+            ),
+            data_plane=domains[0].data_plane if domains else None,
+        )
 
     async def _look_at_policy(self) -> None:
         if self._applied != self._runtime.policy.version:

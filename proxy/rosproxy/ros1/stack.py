@@ -14,14 +14,14 @@ from typing import Any
 from rosproxy.admin.requests import (
     ContainerNews,
     EmptyBody,
+    EnforcementCounts,
     MasterAddress,
+    PortProbe,
     read_body,
 )
 from rosproxy.admin.server import Action
-from rosproxy.admin.status import ProxyState
 from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.app.binding import setting_error_if_taken
-from rosproxy.app.holders import report_taken_ports
+from rosproxy.binding import report_taken_ports, setting_error_if_taken
 from rosproxy.forwarding.kernel.nft import Table
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
@@ -34,6 +34,8 @@ from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
+from rosproxy.ros1.range_probe import probe_range
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
@@ -41,11 +43,12 @@ from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
 from rosproxy.ros1.standins.ports import TIDY_INTERVAL, StandInPorts
+from rosproxy.ros1.status import Ros1State
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, EnforcementCounts, PolicyEnforcer
+from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, PolicyEnforcer
 from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -68,6 +71,7 @@ class Ros1:
 
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
+        runtime.metrics.known_methods = KNOWN_METHODS
         self.context = context = Context(runtime)
         self._access = access = AccessChecks(
             context.policy, context.registry, context.addressing, context.upstream
@@ -99,7 +103,7 @@ class Ros1:
         self.master_monitor = monitor = MasterMonitor(
             context, self._recovery, registrar, self._memory
         )
-        self._state = ProxyState(context, monitor, self.tcpros, self.stand_ins, plane)
+        self._state = Ros1State(context, monitor, self.tcpros, self.stand_ins, plane)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(
             context, leases, self.stand_ins, self._adopter, self.tcpros, access
@@ -201,17 +205,39 @@ class Ros1:
         await asyncio.gather(self.tcpros.relays.stop(), *servers)
         await self.context.upstream.close()
 
-    async def enforce_policy(self) -> EnforcementCounts:
+    @property
+    def retired(self) -> bool:
+        """Whether all its nodes were unregistered, for good."""
+        return self.context.retired
+
+    async def settle(self) -> None:
+        """Wait until the master has answered: it tries the range, and is the first cause else."""
+        await self.master_monitor.answered.wait()
+
+    async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
+        """How some ports of the range are reached from outside."""
+        return await probe_range(self.context, self.leases, or_fast)
+
+    async def try_ports(self) -> tuple[PortProbe, ...]:
+        """Instead of a start: take the range, have it tried, and let go. Raises SettingError."""
+        try:
+            self.reserve_range()
+            return await self.probe(or_fast=True)
+        finally:
+            self.leases.close_all()
+            await self.context.upstream.close()
+
+    async def apply_policy(self) -> EnforcementCounts:
         """Make everything fit the policy. Raises Unreachable, MasterError."""
         return await self._enforcer.enforce()
 
-    def status(self) -> ProxyStatus:
-        """The state."""
-        return self._state.status()
+    def add_to(self, status: ProxyStatus) -> ProxyStatus:
+        """The status of the proxy, with what there is to tell of ROS 1."""
+        return self._state.add_to(status)
 
     def unready(self) -> str | None:
         """Why nodes can't use it now; None if they can."""
-        if self.context.retired:
+        if self.retired:
             return "retired: nothing is registered any more"
         if self.master_monitor.up:
             return None

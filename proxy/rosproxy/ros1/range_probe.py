@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
-from rosproxy.admin.requests import PortProbe, RangeProbe
+from rosproxy.admin.requests import PortProbe
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
@@ -63,7 +63,7 @@ class _Trial:
 
 async def probe_range(
     context: Context, leases: Leases[Endpoint], or_fast: bool = True
-) -> RangeProbe:
+) -> tuple[PortProbe, ...]:
     """Try the lowest and the highest free port of the range; where none is free, one fast port.
 
     After that the proxy forwards the topics of the fast port's node for a while, so it is optional:
@@ -88,7 +88,7 @@ async def probe_range(
         probes.append(PortProbe(port, str(target), from_proxy, from_master))
         if probes[0].from_master == "missed" or pool.free == 1:
             break
-    return RangeProbe(tuple(probes))
+    return tuple(probes)
 
 
 async def _dial(context: Context, trial: _Trial, target: HostPort) -> str:

@@ -1,7 +1,9 @@
-"""Reports the ports of the range that are taken, with who has them if that is another proxy."""
+"""Ports and addresses that can't be bound, told by the option that names them, and who has them."""
 
+import contextlib
+import errno
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from rosproxy.leases.leases import RANGE_OPTION
 from rosproxy.net import signs
@@ -9,6 +11,23 @@ from rosproxy.settings import SettingError, Settings
 from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def setting_error_if_taken(
+    option: str, subject: object, holders: Collection[object] = ()
+) -> Iterator[None]:
+    """While ``subject`` is bound; raises SettingError instead of OSError.
+
+    ``holders`` are those who are likely to have it, if somebody has.
+    """
+    try:
+        yield
+    except OSError as error:
+        text = f"{subject} can't be bound: {error.strerror}"
+        if error.errno == errno.EADDRINUSE:
+            text += f" by {'; '.join(map(str, holders))}" if holders else " (ss -ltunp: by whom)"
+        raise SettingError(option, text) from None
 
 
 def report_taken_ports(

@@ -7,10 +7,10 @@ from typing import cast
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.domain_plane import DomainPlane
-from rosproxy.admin.ros2_status import Ros2State
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
-from rosproxy.app.domain_watch import MOST_NOTED, DomainWatch
+from rosproxy.ros2.domain_plane import DomainPlane
+from rosproxy.ros2.domain_watch import MOST_NOTED, DomainWatch
+from rosproxy.ros2.status import Ros2State
 from rosproxy.telemetry.problems import Problems
 
 GOOD = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")

@@ -4,8 +4,6 @@ import struct
 from dataclasses import dataclass
 from typing import cast
 
-from rosproxy.admin.domain_plane import DomainPlane
-from rosproxy.admin.ros2_status import Ros2State
 from rosproxy.admin.status_document import (
     DataPlaneStatus,
     DomainStatus,
@@ -13,9 +11,11 @@ from rosproxy.admin.status_document import (
     NamedTypeStatus,
 )
 from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import Lease
 from rosproxy.ros2.servers.domain_server import DomainServer
+from rosproxy.ros2.status import Ros2State
 from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, domain, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload
 

@@ -9,10 +9,9 @@ from prometheus_client.registry import Collector
 
 from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.admin import status_document as document
-from rosproxy.admin.domain_plane import DomainPlane
-from rosproxy.admin.status import policy_status
 from rosproxy.admin.status_bounds import bounded_names
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.names import is_of_service, ros_name, ros_service, ros_topic, ros_type
 from rosproxy.ros2.registry.matching import MismatchedPair, mismatched_pairs
 from rosproxy.ros2.registry.participants import (
@@ -45,20 +44,16 @@ class Ros2State(Collector):
         """The domains."""
         return tuple(self._domain(server) for server in self._servers)
 
-    def policy(
-        self, policy: AccessPolicy, ros1_policy: document.PolicyStatus | None
-    ) -> document.PolicyStatus:
-        """The layers in force and what they hide, of ROS 2 and, in ``ros1_policy``, of ROS 1."""
-        hidden = list(ros1_policy.hidden) if ros1_policy else []
+    def hidden(self, policy: AccessPolicy) -> Iterator[document.HiddenStatus]:
+        """What the policy keeps from participants outside."""
         for server in self._servers:
             for participant in server.domain.inside.by_prefix.values():
                 for (kind, name), allowed in participant.verdicts.items():
                     if not allowed:
                         reason = policy.judge(kind, name, (), participant.address).reason
-                        hidden.append(
-                            document.HiddenStatus(kind.value, name, participant.guid_prefix, reason)
+                        yield document.HiddenStatus(
+                            kind.value, name, participant.guid_prefix, reason
                         )
-        return policy_status(policy, hidden, ros1_policy.left_out if ros1_policy else 0)
 
     def collect(self) -> Iterable[Metric]:
         """The state as metrics: gauges, and counters of datagrams."""

@@ -3,8 +3,8 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.domain_problems import DomainProblem, domain_problems
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
+from rosproxy.ros2.domain_problems import DomainProblem, domain_problems
 
 INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")

@@ -1,0 +1,71 @@
+"""Does what is sent to the advertised host by UDP come in? Tried by the proxy itself.
+
+In ROS 2 nobody outside can be asked to try, and where NAT has no way back (no hairpin) the try
+fails although outside gets through. So a success proves much, and a failure little.
+"""
+
+import asyncio
+import contextlib
+import secrets
+import socket
+
+from rosproxy.admin.requests import PortProbe
+from rosproxy.binding import report_taken_ports
+from rosproxy.forwarding import datagrams
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.resolver import resolve
+from rosproxy.runtime import Runtime
+
+ATTEMPTS, WITHIN = 3, 1.0
+"""UDP may lose some: how many are sent, and the seconds in which each may come back."""
+
+
+async def try_udp(target: HostPort, secret: bytes, heard: asyncio.Event) -> str:
+    """Send a secret to an IP address and port: ``ok`` if ``heard`` is set then, else why not."""
+    family = socket.AF_INET6 if ":" in target.host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        for _ in range(ATTEMPTS):
+            try:
+                sock.sendto(secret, (target.host, target.port))
+            except OSError:
+                return "unreachable"
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(WITHIN):
+                    await heard.wait()
+                return "ok"
+    return "silent"
+
+
+async def try_ports(runtime: Runtime) -> tuple[PortProbe, ...]:
+    """Take all ports of the range, and try the first, where outside finds the first domain.
+
+    Raises SettingError if none can be had.
+    """
+    settings, addresses = runtime.settings, await resolve(runtime.settings.advertise_host)
+    ports, taken = settings.ports, list[int]()
+    with contextlib.ExitStack() as stack:
+        bound: dict[int, socket.socket] = {}
+        for port in ports.listen.ports():
+            try:
+                bound[port] = stack.enter_context(datagrams.bind(settings.bind, port))
+            except OSError:
+                taken.append(port)
+        report_taken_ports("2", settings, taken, runtime.problems)
+        first = ports.listen.first
+        if first not in bound or not addresses:
+            return ()
+        heard, secret = asyncio.Event(), secrets.token_bytes(16)
+        loop = asyncio.get_running_loop()
+        loop.add_reader(bound[first], _listen_for, bound[first], secret, heard)
+        try:
+            outcome = await try_udp(HostPort(addresses[0], ports.advertise.first), secret, heard)
+        finally:
+            loop.remove_reader(bound[first])
+    advertised = str(HostPort(settings.advertise_host, ports.advertise.first))
+    return (PortProbe(first, advertised, outcome, "unknown", "udp"),)
+
+
+def _listen_for(sock: socket.socket, secret: bytes, heard: asyncio.Event) -> None:
+    with contextlib.suppress(OSError):
+        if sock.recv(datagrams.LARGEST_DATAGRAM) == secret:
+            heard.set()
