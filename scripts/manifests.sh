@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Write what is made from the chart: manifests/install.yaml, its README.md, and the tables of the
-# RosProxy's fields in docs/.
+# RosProxy's fields in docs/; and that of the proxy's settings.
 #   scripts/manifests.sh [DIRECTORY]      manifest and README go there instead, and the tables stay
 # Needs helm and helm-docs: those of the cluster's programs (scripts/install-kubernetes.sh), else the
 # PATH's.
@@ -25,4 +25,5 @@ helm-docs --log-level error --dry-run --chart-search-root charts --sort-values-o
 
 if [ $# = 0 ]; then
   "${PYTHON:-.venv/bin/python}" scripts/custom_resource_docs.py
+  "${PYTHON:-.venv/bin/python}" -m scripts.options_docs
 fi

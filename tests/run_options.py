@@ -8,8 +8,9 @@ from unittest import mock
 import click
 
 from rosproxy.cli.main import run
-from rosproxy.cli.options import OneLineError
-from rosproxy.settings import SettingError, Settings, make_settings
+from rosproxy.cli.options import OneLineError, make_settings
+from rosproxy.settings import Settings
+from rosproxy.values import SettingError
 
 
 def parse_settings(options: Mapping[str, Any]) -> Settings:
@@ -32,8 +33,7 @@ def _run(words: list[str], variables: Mapping[str, str]) -> Settings:
         except click.UsageError as error:
             option, _, message = OneLineError(error, "rosproxy").message.partition(": ")
             raise SettingError(option, message) from None
-    others = ("check", "deep", "log_format", "log_level")
-    return make_settings(**{name: value for name, value in values.items() if name not in others})
+    return make_settings(Settings, values)
 
 
 def _words(name: str, value: Any) -> Iterator[str]:

@@ -10,17 +10,15 @@ from typing import Any
 
 import click
 
-from rosproxy import __version__
+from rosproxy import __version__, values
 from rosproxy.cli.main import main as proxy_main
 from rosproxy.cli.options import (
-    BIND_ADDRESS,
     GROUP_SETTINGS,
-    HOST,
-    PORT_RANGE,
     Command,
     Commands,
     Parsed,
     Seconds,
+    click_type,
     config_option,
     log_options,
     setting_errors,
@@ -118,7 +116,7 @@ def main() -> None:
 )
 @click.option(
     "--advertise-host",
-    type=HOST,
+    type=click_type(values.HOST),
     help="Name or address under which outside nodes and masters reach this host. Default: this "
     "host's address towards the master.",
 )
@@ -131,14 +129,14 @@ def main() -> None:
 )
 @click.option(
     "--port-window",
-    type=PORT_RANGE,
+    type=click_type(values.PORT_RANGE),
     default="11412-65535",
     metavar="A-B",
     help="Where ranges of ports are looked for.",
 )
 @click.option(
     "--publish-address",
-    type=BIND_ADDRESS,
+    type=click_type(values.BIND_ADDRESS),
     multiple=True,
     default=("0.0.0.0",),
     metavar="ADDRESS",
@@ -269,14 +267,14 @@ for command in (docker_commands.status, docker_commands.plan, docker_commands.do
 )
 @click.option(
     "--node-port-range",
-    type=PORT_RANGE,
+    type=click_type(values.PORT_RANGE),
     default="30000-32767",
     metavar="A-B",
     help="The API server's --service-node-port-range: no proxy gets a port of it.",
 )
 @click.option(
     "--ephemeral-range",
-    type=PORT_RANGE,
+    type=click_type(values.PORT_RANGE),
     default="32768-60999",
     metavar="A-B",
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",

@@ -1,116 +1,333 @@
 """The settings of a proxy: plain data, checked.
 
-``read_…`` makes one value of a text, as it comes from a command line, an environment or a label,
-and raises ValueError with what is wrong and an example. `make_settings` puts values together and
-raises SettingError where they don't go together.
+Each is written once, in `Settings`: its field, type, default, and the `Option` from which come the
+option of ``rosproxy run``, its variable, its key in the file of ``--config``, its help, its bounds
+and its row in docs/reference/options.md.
 """
 
-import hashlib
-import json
-import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from ipaddress import ip_address, ip_network
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Literal
 
-from rosproxy.access.layers import PolicyLayer, PolicyMode, check_bounds, read_layers
+from rosproxy import values
+from rosproxy.access.layers import PolicyLayer, PolicyMode, check_bounds
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net import addresses
-from rosproxy.net.addresses import HostPort, Network, parse_host_port
+from rosproxy.net.addresses import HostPort, Network
+from rosproxy.values import DataPlane, Direction, Option, SettingError, SlaveControl, hash_token
 
 MEBIBYTE = 1024 * 1024
 LEAST_PER_DOMAIN = 4
 """Ports of the range for a domain of ROS 2: one to be found at, three for a participant."""
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
-DataPlane = Literal["auto", "kernel", "splice", "copy"]
-"""How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
-Direction = Literal["out", "both"]
-"""Who reaches the other side through the proxy: outside alone, or the nodes inside, too."""
-SlaveControl = Literal["any", "master"]
-"""Who may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
-
-_Value = TypeVar("_Value")
-_RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
-_TOKEN = re.compile(r"[!-~]{8,200}")
-_HASH = re.compile(r"[0-9a-f]{64}")
-_LONGEST = 40
-"""Characters of a bad value that a message repeats."""
+DEFAULT_RANGE = PortRange(11000, 11099)
 
 
-class SettingError(ValueError):
-    """A setting that can't be used. ``option`` names it as on the command line."""
-
-    def __init__(self, option: str, problem: str) -> None:
-        super().__init__(f"{option}: {problem}")
-        self.option = option
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Everything that ``rosproxy run`` can be told. Times are in seconds.
 
     ``inside_networks`` empty means: the networks of the proxy's own interfaces, with ``direction``
-    ``both`` without that of the default route if there are others.
-    ``master_address``: the IP address of the master's host where the proxy can't resolve its name
-    or would find itself. ``direction`` ``both``: nodes inside reach those outside through the
-    proxy, too; ``udp``: the range is published for UDP as well. ``admin_token``: what callers that
-    are not on loopback must know, or ``admin_token_hash``: its SHA-256 in hex digits, for a proxy
-    that is not to hold the token.
-    ``ros`` are the versions of ROS that it is for, 1 or 2 or both. Of ROS 2: ``ros2_domain`` are
-    the domains, which share the range out among them (none: domain 0), ``ros2_peer`` who outside is
-    told of participants inside (with port 0 at the well-known ports), ``ros2_ear`` where the ear
-    listens.
-    ``policy`` are the layers of the options, in ``policy_mode`` as is that of the ``policy_file``;
-    ``policy_layers`` are those that an operator gives for the start, ``await_policy`` is how long
-    nothing is registered then, unless the operator has told the present ones before.
-    Raises SettingError if two of them want the same port, or both a token and a hash are given.
+    ``both`` without that of the default route if there are others. A ``ros2_peer`` with port 0 is
+    told at the well-known ports. Raises SettingError where two of them don't go together.
     """
 
-    master_uri: str
-    advertise_host: str
-    ports: PortMap
-    ros: tuple[str, ...] = ("1",)
-    ros2_domain: tuple[int, ...] = ()
-    ros2_peer: tuple[HostPort, ...] = ()
-    ros2_ear: HostPort | None = None
-    master_port: int = 11311
-    publish_master: int | None = None
-    bind: str = "0.0.0.0"
-    admin: HostPort = DEFAULT_ADMIN
-    inside_networks: tuple[Network, ...] = ()
-    probe_interval: float = 5.0
-    probe_timeout: float = 3.0
-    cleanup_after: float = 30.0
-    linger: float = 30.0
-    master_interval: float = 2.0
-    slave_control: SlaveControl = "any"
-    data_plane: DataPlane = "auto"
-    direction: Direction = "out"
-    udp: bool = False
-    master_address: str | None = None
-    admin_token: str | None = field(default=None, repr=False)
-    admin_token_hash: str | None = None
-    max_lease_call: int = 1
-    max_master_call: int = 4
-    max_body: int = 64
-    max_buffered: int = 32
-    max_connections_per_source: int = 4096
-    max_connections_per_lease: int = 2048
-    policy: tuple[PolicyLayer, ...] = ()
-    policy_mode: PolicyMode = PolicyMode.ENFORCE
-    policy_file: str | None = None
-    policy_layers: tuple[PolicyLayer, ...] = ()
-    await_policy: float = 0.0
+    ros: Annotated[
+        tuple[Literal["1", "2"], ...],
+        Option(
+            "Version of ROS that the proxy is for. Repeatable: one process for both, with one "
+            "range, which ROS 1 uses for TCP and ROS 2 for UDP.",
+            repeatable=True,
+            note="`1 2` for both",
+        ),
+    ] = ("1",)
+    master_uri: Annotated[
+        str,
+        Option(
+            "The real master, e.g. `http://robot:11311`. It need not be up when the proxy starts.",
+            values.MASTER_URI,
+            variables=("ROS_MASTER_URI",),
+            default="required for ROS 1",
+        ),
+    ] = ""
+    master_address: Annotated[
+        str | None,
+        Option(
+            "IP address of the master's host, to connect to instead of resolving its name; the "
+            "name may then be [one of the proxy itself](../guide/by-hand.md#keep-the-masters-name)."
+            " It can be changed at run time.",
+            values.ADDRESS,
+            default="where its name leads",
+        ),
+    ] = None
+    advertise_host: Annotated[
+        str,
+        Option(
+            "Name or address under which outside nodes and the master reach this host. All of "
+            "them must be able to resolve it.",
+            values.HOST,
+        ),
+    ]
+    master_port: Annotated[
+        int,
+        Option(
+            "Where inside nodes find their master: `ROS_MASTER_URI=http://<proxy>:11311`.",
+            values.PORT,
+        ),
+    ] = 11311
+    port_range: Annotated[
+        PortRange,
+        Option(
+            "Ports that the proxy listens on. [One for each node inside]"
+            "(../guide/by-hand.md#how-many-ports); publish exactly these.",
+            values.PORT_RANGE,
+        ),
+    ] = DEFAULT_RANGE
+    advertise_port_range: Annotated[
+        PortRange | None,
+        Option(
+            "The same ports as outside sees them, if that differs: as many, in the same order.",
+            values.PORT_RANGE,
+            default="as `--port-range`",
+        ),
+    ] = None
+    publish_master: Annotated[
+        int | None,
+        Option(
+            "Where the master itself runs inside: offers it to outside on this port (publish it "
+            "too). It calls nodes at the advertised address, so it must itself reach the host's "
+            "published ports; Docker's own port proxy sees to that, NAT without hairpin does not.",
+            values.PORT,
+            default="off",
+        ),
+    ] = None
+    bind: Annotated[
+        str,
+        Option("Address to listen on; `::` for IPv4 and IPv6.", values.BIND_ADDRESS),
+    ] = "0.0.0.0"
+    admin: Annotated[
+        HostPort,
+        Option(
+            "The admin endpoint ([API](admin-api.md)) and the live page. To let Prometheus scrape, "
+            "bind it to an address that only your monitoring reaches.",
+            values.HOST_PORT,
+            name="--admin-bind",
+        ),
+    ] = DEFAULT_ADMIN
+    admin_token: Annotated[
+        str | None,
+        Option(
+            "What callers that are not on loopback must send to change anything at the admin "
+            "endpoint, and give to see the [live page](../guide/live-page.md#who-may-look): 8 to "
+            "200 printable ASCII characters without spaces. Better given as a variable: a command "
+            "line can be seen by all.",
+            values.TOKEN,
+            default="none",
+        ),
+    ] = field(default=None, repr=False)
+    admin_token_hash: Annotated[
+        str | None,
+        Option(
+            "The same for a proxy that is not to hold the token: its SHA-256 in 64 hex digits "
+            "(`printf %s \"$TOKEN\" | sha256sum`). Whoever reads the proxy's environment can't "
+            "call it then, as long as the token can't be guessed: make it of `openssl rand -hex "
+            "16`.",
+            values.TOKEN_HASH,
+            default="none",
+        ),
+    ] = None
+    inside_networks: Annotated[
+        tuple[Network, ...],
+        Option(
+            "A network of nodes inside. Only addresses in one, or selected by an operator, may use "
+            "the proxy as their master; there nodes reach each other directly. Repeatable.",
+            values.NETWORK,
+            name="--inside-network",
+            variables=("ROSPROXY_INSIDE_NETWORKS",),
+            repeatable=True,
+            default="networks of the proxy's interfaces",
+            note="separated by spaces",
+        ),
+    ] = ()
+    probe_interval: Annotated[
+        float,
+        Option(
+            "Time between probes of an idle node. One that ends is noticed at once.",
+            values.time(0.05),
+        ),
+    ] = 5.0
+    probe_timeout: Annotated[
+        float, Option("Time that a node has to answer.", values.time(0.05))
+    ] = 3.0
+    cleanup_after: Annotated[
+        float,
+        Option(
+            "Time after which a node that is gone is unregistered at the master. 0: never.",
+            values.time(0),
+        ),
+    ] = 30.0
+    linger: Annotated[
+        float,
+        Option("Time for which a port is kept after its node has ended.", values.time(0)),
+    ] = 30.0
+    master_interval: Annotated[
+        float, Option("Time between looks at the master.", values.time(0.05))
+    ] = 2.0
+    slave_control: Annotated[
+        SlaveControl,
+        Option(
+            "Who may call `shutdown`, `publisherUpdate` and `paramUpdate` at inside nodes. With "
+            "`master`, `rosnode kill` works from the master's host only."
+        ),
+    ] = "any"
+    policy_rules: Annotated[
+        tuple[tuple[Rule, ...], ...],
+        Option(
+            "What outside may see and do, and what inside may take from outside: [rules]"
+            "(policy.md) such as `deny publish /camera/*`. Repeatable.",
+            values.POLICY_RULES,
+            name="--policy",
+            repeatable=True,
+            default="none",
+            note="one text, rules separated by `;` or line ends",
+        ),
+    ] = ()
+    policy_mode: Annotated[
+        Literal["enforce", "audit"],
+        Option("Whether the rules of `--policy` and `--policy-file` are enforced, or only told."),
+    ] = "enforce"
+    policy_file: Annotated[
+        str | None,
+        Option(
+            "A file with more such rules, a line each; it is read again when it changes.",
+            values.FILE,
+            default="none",
+        ),
+    ] = None
+    policy_layers: Annotated[
+        tuple[PolicyLayer, ...],
+        Option(
+            "For operators: the layers of rules at the start, as [`POST /policy`]"
+            "(admin-api.md#policy) takes them.",
+            values.POLICY_LAYERS,
+            default="none",
+        ),
+    ] = ()
+    await_policy: Annotated[
+        float,
+        Option(
+            "For operators: time at the start without registrations before `POST /policy` comes.",
+            values.time(0),
+        ),
+    ] = 0.0
+    direction: Annotated[
+        Direction,
+        Option(
+            "`both`: nodes inside reach those outside through the proxy, too, at [ports on its "
+            "inside addresses](../guide/by-hand.md#no-way-out-but-the-proxy)."
+        ),
+    ] = "out"
+    udp: Annotated[
+        bool,
+        Option(
+            "With `--direction both`: the range is published for UDP, too, so that UDPROS of a "
+            "publisher outside comes in. Without, a subscriber gets TCPROS if it offers that."
+        ),
+    ] = False
+    data_plane: Annotated[
+        DataPlane, Option("How topics' bytes are forwarded, see [data plane](#data-plane).")
+    ] = "auto"
+    max_lease_call: Annotated[
+        int,
+        Option(
+            "Longest call of outside to a node, with 10,000 XML elements for each MiB. This and "
+            "the next five: [bounds](limits.md).",
+            values.MEBIBYTES,
+        ),
+    ] = 1
+    max_master_call: Annotated[
+        int,
+        Option(
+            "Longest call with addresses of a node to the master; 5,000 elements for each MiB.",
+            values.MEBIBYTES,
+        ),
+    ] = 4
+    max_body: Annotated[
+        int,
+        Option(
+            "Longest parameter, or other call or reply without addresses, that passes.",
+            values.MEBIBYTES,
+        ),
+    ] = 64
+    max_buffered: Annotated[
+        int,
+        Option(
+            "Memory for all calls and replies that are read; one source gets half of it.",
+            values.MEBIBYTES,
+        ),
+    ] = 32
+    max_connections_per_source: Annotated[
+        int,
+        Option(
+            "Connections from one address; behind NAT or Docker's port proxy many share one.",
+            values.CONNECTIONS,
+        ),
+    ] = 4096
+    max_connections_per_lease: Annotated[
+        int, Option("Connections to one port of the range.", values.CONNECTIONS)
+    ] = 2048
+    ros2_domain: Annotated[
+        tuple[int, ...],
+        Option(
+            "[ROS 2](../guide/ros2.md): a domain. Repeatable; they share out the range equally.",
+            values.DOMAIN,
+            variables=("ROSPROXY_ROS2_DOMAINS", "ROS_DOMAIN_ID"),
+            repeatable=True,
+            default="0",
+        ),
+    ] = ()
+    ros2_peer: Annotated[
+        tuple[HostPort, ...],
+        Option(
+            "ROS 2: a host outside that is told of participants inside, at the well-known ports of "
+            "its first 32 participants; or another proxy, with the first port of its range, where "
+            "this one has a single domain. Repeatable.",
+            values.PEER,
+            variables=("ROSPROXY_ROS2_PEERS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    ros2_ear: Annotated[
+        HostPort | None,
+        Option(
+            "ROS 2: where [`rosproxy ear`](../guide/ros2.md#the-lan) listens, for a single domain.",
+            values.HOST_PORT,
+            default="none",
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:
             raise SettingError("--admin-token-hash", "goes instead of --admin-token, not with it")
+        self._check_ranges()
         try:
             check_bounds((*self.policy, *self.policy_layers))
         except ValueError as error:
             raise SettingError("--policy", str(error)) from None
         self._check_versions()
+        self._check_ports()
+
+    def _check_ranges(self) -> None:
+        advertise = self.advertise_port_range
+        if advertise and len(advertise) != len(self.port_range):
+            text = (
+                f"{advertise} has {len(advertise)} ports and --port-range {self.port_range} has "
+                f"{len(self.port_range)}; both need the same number"
+            )
+            raise SettingError("--advertise-port-range", text)
+
+    def _check_ports(self) -> None:
         taken: dict[int, str] = {}
         for option, port in (
             ("--master-port", self.master_port),
@@ -119,8 +336,8 @@ class Settings:
         ):
             if port is None:
                 continue
-            if port in self.ports.listen:
-                text = f"port {port} lies in --port-range {self.ports.listen}; move one of them"
+            if port in self.port_range:
+                text = f"port {port} lies in --port-range {self.port_range}; move one of them"
                 raise SettingError(option, text)
             if port in taken:
                 text = f"port {port} is that of {taken[port]}; move one of them"
@@ -132,8 +349,8 @@ class Settings:
             text = "missing; give the real ROS master, e.g. http://robot:11311 (ROS_MASTER_URI)"
             raise SettingError("--master-uri", text)
         count = len(self.domains)
-        if self.for_ros2 and len(self.ports.listen) < LEAST_PER_DOMAIN * count:
-            text = f"{self.ports.listen} is too short: each of {count} domains needs"
+        if self.for_ros2 and len(self.port_range) < LEAST_PER_DOMAIN * count:
+            text = f"{self.port_range} is too short: each of {count} domains needs"
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
         if self.for_ros2 and count > 1:
             self._check_domains_stay_apart()
@@ -147,6 +364,17 @@ class Settings:
             if peer.port:
                 text = f"{peer} is one domain of another proxy: {cure}"
                 raise SettingError("--ros2-peer", text)
+
+    @property
+    def ports(self) -> PortMap:
+        """What the proxy listens on, and what outside sees."""
+        return PortMap(self.port_range, self.advertise_port_range or self.port_range)
+
+    @property
+    def policy(self) -> tuple[PolicyLayer, ...]:
+        """The layer of the options' own rules; none without rules."""
+        rules = tuple(rule for given in self.policy_rules for rule in given)
+        return (PolicyLayer("--policy", rules, PolicyMode(self.policy_mode)),) if rules else ()
 
     @property
     def for_ros1(self) -> bool:
@@ -170,159 +398,3 @@ class Settings:
         It is that of the token where that was given: the admin endpoint holds a hash in any case.
         """
         return hash_token(self.admin_token) if self.admin_token else self.admin_token_hash
-
-
-def hash_token(token: str) -> str:
-    """The SHA-256 of a token, in 64 hex digits, as ``--admin-token-hash`` takes it."""
-    return hashlib.sha256(token.encode()).hexdigest()
-
-
-def make_settings(
-    port_range: PortRange,
-    advertise_port_range: PortRange | None,
-    admin_bind: HostPort,
-    inside_network: tuple[Network, ...],
-    policy: tuple[tuple[Rule, ...], ...] = (),
-    policy_mode: str = PolicyMode.ENFORCE.value,
-    **others: Any,
-) -> Settings:
-    """Settings from the values of the command line's options, by their names.
-
-    Raises SettingError if they don't go together.
-    """
-    advertise = advertise_port_range or port_range
-    if len(advertise) != len(port_range):
-        raise SettingError(
-            "--advertise-port-range",
-            f"{advertise} has {len(advertise)} ports and --port-range {port_range} has "
-            f"{len(port_range)}; both need the same number",
-        )
-    ports = PortMap(port_range, advertise)
-    others["master_uri"] = others.get("master_uri") or ""  # ROS 2 has none
-    mode, rules = PolicyMode(policy_mode), tuple(rule for given in policy for rule in given)
-    return Settings(
-        ports=ports,
-        admin=admin_bind,
-        inside_networks=inside_network,
-        policy=(PolicyLayer("--policy", rules, mode),) if rules else (),
-        policy_mode=mode,
-        **others,
-    )
-
-
-def read_range(text: str) -> PortRange:
-    """A range of ports, ``first-last``. Raises ValueError."""
-    found = _RANGE.fullmatch(text)
-    if found is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 11000-11099")
-    ports = PortRange(int(found[1]), int(found[2]))
-    if not 1 <= ports.first <= ports.last <= 65535:
-        raise ValueError(f"{text!r} must rise and lie between 1 and 65535, such as 11000-11099")
-    return ports
-
-
-def read_host(text: str) -> str:
-    """A host name or address, which comes out without brackets. Raises ValueError."""
-    bare = text.strip("[]")
-    if parse_host_port(f"[{bare}]:1" if ":" in bare else f"{bare}:1") != HostPort(bare, 1):
-        raise ValueError(
-            f"{text[:_LONGEST]!r} is neither a host name nor an address such as 192.0.2.7"
-        )
-    return bare
-
-
-def read_address(text: str) -> str | None:
-    """An IP address in its plain form; None for no text. Raises ValueError."""
-    address = addresses.parse_address(text)
-    if text and address is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not an IP address such as 192.0.2.7")
-    return address
-
-
-def read_bind_address(text: str) -> str:
-    """An IP address to listen on, also the unspecified one. Raises ValueError."""
-    try:
-        return str(ip_address(text))
-    except ValueError:
-        message = f"{text[:_LONGEST]!r} is not an IP address of this host, such as 0.0.0.0"
-        raise ValueError(message) from None
-
-
-def read_host_port(text: str) -> HostPort:
-    """``host:port`` or ``[v6]:port``. Raises ValueError."""
-    where = parse_host_port(text)
-    if where is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not of the form {DEFAULT_ADMIN}")
-    return where
-
-
-def read_peer(text: str) -> HostPort:
-    """A peer of ROS 2: a host, or ``host:port``; without a port it is 0. Raises ValueError."""
-    try:
-        return HostPort(read_host(text), 0)
-    except ValueError:
-        return read_host_port(text)
-
-
-def read_network(text: str) -> Network:
-    """A network as CIDR. Raises ValueError."""
-    try:
-        return ip_network(text)
-    except ValueError as error:
-        message = f"{text[:_LONGEST]!r} is not a network such as 172.18.0.0/16: {error}"
-        raise ValueError(message) from None
-
-
-def read_master_uri(text: str) -> str:
-    """The URI of a ROS master. Raises ValueError."""
-    if not text.startswith("http://") or addresses.parse_authority(text) is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not of the form http://host:11311")
-    return text
-
-
-def read_token(text: str) -> str | None:
-    """What travels in a header: printable ASCII without spaces; None for no text.
-
-    Raises ValueError, which does not repeat it.
-    """
-    if text and not _TOKEN.fullmatch(text):
-        raise ValueError(
-            "must be 8 to 200 letters, digits or signs without spaces, for example the output of "
-            "openssl rand -hex 16"
-        )
-    return text or None
-
-
-def read_token_hash(text: str) -> str | None:
-    """A SHA-256 in hex digits, in lower case; None for no text. Raises ValueError."""
-    digits = text.strip().lower()
-    if digits and not _HASH.fullmatch(digits):
-        raise ValueError(
-            'must be the 64 hex digits of a SHA-256: printf %s "$TOKEN" | sha256sum gives them'
-        )
-    return digits or None
-
-
-def read_policy_layers(text: str) -> tuple[PolicyLayer, ...]:
-    """The layers of a policy as JSON; none for no text. Raises ValueError."""
-    try:
-        return read_layers(json.loads(text)) if text.strip() else ()
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-
-
-def parse_range(option: str, text: str) -> PortRange:
-    """Like `read_range`. Raises SettingError that names ``option``."""
-    return _named(option, read_range, text)
-
-
-def parse_host(option: str, text: str) -> str:
-    """Like `read_host`. Raises SettingError that names ``option``."""
-    return _named(option, read_host, text)
-
-
-def _named(option: str, read: Callable[[str], _Value], text: str) -> _Value:
-    try:
-        return read(text)
-    except ValueError as error:
-        raise SettingError(option, str(error)) from None

@@ -121,8 +121,14 @@ def make_addressing(
 
 def make_stand_ins(ports: PortMap | None = None, **options: Any) -> StandIns:
     """The stand-ins of a proxy whose master is ``robot``; none yet."""
-    listen = PortRange(45000, 45009)
-    settings = Settings("http://robot:11311", HOST, ports or PortMap(listen, listen), **options)
+    ports = ports or PortMap(PortRange(45000, 45009), PortRange(45000, 45009))
+    settings = Settings(
+        master_uri="http://robot:11311",
+        advertise_host=HOST,
+        port_range=ports.listen,
+        advertise_port_range=ports.advertise,
+        **options,
+    )
     return StandIns(settings)
 
 

@@ -8,6 +8,7 @@ from statistics import median
 
 import click
 import pytest
+from scripts import options_docs
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(
@@ -70,6 +71,11 @@ def test_every_option_is_documented() -> None:
     variables = [str(option.envvar) for option in run_options() if option.envvar]
     missing = [word for word in names + variables if not re.search(rf"(?<![\w-]){word}\b", text)]
     assert not missing
+
+
+def test_the_table_of_settings_is_that_of_the_code() -> None:
+    page = options_docs.PAGE.read_text()
+    assert page == options_docs.page(page), "run: make manifests"
 
 
 def test_architecture_names_what_exists() -> None:

@@ -2,13 +2,14 @@
 
 import click
 
-from rosproxy.cli.options import CONNECTIONS, MEBIBYTES, POLICY_RULES, Command, with_options
+from rosproxy import values
+from rosproxy.cli.options import Command, click_type, with_options
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS
 
 _POLICY = (
     click.option(
         "--policy",
-        type=POLICY_RULES,
+        type=click_type(values.POLICY_RULES),
         multiple=True,
         help='What outside may see and do at all proxies, and inside take, such as "deny publish '
         '/camera/*" (repeatable; several separated by ;). Others can only narrow it.',
@@ -25,25 +26,25 @@ _POLICY = (
 _BOUNDS = (
     click.option(
         "--proxy-max-buffered",
-        type=MEBIBYTES,
+        type=click_type(values.MEBIBYTES),
         default=OWN_BOUNDS.max_buffered,
         help="Memory of each proxy for calls and replies that are read.",
     ),
     click.option(
         "--proxy-max-body",
-        type=MEBIBYTES,
+        type=click_type(values.MEBIBYTES),
         default=OWN_BOUNDS.max_body,
         help="Longest parameter that passes a proxy.",
     ),
     click.option(
         "--proxy-max-connections-per-source",
-        type=CONNECTIONS,
+        type=click_type(values.CONNECTIONS),
         default=OWN_BOUNDS.max_connections_per_source,
         help="Connections of one address to a proxy.",
     ),
     click.option(
         "--proxy-max-connections-per-lease",
-        type=CONNECTIONS,
+        type=click_type(values.CONNECTIONS),
         default=OWN_BOUNDS.max_connections_per_lease,
         help="Connections to one port of a proxy.",
     ),

@@ -2,7 +2,8 @@
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
-from rosproxy.settings import LEAST_PER_DOMAIN, read_peer
+from rosproxy.settings import LEAST_PER_DOMAIN
+from rosproxy.values import read_peer
 
 LAST_DOMAIN = 232
 """The last one whose well-known ports are ports (DDSI-RTPS 2.5, 9.6.2.3)."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import SettingError, read_address, read_master_uri
+from rosproxy.values import SettingError, read_address, read_master_uri
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import make_proxy_bounds
 from rosproxy_operator.docker.planner.model import NOWHERE, PlanSettings

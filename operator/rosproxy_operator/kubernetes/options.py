@@ -5,7 +5,8 @@ The rest is in `rosproxy_operator.cli`.
 
 import click
 
-from rosproxy.cli.options import PORT_RANGE, Command, Parsed, with_options
+from rosproxy import values
+from rosproxy.cli.options import Command, Parsed, click_type, with_options
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import EVERY_PORT, read_glob, read_name, read_peers
 
@@ -31,7 +32,7 @@ def administrators_options(command: Command) -> Command:
         ),
         click.option(
             "--allow-port-window",
-            type=PORT_RANGE,
+            type=click_type(values.PORT_RANGE),
             default=f"{EVERY_PORT}",
             metavar="A-B",
             help="Where a RosProxy may have hostPorts: its portWindow and its master's port.",

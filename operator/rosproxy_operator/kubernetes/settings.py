@@ -11,7 +11,7 @@ import msgspec
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.settings import DataPlane, SettingError
+from rosproxy.values import DataPlane, SettingError
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
 from rosproxy_operator.kubernetes.resources.model import Json, Name

@@ -10,16 +10,17 @@ from collections.abc import Sequence
 from typing import Any
 
 from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.access.layers import read_layer
+from rosproxy.access.layers import PolicyMode, read_layer
 from rosproxy.access.policy_file import LOOK_INTERVAL, OPTION, PolicyFile
 from rosproxy.admin.requests import BodyError, PolicyNews, read_body
 from rosproxy.admin.status_document import to_json
 from rosproxy.app.stacks import Stack
 from rosproxy.runtime import Runtime
-from rosproxy.settings import SettingError, Settings
+from rosproxy.settings import Settings
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
+from rosproxy.values import SettingError
 
 OPERATOR_POLICY = "the operator's policy"
 """The subject of the problem that it was refused, which the proxy's status shows."""
@@ -37,7 +38,7 @@ class PolicySources:
         if not settings.policy_file:
             return
         file = PolicyFile(
-            settings.policy_file, settings.policy_mode, runtime.policy, runtime.problems
+            settings.policy_file, PolicyMode(settings.policy_mode), runtime.policy, runtime.problems
         )
         _read(file)
         runtime.tasks.repeat(file.look, LOOK_INTERVAL, "looking at the policy's file")
@@ -78,7 +79,7 @@ def read_policy_file(settings: Settings) -> None:
         metrics, problems = Metrics(), Problems()
         refusals = Refusals(metrics, problems, time.monotonic)
         policy = AccessPolicy(settings.policy, settings.policy_layers, metrics, refusals)
-        _read(PolicyFile(settings.policy_file, settings.policy_mode, policy, problems))
+        _read(PolicyFile(settings.policy_file, PolicyMode(settings.policy_mode), policy, problems))
 
 
 def _read(file: PolicyFile) -> None:

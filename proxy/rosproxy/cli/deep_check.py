@@ -21,7 +21,8 @@ from rosproxy.net import sockets
 from rosproxy.net.addresses import is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
-from rosproxy.settings import SettingError, Settings
+from rosproxy.settings import Settings
+from rosproxy.values import SettingError
 
 
 def deep_check(settings: Settings) -> list[DoctorFinding]:

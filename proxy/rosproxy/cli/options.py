@@ -9,18 +9,20 @@ import contextlib
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import click
 
-from rosproxy import settings
-from rosproxy.access.rules import parse_rules
+from rosproxy import values
 from rosproxy.cli import variables
 from rosproxy.cli.config_file import read_config
 from rosproxy.cli.variables import UnknownVariable
+from rosproxy.values import Setting, SettingError, declared
 
 Command = Callable[..., Any]
+_Settings = TypeVar("_Settings")
 GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
@@ -30,8 +32,8 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
     ``read`` raises ValueError, whose message says what is wrong with the text and gives an example.
     """
 
-    def __init__(self, name: str, read: Callable[[str], Any]) -> None:
-        self.name, self._read = name, read
+    def __init__(self, name: str, read: Callable[[str], Any], separable: bool = True) -> None:
+        self.name, self._read, self._separable = name, read, separable
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The value of a text. Raises click.BadParameter."""
@@ -40,16 +42,9 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
         except ValueError as error:
             self.fail(str(error), param, ctx)
 
-
-class PolicyRules(Parsed):
-    """Rules of a policy; a variable's value is one text, in which spaces separate no values."""
-
-    def __init__(self) -> None:
-        super().__init__("rules", parse_rules)
-
     def split_envvar_value(self, rv: str) -> Sequence[str]:
-        """The value of a variable, whole."""
-        return [rv]
+        """The values of a variable, where several may be given."""
+        return super().split_envvar_value(rv) if self._separable else [rv]
 
 
 class Seconds(click.FloatRange):
@@ -58,38 +53,64 @@ class Seconds(click.FloatRange):
     name = "s"
 
     def __init__(self, least: float) -> None:
-        super().__init__(least, 86400)
+        super().__init__(least, values.DAY)
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         """The value of a text. Raises click.BadParameter."""
         seconds = float(click.FLOAT.convert(value, param, ctx))
-        if math.isnan(seconds) or not 0 <= (self.min or 0) <= seconds <= 86400:
-            self.fail(f"{seconds:g} s is not between {self.min:g} and 86400 s", param, ctx)
+        if math.isnan(seconds) or not 0 <= (self.min or 0) <= seconds <= values.DAY:
+            self.fail(f"{seconds:g} s is not between {self.min:g} and {values.DAY} s", param, ctx)
         return seconds
 
 
-PORT = click.IntRange(1, 65535)
-PORT.name = "port"
-MEBIBYTES = click.IntRange(1, 65536)
-MEBIBYTES.name = "MiB"
-CONNECTIONS = click.IntRange(16, 1_000_000)
-CONNECTIONS.name = "n"
-PORT_RANGE = Parsed("A-B", settings.read_range)
-HOST = Parsed("host", settings.read_host)
-ADDRESS = Parsed("address", settings.read_address)
-BIND_ADDRESS = Parsed("address", settings.read_bind_address)
-HOST_PORT = Parsed("address:port", settings.read_host_port)
-PEER = Parsed("host[:port]", settings.read_peer)
-DOMAIN = click.IntRange(0, 232)
-DOMAIN.name = "id"
-NETWORK = Parsed("CIDR", settings.read_network)
-MASTER_URI = Parsed("URI", settings.read_master_uri)
-TOKEN = Parsed("token", settings.read_token)
-POLICY_RULES = PolicyRules()
-POLICY_LAYERS = Parsed("JSON", settings.read_policy_layers)
-TOKEN_HASH = Parsed("hash", settings.read_token_hash)
+def click_type(kind: values.Text | values.Number) -> click.ParamType:  # type: ignore[type-arg]
+    """A kind of value, for click."""
+    if isinstance(kind, values.Text):
+        return Parsed(kind.form, kind.read, kind.separable)
+    if kind.seconds:
+        return Seconds(kind.least)
+    number = click.IntRange(int(kind.least), int(kind.most))
+    number.name = kind.form
+    return number
+
+
+def settings_options(settings: type) -> Callable[[Command], Command]:
+    """The options of a dataclass whose fields are annotated with an `Option` each."""
+    return lambda command: with_options(command, [*map(_click_option, declared(settings))])
+
+
+def make_settings(settings: type[_Settings], given: Mapping[str, Any]) -> _Settings:
+    """The dataclass of what was given for its options. Raises SettingError."""
+    by_field = {setting.field: given[setting.parameter] for setting in declared(settings)}
+    return settings(**{field: value for field, value in by_field.items() if value is not None})
+
+
+def _click_option(setting: Setting) -> Callable[[Command], Command]:
+    option, form = setting.option, _form(setting)
+    if setting.default not in (None, "", ()):
+        form["default"] = setting.default
+    return click.option(
+        setting.name,
+        envvar=list(option.variables) or None,
+        multiple=option.repeatable,
+        required=setting.required,
+        help=plain(option.help),
+        **form,
+    )
+
+
+def _form(setting: Setting) -> dict[str, Any]:
+    """What its kind, or its type alone, says of an option: one of several words, or a flag."""
+    if setting.option.kind:
+        return {"type": click_type(setting.option.kind)}
+    return {"type": click.Choice(setting.words)} if setting.words else {"is_flag": True}
+
+
+def plain(markdown: str) -> str:
+    """A text without its links and marks of code."""
+    return re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", markdown).replace("`", "")
 
 
 class OneLineError(click.ClickException):
@@ -213,7 +234,7 @@ def setting_errors() -> Iterator[None]:
     """Tell a SettingError, which comes up when options are put together, as a usage error."""
     try:
         yield
-    except settings.SettingError as error:
+    except SettingError as error:
         raise click.UsageError(str(error)) from None
 
 
@@ -236,6 +257,6 @@ def _usage_text(error: click.UsageError) -> str:
     if isinstance(error, click.MissingParameter):
         prefix = error.ctx.auto_envvar_prefix if error.ctx else None
         variable = option.envvar or f"{prefix}_{str(option.name).upper()}"
-        return f"{name}: missing; give {option.help} ({variable})"
+        return f"{name}: missing; give {str(option.help).partition('. ')[0]} ({variable})"
     has_example = isinstance(option.default, int | float) and not isinstance(option.default, bool)
     return f"{name}: {message}" + (f"; for example {option.default:g}" if has_example else "")

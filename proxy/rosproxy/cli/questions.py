@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 import click
 
+from rosproxy import values
 from rosproxy.cli import options
 
 WAIT_INTERVAL = 0.5
@@ -119,19 +120,19 @@ def health(admin: Any) -> None:
 @_admin_option
 @click.option(
     "--master-uri",
-    type=options.MASTER_URI,
+    type=options.click_type(values.MASTER_URI),
     envvar="ROS_MASTER_URI",
     help="The master to look at if the proxy can't be asked for its own.",
 )
 @click.option(
     "--advertise-host",
-    type=options.HOST,
+    type=options.click_type(values.HOST),
     envvar="ROSPROXY_ADVERTISE_HOST",
     help="The advertised host if the proxy can't be asked for it.",
 )
 @click.option(
     "--master-address",
-    type=options.ADDRESS,
+    type=options.click_type(values.ADDRESS),
     envvar="ROSPROXY_MASTER_ADDRESS",
     help="The IP address of the master's host if the proxy can't be asked for it.",
 )

@@ -56,7 +56,7 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
 from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 from rosproxy.runtime import Runtime
-from rosproxy.settings import SettingError
+from rosproxy.values import SettingError
 
 log = logging.getLogger(__name__)
 

@@ -40,7 +40,7 @@ from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
 from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
-from rosproxy.settings import SettingError
+from rosproxy.values import SettingError
 
 log = logging.getLogger(__name__)
 

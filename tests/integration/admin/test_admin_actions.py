@@ -8,7 +8,7 @@ from examples.demo.fake_http import End, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.settings import hash_token
+from rosproxy.values import hash_token
 from tests.integration.admin_calls import news, post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.leases.ports import PortMap, PortRange
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
@@ -26,7 +26,9 @@ URI, SERVICE, LAPTOP = "http://robot:40001/", "rosrpc://robot:40003", "http://la
 
 def settings(**options: Any) -> Settings:
     listen = PortRange(45000, 45009)
-    return Settings("http://robot:11311", "host", PortMap(listen, listen), **options)
+    return Settings(
+        master_uri="http://robot:11311", advertise_host="host", port_range=listen, **options
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.settings import DataPlane, Direction, SlaveControl
+from rosproxy.values import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.settings import SlaveControl
+from rosproxy.values import SlaveControl
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import Connect, Create, CreateSandbox
 from rosproxy_operator.docker.planner.labels.bounds import (

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.settings import hash_token
+from rosproxy.values import hash_token
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.engine_json import uplink_secret

@@ -9,7 +9,7 @@ import pytest
 from aiohttp import web
 from msgspec import structs
 
-from rosproxy.settings import hash_token
+from rosproxy.values import hash_token
 from rosproxy_operator.common import control_loop
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes import controller as module

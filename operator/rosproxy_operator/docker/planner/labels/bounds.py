@@ -16,7 +16,7 @@ from typing import get_args
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import DataPlane, read_peer
+from rosproxy.values import DataPlane, read_peer
 from rosproxy_operator.docker.planner.model import Member, PlanSettings
 
 LEAST_PORT = 1024

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import DataPlane, Direction, SlaveControl
+from rosproxy.values import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import (

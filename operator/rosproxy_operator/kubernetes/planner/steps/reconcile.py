@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import hash_token
+from rosproxy.values import hash_token
 from rosproxy_operator.common.allocation import RETRY_FOR
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (
