@@ -1,39 +1,58 @@
-"""Write the table of the proxy's settings in docs/reference/options.md.
+"""Write the tables of settings in docs/reference/options.md.
 
     python -m scripts.options_docs
 
-It stands between ``<!-- settings of the proxy -->`` and ``<!-- end of settings of the proxy -->``,
-and is made of the annotations of `rosproxy.settings.Settings`.
+Each stands between two comments with the program's name, and is made of the annotations of its
+settings: that of ``rosproxy run`` of `rosproxy.settings.Settings`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rosproxy.settings import Settings
 from rosproxy.values import Setting, declared
+from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.kubernetes.settings import (
+    Bounds,
+    ClusterSettings,
+    KubernetesSettings,
+    WebhookSettings,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/reference/options.md"
-BEGIN, END = "<!-- settings of the proxy -->\n", "<!-- end of settings of the proxy -->"
+SETTINGS: dict[str, tuple[type, ...]] = {
+    "rosproxy run": (Settings,),
+    "rosproxy-operator docker": (PlanSettings,),
+    "rosproxy-operator kubernetes": (
+        *(ClusterSettings, Bounds, KubernetesSettings, WebhookSettings),
+    ),
+}
+"""The classes of each program's settings."""
 
 
 def page(text: str) -> str:
-    """The page with its table made anew."""
-    before, rest = text.split(BEGIN)
-    table = "\n".join(_table())
-    return f"{before}{BEGIN}\n{table}\n\n{END}{rest.split(END)[1]}"
+    """The page with its tables made anew."""
+    for program, classes in SETTINGS.items():
+        begin, end = f"<!-- {program} -->\n", f"<!-- end of {program} -->"
+        before, rest = text.split(begin)
+        table = "\n".join(_table(setting for kind in classes for setting in declared(kind)))
+        text = f"{before}{begin}\n{table}\n\n{end}{rest.split(end)[1]}"
+    return text
 
 
-def _table() -> Iterator[str]:
+def _table(settings: Iterable[Setting]) -> Iterator[str]:
     yield from ("| option | variable | default | meaning |", "|---|---|---|---|")
-    for setting in declared(Settings):
+    for setting in settings:
         cells = (_option(setting), _variables(setting), _default(setting), setting.option.help)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
 def _option(setting: Setting) -> str:
     kind = setting.option.kind
-    form = kind.form if kind else "|".join(setting.words)
+    form = kind.form if kind else "|".join(filter(None, setting.words))
+    if setting.default is True:
+        return f"`{setting.name}`, `--no-{setting.name.removeprefix('--')}`"
     return f"`{setting.name} {form}`" if form else f"`{setting.name}`"
 
 
@@ -50,7 +69,7 @@ def _default(setting: Setting) -> str:
     if isinstance(default, bool):
         return "on" if default else "off"
     if isinstance(default, tuple):
-        return " ".join(map(str, default))
+        return ", ".join(map(str, default))
     return f"{default:g}" if isinstance(default, float) else str(default)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from rosproxy import __version__, values
+from rosproxy import __version__
 from rosproxy.cli.main import main as proxy_main
 from rosproxy.cli.options import (
     GROUP_SETTINGS,
@@ -18,42 +18,26 @@ from rosproxy.cli.options import (
     Commands,
     Parsed,
     Seconds,
-    click_type,
     config_option,
     log_options,
     setting_errors,
+    settings_options,
     unknown_variables,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.options import policy_options, proxy_bound_options
 from rosproxy_operator.common.words import exit_on_error, fail
 from rosproxy_operator.docker import commands as docker_commands
-from rosproxy_operator.docker.options import bound_options
-from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
-from rosproxy_operator.docker.settings import (
-    DEFAULT_ADMIN,
-    make_plan_settings,
-    read_shared_master_uri,
-    read_uplink,
-)
+from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
 from rosproxy_operator.kubernetes import commands as kubernetes_commands
-from rosproxy_operator.kubernetes.options import administrators_options, own_options, ros2_options
-from rosproxy_operator.kubernetes.settings import DEFAULT_ADMIN as CLUSTER_ADMIN
 from rosproxy_operator.kubernetes.settings import (
-    DEFAULT_LIVENESS,
     DEFAULT_WEBHOOK,
+    Bounds,
+    ClusterSettings,
+    KubernetesSettings,
+    WebhookSettings,
     make_kubernetes_settings,
-    read_name,
-    read_namespace,
-    read_object_name,
 )
-
-
-def _read_image(text: str) -> str:
-    """The name of a container image. Raises ValueError."""
-    if not text or any(c.isspace() for c in text):
-        raise ValueError(f"{text!r} is not the name of an image")
-    return text
 
 
 def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
@@ -64,26 +48,12 @@ def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
     return listener
 
 
-IMAGE = Parsed("image", _read_image)
-NAME = Parsed("namespace/name", read_name)
-
-
 def _bind_option(
     name: str, example: HostPort, text: str, optional: bool = False
 ) -> Callable[[Command], Command]:
     """Where to listen: by default at the example, or if that is ``optional`` nowhere."""
     kind = Parsed("address:port", partial(_read_bind, example, optional))
     return click.option(name, type=kind, default="none" if optional else str(example), help=text)
-
-
-def _admin_option(default: HostPort) -> Callable[[Command], Command]:
-    return _bind_option(
-        "--admin-bind", default, "Where /healthz, /readyz, /metrics and the live page are served."
-    )
-
-
-def _image_option(text: str) -> Callable[[Command], Command]:
-    return click.option("--proxy-image", type=IMAGE, default="rosproxy:latest", help=text)
 
 
 _resync_option = click.option(
@@ -108,83 +78,13 @@ def main() -> None:
     invoke_without_command=True,
     context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
 )
-@click.option(
-    "--master-uri",
-    type=Parsed("URI", read_shared_master_uri),
-    envvar=["ROSPROXY_MASTER_URI", "ROS_MASTER_URI"],
-    help="The real ROS master of containers that name none.",
-)
-@click.option(
-    "--advertise-host",
-    type=click_type(values.HOST),
-    help="Name or address under which outside nodes and masters reach this host. Default: this "
-    "host's address towards the master.",
-)
-@click.option(
-    "--ports",
-    type=click.IntRange(1, MOST_PORTS),
-    default=32,
-    metavar="N",
-    help="Ports of a proxy, one per node behind it.",
-)
-@click.option(
-    "--port-window",
-    type=click_type(values.PORT_RANGE),
-    default="11412-65535",
-    metavar="A-B",
-    help="Where ranges of ports are looked for.",
-)
-@click.option(
-    "--publish-address",
-    type=click_type(values.BIND_ADDRESS),
-    multiple=True,
-    default=("0.0.0.0",),
-    metavar="ADDRESS",
-    help="Address of this host on which ports are published (repeatable).",
-)
-@_image_option("The proxies' image.")
-@click.option(
-    "--data-plane",
-    type=click.Choice(["auto", "kernel", "splice", "copy"]),
-    default="auto",
-    help="How proxies forward topics. kernel: they get the capability NET_ADMIN for it.",
-)
-@click.option(
-    "--direction",
-    type=click.Choice(["out", "both"]),
-    default="out",
-    help="Who needs no route to the other side: outside alone, or (both) containers as well. Those "
-    "on an internal network get both by themselves.",
-)
-@click.option(
-    "--udp",
-    is_flag=True,
-    help="Proxies of both directions publish their ports for UDP as well, so that UDPROS of nodes "
-    "outside reaches containers.",
-)
-@bound_options
+@settings_options(PlanSettings)
 @proxy_bound_options
 @policy_options
-@click.option(
-    "--expose-by-default",
-    is_flag=True,
-    help="Also serve containers without rosproxy.enable=true if they have ROS_MASTER_URI set.",
-)
-@click.option(
-    "--grace",
-    type=Seconds(0.0),
-    default=60.0,
-    metavar="S",
-    help="Time for which a proxy outlives its last container.",
-)
 @_resync_option
-@click.option(
-    "--uplink",
-    type=Parsed("network", read_uplink),
-    default="0-rosproxy",
-    help="Network that is created for the proxies; it has to sort before all others.",
+@_bind_option(
+    "--admin-bind", DEFAULT_ADMIN, "Where /healthz, /readyz, /metrics and the live page are served."
 )
-@_admin_option(DEFAULT_ADMIN)
 @log_options
 @config_option
 @click.option(
@@ -253,70 +153,16 @@ for command in (docker_commands.status, docker_commands.plan, docker_commands.do
     invoke_without_command=True,
     context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
 )
-@click.option(
-    "--namespace",
-    type=Parsed("name", read_namespace),
-    multiple=True,
-    help="Look after the RosProxies of this namespace only (repeatable). Default: of all.",
-)
-@_image_option("Image of the proxies whose RosProxy names none.")
-@click.option(
-    "--proxy-image-pull-policy",
-    type=click.Choice(["Always", "IfNotPresent", "Never"]),
-    help="Their imagePullPolicy. Default: left to Kubernetes.",
-)
-@click.option(
-    "--node-port-range",
-    type=click_type(values.PORT_RANGE),
-    default="30000-32767",
-    metavar="A-B",
-    help="The API server's --service-node-port-range: no proxy gets a port of it.",
-)
-@click.option(
-    "--ephemeral-range",
-    type=click_type(values.PORT_RANGE),
-    default="32768-60999",
-    metavar="A-B",
-    help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
-)
-@administrators_options
-@ros2_options
+@settings_options(ClusterSettings, Bounds, KubernetesSettings)
 @proxy_bound_options
 @policy_options
-@own_options
-@_resync_option
 @_bind_option(
     "--webhook-bind",
     DEFAULT_WEBHOOK,
     "Where the admission webhook is served that wires pods; none: it is not.",
     optional=True,
 )
-@click.option(
-    "--webhook-service",
-    type=NAME,
-    help="The webhook's Service: the names for which its certificate is made.",
-)
-@click.option(
-    "--webhook-secret",
-    type=NAME,
-    help="An existing Secret in which that certificate is kept over restarts.",
-)
-@click.option(
-    "--webhook-configuration",
-    type=Parsed("name", read_object_name),
-    help="The MutatingWebhookConfiguration into which its CA is written.",
-)
-@click.option(
-    "--webhook-cert-dir",
-    metavar="DIR",
-    help="Take the certificate from here instead (tls.crt, tls.key), anew when it changes.",
-)
-@_admin_option(CLUSTER_ADMIN)
-@_bind_option(
-    "--liveness-bind",
-    DEFAULT_LIVENESS,
-    "Where /healthz is served for the kubelet: it fails when any part hangs.",
-)
+@settings_options(WebhookSettings)
 @log_options
 @config_option
 @click.pass_context

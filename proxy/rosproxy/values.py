@@ -6,10 +6,20 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable
-from dataclasses import MISSING, Field, dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from inspect import Parameter, signature
 from ipaddress import ip_address, ip_network
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from rosproxy.access.layers import PolicyLayer, read_layers
 from rosproxy.access.rules import parse_rules
@@ -75,7 +85,7 @@ class Option:
 
 
 class Setting(NamedTuple):
-    """A field of a dataclass that is annotated with an `Option`; ``words``: those it may be."""
+    """A field that is annotated with an `Option`; ``words``: those that it may be."""
 
     field: str
     option: Option
@@ -99,18 +109,31 @@ class Setting(NamedTuple):
 
 
 def declared(settings: type) -> list[Setting]:
-    """The settings of a dataclass, in its order."""
-    hints = get_type_hints(settings, include_extras=True)
-    return [_setting(field, hints[field.name]) for field in fields(settings)]
+    """The settings of a dataclass or struct, in its order; a field without an `Option` is none."""
+    hints, parameters = (
+        get_type_hints(settings, include_extras=True),
+        signature(settings).parameters,
+    )
+    return [
+        _setting(name, hints[name], parameter.default)
+        for name, parameter in parameters.items()
+        if get_origin(hints[name]) is Annotated
+    ]
 
 
-def _setting(field: Field[Any], hint: Any) -> Setting:
-    kind = get_args(hint)[0]
+def make_settings(settings: type[_Value], given: Mapping[str, Any], **other: Any) -> _Value:
+    """The settings of what was given for their options, and of ``other`` fields."""
+    by_field = {setting.field: given[setting.parameter] for setting in declared(settings)}
+    values = {field: value for field, value in by_field.items() if value is not None}
+    return settings(**values, **other)
+
+
+def _setting(field: str, hint: Any, default: Any) -> Setting:
+    kind, option = get_args(hint)
     if get_origin(kind) is tuple:
         kind = get_args(kind)[0]
     words = get_args(kind) if get_origin(kind) is Literal else ()
-    default = None if field.default is MISSING else field.default
-    return Setting(field.name, hint.__metadata__[0], default, words)
+    return Setting(field, option, None if default is Parameter.empty else default, words)
 
 
 class SettingError(ValueError):
@@ -164,11 +187,11 @@ def read_bind_address(text: str) -> str:
         raise ValueError(message) from None
 
 
-def read_host_port(text: str) -> HostPort:
+def read_host_port(text: str, example: str = "127.0.0.1:11312") -> HostPort:
     """``host:port`` or ``[v6]:port``. Raises ValueError."""
     target = parse_host_port(text)
     if target is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not of the form 127.0.0.1:11312")
+        raise ValueError(f"{text[:_LONGEST]!r} is not of the form {example}")
     return target
 
 
@@ -247,6 +270,11 @@ def _named(option: str, read: Callable[[str], _Value], text: str) -> _Value:
         return read(text)
     except ValueError as error:
         raise SettingError(option, str(error)) from None
+
+
+def host_port(example: HostPort) -> Text:
+    """``host:port``, for which a message gives an example."""
+    return Text("ADDRESS:PORT", lambda text: read_host_port(text, str(example)))
 
 
 PORT = Number("PORT", 1, 65535)

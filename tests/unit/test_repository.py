@@ -145,7 +145,7 @@ def reference() -> str:
 def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     from rosproxy_operator.cli import main
     from rosproxy_operator.common.metrics import DockerMetrics
-    from rosproxy_operator.docker.planner.labels.values import LABELS
+    from rosproxy_operator.docker.planner.labels.readers import LABELS
 
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
     metrics = [family.name for family in DockerMetrics().registry.collect()]

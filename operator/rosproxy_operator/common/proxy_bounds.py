@@ -5,17 +5,21 @@ from typing import Any
 
 import msgspec
 
-PREFIX = "proxy_"
+from rosproxy.settings import Settings
+from rosproxy.values import declared
+
+PREFIX = "proxy-"
 """Before the names of the operator's options."""
+_OWN = {setting.field: setting.default for setting in declared(Settings)}
 
 
 class ProxyBounds(msgspec.Struct, frozen=True):
     """Bounds of each proxy, MiB and numbers of connections; the defaults are the proxy's own."""
 
-    max_buffered: int = 32
-    max_body: int = 64
-    max_connections_per_source: int = 4096
-    max_connections_per_lease: int = 2048
+    max_buffered: int = _OWN["max_buffered"]
+    max_body: int = _OWN["max_body"]
+    max_connections_per_source: int = _OWN["max_connections_per_source"]
+    max_connections_per_lease: int = _OWN["max_connections_per_lease"]
 
 
 OWN_BOUNDS = ProxyBounds()
@@ -23,7 +27,7 @@ OWN_BOUNDS = ProxyBounds()
 
 def make_proxy_bounds(options: Mapping[str, Any]) -> ProxyBounds:
     """The bounds from the values of the command line's options, by their names."""
-    return ProxyBounds(*(options[f"{PREFIX}{name}"] for name in ProxyBounds.__struct_fields__))
+    return ProxyBounds(*(options[f"proxy_{name}"] for name in ProxyBounds.__struct_fields__))
 
 
 def bound_variables(bounds: ProxyBounds) -> dict[str, str]:

@@ -27,11 +27,11 @@ from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.client import DockerClient, Json, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
-from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import DockerProxySync
+from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
-from rosproxy_operator.docker.planner.model import PlanSettings
+from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.status import survey
 
 AT_ONCE = 4

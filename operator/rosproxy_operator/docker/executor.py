@@ -36,7 +36,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import Key, PlanSettings
+from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.own import forgery_reason
 from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.redirect import redirect_config
@@ -50,6 +50,7 @@ from rosproxy_operator.docker.planner.specs import (
     read_own,
     sandbox_config,
 )
+from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)

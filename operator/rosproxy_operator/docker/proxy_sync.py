@@ -20,8 +20,9 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
-from rosproxy_operator.docker.planner.model import Member, PlanSettings
+from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, network_facts
+from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)

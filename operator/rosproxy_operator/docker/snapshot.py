@@ -29,7 +29,6 @@ from rosproxy_operator.docker.planner.model import (
     HostState,
     Network,
     OwnContainer,
-    PlanSettings,
     Proxy,
     RedirectContainer,
     Sandbox,
@@ -46,6 +45,7 @@ from rosproxy_operator.docker.planner.specs import (
     proxy_token,
     read_own,
 )
+from rosproxy_operator.docker.settings import PlanSettings
 
 log = logging.getLogger(__name__)
 

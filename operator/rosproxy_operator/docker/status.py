@@ -20,20 +20,14 @@ from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.label_policy import network_owner
-from rosproxy_operator.docker.planner.model import (
-    Container,
-    HostState,
-    Key,
-    Member,
-    OwnContainer,
-    PlanSettings,
-)
+from rosproxy_operator.docker.planner.model import Container, HostState, Key, Member, OwnContainer
 from rosproxy_operator.docker.planner.plan import plan
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import ear_name, proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
+from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 ProxyStatuses = Mapping[str, ProxyStatus]

@@ -43,11 +43,11 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.manifests import without_cluster_ip
 from rosproxy_operator.kubernetes.proxies.proxy_sync import address_of, token_for
+from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
-from rosproxy_operator.kubernetes.resources.values import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.status.events import count_patch, event_body
 
 log = logging.getLogger(__name__)

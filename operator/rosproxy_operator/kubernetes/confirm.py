@@ -18,11 +18,11 @@ from rosproxy_operator.kubernetes.planner.actions import (
     EvictPod,
 )
 from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, own_pods
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Json, Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.records import pod_record, rosproxy_record
-from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 Deletion = DeleteService | DeletePolicy | DeleteProxy | DeleteEar | EvictPod
 

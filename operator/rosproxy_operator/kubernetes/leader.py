@@ -27,8 +27,8 @@ from rosproxy_operator.kubernetes.api.client import (
 )
 from rosproxy_operator.kubernetes.planner import leadership
 from rosproxy_operator.kubernetes.planner.leadership import LOOK, RENEW, Candidate, LeaseRecord
+from rosproxy_operator.kubernetes.resources.checks import int_at, submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import int_at, submap, text_at
 
 log = logging.getLogger(__name__)
 

@@ -1,22 +1,25 @@
-"""The settings of ``rosproxy-operator kubernetes``: plain data, checked.
+"""The settings of ``rosproxy-operator kubernetes``: plain data, each written once.
 
-``read_…`` makes one value of a text and raises ValueError; see `rosproxy.settings`.
+See `rosproxy.settings`. Only what decides whether the webhook is served has its option in
+`rosproxy_operator.cli`: without it there is none.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
+from rosproxy import values as common_values
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.values import DataPlane, SettingError
+from rosproxy.values import DataPlane, Option, SettingError, SlaveControl, make_settings, time
+from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
+from rosproxy_operator.kubernetes import values
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
-from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
 DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)
@@ -32,43 +35,126 @@ EVERY_PORT = PortRange(1024, 65535)
 class Bounds(msgspec.Struct, frozen=True):
     """What a RosProxy may ask for: the administrator's word, which no RosProxy can widen.
 
-    ``masters`` are globs of the masters' URIs, any if there are none; ``window`` is where hostPorts
-    may lie, all of ``spec.portWindow`` and ``spec.master.publish``; ``images`` are globs of the
-    images that ``spec.image`` may name besides the operator's own. ``slave_control`` is what holds
-    for all: a RosProxy may only narrow it. Of ROS 2: ``peers`` are globs of the hosts that it may
-    tell of participants, any if there are none; ``multicast``: whether it may hear the nodes' LAN,
-    by pods in the nodes' own network.
+    ``masters``, ``images`` and ``peers`` are globs; ``window`` is where hostPorts may lie, all of
+    ``spec.portWindow`` and ``spec.master.publish``.
     """
 
-    masters: tuple[str, ...] = ()
-    max_ports: int = MOST_PORTS
-    window: PortRange = EVERY_PORT
-    data_planes: tuple[DataPlane, ...] = ("auto", "splice", "copy")
-    images: tuple[str, ...] = ()
-    slave_control: str = "any"
-    peers: tuple[str, ...] = ()
-    multicast: bool = True
+    masters: Annotated[
+        tuple[str, ...],
+        Option(
+            "Masters that a RosProxy may name, as `http://192.0.2.*:11311`. [How they are compared]"
+            "(permissions.md#what-rosproxies-may-ask-for). Repeatable.",
+            values.GLOB,
+            name="--allow-master",
+            repeatable=True,
+            default="any",
+        ),
+    ] = ()
+    max_ports: Annotated[
+        int,
+        Option("Most ports that a RosProxy may ask for: the highest `spec.ports`.", values.PORTS),
+    ] = MOST_PORTS
+    window: Annotated[
+        PortRange,
+        Option(
+            "Where a RosProxy may have hostPorts: `spec.portWindow` and `spec.master.publish`.",
+            common_values.PORT_RANGE,
+            name="--allow-port-window",
+        ),
+    ] = EVERY_PORT
+    data_planes: Annotated[
+        tuple[DataPlane, ...],
+        Option(
+            "What `spec.dataPlane` may be; kernel takes NET_ADMIN. Repeatable.",
+            name="--allow-data-plane",
+            repeatable=True,
+        ),
+    ] = ("auto", "splice", "copy")
+    images: Annotated[
+        tuple[str, ...],
+        Option(
+            "Images that `spec.image` may name besides `--proxy-image`. Repeatable.",
+            values.GLOB,
+            name="--allow-image",
+            repeatable=True,
+            default="none",
+        ),
+    ] = ()
+    slave_control: Annotated[
+        SlaveControl,
+        Option(
+            "As the option of `rosproxy run`, for all proxies; `spec.policy.slaveControl` may only "
+            "narrow it."
+        ),
+    ] = "any"
+    peers: Annotated[
+        tuple[str, ...],
+        Option(
+            "ROS 2: hosts that `spec.peers` may name, as `192.0.2.*`. A pattern without letters "
+            "fits addresses only. Repeatable.",
+            values.GLOB,
+            name="--allow-peer",
+            repeatable=True,
+            default="any",
+        ),
+    ] = ()
+    multicast: Annotated[
+        bool,
+        Option(
+            "ROS 2: whether `spec.multicast` may be true: pods in the nodes' own network, which "
+            "hear the LAN.",
+            name="--allow-multicast",
+        ),
+    ] = True
 
 
 class ClusterSettings(msgspec.Struct, frozen=True):
     """The operator's options that decide what is planned.
 
-    ``image`` and ``image_pull_policy`` are those of proxies whose RosProxy names none; an empty
-    policy leaves it to Kubernetes. ``node_ports`` is the API server's --service-node-port-range,
-    ``ephemeral`` the range from which the nodes' kernels take ports for connections: no hostPort
-    is taken from either. ``network_policy``: whether RosProxies get one; ``admin_from`` are the
-    NetworkPolicyPeers that it lets reach the proxies' admin endpoints, everybody if it is None.
-    ``proxy_bounds`` are what each proxy may take, ``policy`` is the administrator's, for all
-    proxies: one layer or none.
+    An empty ``image_pull_policy`` leaves it to Kubernetes. ``proxy_bounds`` are what each proxy may
+    take, ``policy`` is the administrator's, for all proxies: one layer or none.
     """
 
-    image: str = "rosproxy:latest"
-    image_pull_policy: str = ""
-    node_ports: PortRange = NODE_PORTS
-    ephemeral: PortRange = EPHEMERAL
+    image: Annotated[
+        str,
+        Option("The proxies' image, where a RosProxy names none.", IMAGE, name="--proxy-image"),
+    ] = "rosproxy:latest"
+    image_pull_policy: Annotated[
+        Literal["", "Always", "IfNotPresent", "Never"],
+        Option("Its imagePullPolicy.", name="--proxy-image-pull-policy", default="Kubernetes' own"),
+    ] = ""
+    node_ports: Annotated[
+        PortRange,
+        Option(
+            "The API server's `--service-node-port-range`: no proxy gets a port of it.",
+            common_values.PORT_RANGE,
+            name="--node-port-range",
+        ),
+    ] = NODE_PORTS
+    ephemeral: Annotated[
+        PortRange,
+        Option(
+            "The nodes' `net.ipv4.ip_local_port_range`, from which their kernels take ports for "
+            "connections: no proxy gets a port of it.",
+            common_values.PORT_RANGE,
+            name="--ephemeral-range",
+        ),
+    ] = EPHEMERAL
     bounds: Bounds = Bounds()
-    network_policy: bool = True
-    admin_from: tuple[Json, ...] | None = None
+    network_policy: Annotated[
+        bool,
+        Option(
+            "Whether each RosProxy's proxies get [a NetworkPolicy](permissions.md#networkpolicy)."
+        ),
+    ] = True
+    admin_from: Annotated[
+        tuple[Json, ...] | None,
+        Option(
+            "Whom it lets reach the proxies' admin port: a JSON list of NetworkPolicyPeers.",
+            values.NETWORK_PEERS,
+            default="everybody",
+        ),
+    ] = None
     proxy_bounds: ProxyBounds = OWN_BOUNDS
     policy: tuple[PolicyLayer, ...] = ()
 
@@ -82,31 +168,103 @@ class WebhookSettings(msgspec.Struct, frozen=True):
     """
 
     bind: HostPort = DEFAULT_WEBHOOK
-    service: Name | None = None
-    secret: Name | None = None
-    configuration: str = ""
-    directory: str = ""
+    service: Annotated[
+        Name | None,
+        Option(
+            "The webhook's Service, for whose names its certificate is made.",
+            values.NAME,
+            name="--webhook-service",
+            default="none",
+        ),
+    ] = None
+    secret: Annotated[
+        Name | None,
+        Option(
+            "An existing Secret in which the certificate is kept. Without it a new one is made at "
+            "each start.",
+            values.NAME,
+            name="--webhook-secret",
+            default="none",
+        ),
+    ] = None
+    configuration: Annotated[
+        str,
+        Option(
+            "The MutatingWebhookConfiguration that is given its authority.",
+            values.OBJECT_NAME,
+            name="--webhook-configuration",
+            default="none",
+        ),
+    ] = ""
+    directory: Annotated[
+        str,
+        Option(
+            "`tls.crt` and `tls.key` of somebody else's making, instead of the last three; read "
+            "again when they change.",
+            values.DIRECTORY,
+            name="--webhook-cert-dir",
+            default="none",
+        ),
+    ] = ""
 
 
 class KubernetesSettings(msgspec.Struct, frozen=True):
     """Everything that ``rosproxy-operator kubernetes`` can be told.
 
-    ``namespaces`` are those that are looked after, all if there are none. ``resync`` is in seconds:
-    how long it waits at most between two looks. ``admin`` is where it serves its own health and
-    metrics, ``liveness`` where it tells that it is alive. Without ``webhook`` pods are not wired.
-    ``key_secret`` is the Secret that holds the key of the proxies' tokens; None: it is made anew
-    with each start. ``lease``: of all operators with the same one acts, and all share certificate
-    and key; None: it is the only one.
+    ``resync`` is in seconds. Without ``webhook`` pods are not wired. Without ``key_secret`` the key
+    of the proxies' tokens is made anew with each start; without ``lease`` it is the only operator.
     """
 
     plan: ClusterSettings = ClusterSettings()
-    namespaces: tuple[str, ...] = ()
-    resync: float = 30.0
-    admin: HostPort = DEFAULT_ADMIN
-    liveness: HostPort = DEFAULT_LIVENESS
+    namespaces: Annotated[
+        tuple[str, ...],
+        Option(
+            "Namespaces whose RosProxies are looked after. Repeatable.",
+            values.NAMESPACE,
+            name="--namespace",
+            repeatable=True,
+            default="all",
+        ),
+    ] = ()
+    key_secret: Annotated[
+        Name | None,
+        Option(
+            "An existing Secret in which the key of the proxies' tokens is kept. Without it a new "
+            "one is made at each start, and the proxies anew.",
+            values.NAME,
+            default="none",
+        ),
+    ] = None
+    lease: Annotated[
+        Name | None,
+        Option(
+            "The Lease by which several operators [choose the one that acts]"
+            "(../guide/kubernetes.md#two-operators). They share `--key-secret` and "
+            "`--webhook-secret`.",
+            values.NAME,
+            default="there is no other",
+        ),
+    ] = None
+    resync: Annotated[float, Option("Longest time between two looks.", time(1.0))] = 30.0
     webhook: WebhookSettings | None = None
-    key_secret: Name | None = None
-    lease: Name | None = None
+    admin: Annotated[
+        HostPort,
+        Option(
+            "Where `/healthz`, `/readyz`, `/metrics` and the [live page of all proxies]"
+            "(../guide/live-page.md#all-proxies-of-a-host-or-a-cluster) are, which is for callers "
+            "on loopback (`kubectl port-forward`).",
+            common_values.host_port(DEFAULT_ADMIN),
+            name="--admin-bind",
+        ),
+    ] = DEFAULT_ADMIN
+    liveness: Annotated[
+        HostPort,
+        Option(
+            "Where `/healthz` is served for the kubelet: it fails when any part hangs.",
+            common_values.host_port(DEFAULT_LIVENESS),
+            name="--liveness-bind",
+        ),
+    ] = DEFAULT_LIVENESS
 
 
 def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
@@ -115,35 +273,15 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
     Raises SettingError if they don't go together.
     """
     _check_shared(options)
-    return KubernetesSettings(
-        plan=ClusterSettings(
-            image=options["proxy_image"],
-            image_pull_policy=options["proxy_image_pull_policy"] or "",
-            node_ports=options["node_port_range"],
-            ephemeral=options["ephemeral_range"],
-            bounds=Bounds(
-                masters=options["allow_master"],
-                max_ports=options["max_ports"],
-                window=options["allow_port_window"],
-                data_planes=options["allow_data_plane"],
-                images=options["allow_image"],
-                slave_control=options["slave_control"],
-                peers=options["allow_peer"],
-                multicast=options["allow_multicast"],
-            ),
-            network_policy=options["network_policy"],
-            admin_from=options["admin_from"],
-            proxy_bounds=make_proxy_bounds(options),
-            policy=administrators_policy(options["policy"], options["policy_mode"]),
-        ),
-        namespaces=tuple(dict.fromkeys(options["namespace"])),
-        resync=options["resync"],
-        admin=options["admin_bind"],
-        liveness=options["liveness_bind"],
-        webhook=_make_webhook(options) if options["webhook_bind"] else None,
-        key_secret=options["key_secret"],
-        lease=options["lease"],
+    plan = make_settings(
+        ClusterSettings,
+        options,
+        bounds=make_settings(Bounds, options),
+        proxy_bounds=make_proxy_bounds(options),
+        policy=administrators_policy(options["policy"], options["policy_mode"]),
     )
+    webhook = _make_webhook(options) if options["webhook_bind"] else None
+    return make_settings(KubernetesSettings, options, plan=plan, webhook=webhook)
 
 
 def _check_shared(options: Mapping[str, Any]) -> None:
@@ -158,83 +296,8 @@ def _check_shared(options: Mapping[str, Any]) -> None:
         raise SettingError("--webhook-secret", text)
 
 
-def read_namespace(text: str) -> str:
-    """The name of a namespace. Raises ValueError."""
-    if not is_label(text):
-        raise ValueError(f"{text!r} is not a namespace's name")
-    return text
-
-
-def read_object_name(text: str) -> str:
-    """The name of an object that has no namespace; empty for no text. Raises ValueError."""
-    if text and not is_subdomain(text):
-        raise ValueError(f"{text!r} is not an object's name")
-    return text
-
-
-def read_name(text: str) -> Name | None:
-    """``NAMESPACE/NAME``; None for no text. Raises ValueError."""
-    namespace, slash, name = text.partition("/")
-    if not text:
-        return None
-    if not slash or not is_label(namespace) or not is_subdomain(name):
-        raise ValueError(f"{text!r} is not of the form NAMESPACE/NAME")
-    return Name(namespace, name)
-
-
-def read_glob(text: str) -> str:
-    """A pattern with ``*`` and ``?``. Raises ValueError."""
-    if not text or any(c.isspace() for c in text):
-        raise ValueError(f"{text!r} is no pattern such as http://192.0.2.*:11311")
-    return text
-
-
-def read_peers(text: str) -> tuple[Json, ...] | None:
-    """A JSON list of NetworkPolicyPeers (networking.k8s.io/v1); None for no text.
-
-    Raises ValueError. What the API server does not know it would drop without a word, and the
-    operator would write it again and again: so it is refused here.
-    """
-    if not text:
-        return None
-    try:
-        return tuple(msgspec.to_builtins(msgspec.json.decode(text, type=list[_Peer])))
-    except msgspec.DecodeError as error:
-        raise ValueError(f"is no JSON list of NetworkPolicyPeers: {error}") from None
-
-
-class _Requirement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    key: str
-    operator: str
-    values: list[str] = []
-
-
-class _Selector(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    matchLabels: dict[str, str] = {}  # noqa: N815 - the API's names
-    matchExpressions: list[_Requirement] = []  # noqa: N815
-
-
-class _Block(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    cidr: str
-    excepted: list[str] = msgspec.field(default_factory=list, name="except")
-
-
-class _Peer(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A NetworkPolicyPeer, as k8s.io/api, networking/v1/types.go, has it."""
-
-    podSelector: _Selector | None = None  # noqa: N815
-    namespaceSelector: _Selector | None = None  # noqa: N815
-    ipBlock: _Block | None = None  # noqa: N815
-
-
 def _make_webhook(options: Mapping[str, Any]) -> WebhookSettings:
-    settings = WebhookSettings(
-        bind=options["webhook_bind"],
-        service=options["webhook_service"],
-        secret=options["webhook_secret"],
-        configuration=options["webhook_configuration"] or "",
-        directory=options["webhook_cert_dir"] or "",
-    )
+    settings = make_settings(WebhookSettings, options, bind=options["webhook_bind"])
     if settings.directory and (settings.secret or settings.configuration):
         raise SettingError(
             "--webhook-cert-dir",

@@ -46,7 +46,7 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
     if deep and not check:
         raise click.UsageError("--deep goes with --check")
     with options.setting_errors():
-        settings = options.make_settings(Settings, given)
+        settings = values.make_settings(Settings, given)
         logs.set_up(log_format, log_level)
         unknown = options.unknown_variables(main)
         if not check:

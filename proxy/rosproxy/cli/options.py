@@ -10,8 +10,8 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import click
 
@@ -22,7 +22,6 @@ from rosproxy.cli.variables import UnknownVariable
 from rosproxy.values import Setting, SettingError, declared
 
 Command = Callable[..., Any]
-_Settings = TypeVar("_Settings")
 GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
@@ -76,23 +75,20 @@ def click_type(kind: values.Text | values.Number) -> click.ParamType:  # type: i
     return number
 
 
-def settings_options(settings: type) -> Callable[[Command], Command]:
-    """The options of a dataclass whose fields are annotated with an `Option` each."""
-    return lambda command: with_options(command, [*map(_click_option, declared(settings))])
+def settings_options(*settings: type) -> Callable[[Command], Command]:
+    """The options of classes whose fields are annotated with an `Option` each."""
+    described = [setting for kind in settings for setting in declared(kind)]
+    return lambda command: with_options(command, [click_option(s) for s in described])
 
 
-def make_settings(settings: type[_Settings], given: Mapping[str, Any]) -> _Settings:
-    """The dataclass of what was given for its options. Raises SettingError."""
-    by_field = {setting.field: given[setting.parameter] for setting in declared(settings)}
-    return settings(**{field: value for field, value in by_field.items() if value is not None})
-
-
-def _click_option(setting: Setting) -> Callable[[Command], Command]:
+def click_option(setting: Setting, prefix: str = "") -> Callable[[Command], Command]:
+    """The option of a setting; with ``prefix``, before its name, that of a program for others."""
     option, form = setting.option, _form(setting)
     if setting.default not in (None, "", ()):
-        form["default"] = setting.default
+        form |= {"default": setting.default, "show_default": option.default or True}
+    name = f"--{prefix}{setting.name.removeprefix('--')}"
     return click.option(
-        setting.name,
+        f"{name}/--no-{name.removeprefix('--')}" if setting.default is True else name,
         envvar=list(option.variables) or None,
         multiple=option.repeatable,
         required=setting.required,

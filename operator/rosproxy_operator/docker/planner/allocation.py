@@ -22,11 +22,11 @@ from rosproxy_operator.docker.planner.model import (
     Desired,
     HostState,
     Key,
-    PlanSettings,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
 from rosproxy_operator.docker.planner.state import DockerMemory, PortRefusal
+from rosproxy_operator.docker.settings import PlanSettings
 
 
 def after_refusals(

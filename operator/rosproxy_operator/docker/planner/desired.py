@@ -13,7 +13,7 @@ from rosproxy.telemetry.text import listed
 from rosproxy.values import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2 import LEAST_PORTS
-from rosproxy_operator.docker.planner.labels.values import (
+from rosproxy_operator.docker.planner.labels.readers import (
     ALIAS,
     BUILT_IN,
     DATA_PLANE,
@@ -26,11 +26,11 @@ from rosproxy_operator.docker.planner.model import (
     HostState,
     Key,
     Member,
-    PlanSettings,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.specs import master, proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 
 _PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
 """In order of precedence: first what the proxy can't do by itself."""

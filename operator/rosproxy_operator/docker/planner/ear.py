@@ -19,7 +19,7 @@ from rosproxy_operator.docker.planner.actions import (
     Rename,
     Start,
 )
-from rosproxy_operator.docker.planner.model import NOWHERE, HostState, Key, PlanSettings
+from rosproxy_operator.docker.planner.model import HostState, Key
 from rosproxy_operator.docker.planner.selection import free_name
 from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
 from rosproxy_operator.docker.planner.steps import (
@@ -28,6 +28,8 @@ from rosproxy_operator.docker.planner.steps import (
     former_name,
     keep_running_steps,
 )
+from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.docker.values import NOWHERE
 
 
 def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:

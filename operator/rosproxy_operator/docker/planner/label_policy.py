@@ -12,8 +12,9 @@ from msgspec import structs
 from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
 from rosproxy.access.rules import MOST_RULES, format_rules
 from rosproxy_operator.common.problem import Problem, bounded
-from rosproxy_operator.docker.planner.labels.values import POLICY
-from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.labels.readers import POLICY
+from rosproxy_operator.docker.planner.model import Container, Key, Member
+from rosproxy_operator.docker.settings import PlanSettings
 
 OUTLIVES = 10.0
 """Seconds for which an address keeps its layers after its container has gone.

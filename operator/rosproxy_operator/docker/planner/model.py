@@ -4,86 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 
-from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.values import DataPlane, Direction, SlaveControl
-from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which its nodes run, or may soon."""
 STARTED = frozenset({"running", "paused"})
 SERVING = STARTED | {"restarting"}
 """States of a container that runs, or does again in a moment."""
-MOST_PORTS = 1000
-"""Ports that a proxy can have: each costs rules and, by default, a process of the engine."""
-GIBIBYTE = 1024 * 1024 * 1024
-NOWHERE = "none"
-"""What stands for no LAN."""
 STARTED_LABEL = "io.rosproxy.started"
 """On a redirect's container: when the one was started whose network it is in."""
-WINDOW = PortRange(11412, 65535)
-"""Where ports are looked for: above the master's, the admin endpoint's, and rosserial's (11411)."""
-
-
-@dataclass(frozen=True, slots=True)
-class PlanSettings:
-    """The operator's options that decide what is planned, by their names.
-
-    ``master_uri``, ``advertise_host`` (None if not given), ``data_plane``, ``direction`` and
-    ``udp`` are for containers without a label of their own. ``ports`` is the least number that a
-    proxy gets, ``port_window`` where they are looked for, ``publish_address`` the host's addresses
-    on which they are published.
-    ``grace`` is in seconds: how long a proxy outlives its last container.
-
-    Of ROS 2: ``ros2_peer`` are hosts outside (``host`` or ``host:port``) that every proxy tells of
-    its participants; ``ros2_lan`` is this host's address on the LAN where participants are heard by
-    multicast, ``none`` if nowhere, empty: where the advertised host is, or far hosts.
-
-    What labels may ask for at most: a master that one of ``allow_master`` means (patterns as
-    `labels.bounds.read_host_pattern` gives them; none: see there), peers that one of ``allow_peer``
-    means (none: any), ``max_ports``, the planes of ``allow_data_plane`` (none: all but kernel), and
-    ``slave_control`` or less. The operator's own options are allowed in any case. ``redirect``:
-    nodes whose master is given by address are led to their proxy by a rule in their container's
-    network, unless its label says no.
-
-    Each proxy may take ``proxy_memory`` bytes and have ``proxy_pids`` threads and processes; 0: any
-    number. The defaults are several times what a thousand connections take at full rate
-    (docs/performance.md): 32 MiB and 50 KiB for each in the process, 64 MiB of pipes and, where the
-    kernel counts them in, 0.7 MiB of socket buffers for each; two threads for each.
-
-    ``proxy_bounds`` are what else each may take, ``policy`` is the administrator's, for all
-    proxies: one layer or none.
-
-    ``secret`` is what the proxies' tokens are made of; empty: the one that the uplink network has.
-    """
-
-    master_uri: str | None = None
-    advertise_host: str | None = None
-    ports: int = 32
-    port_window: PortRange = WINDOW
-    publish_address: tuple[str, ...] = ("0.0.0.0",)
-    proxy_image: str = "rosproxy:latest"
-    expose_by_default: bool = False
-    grace: float = 60.0
-    uplink: str = "0-rosproxy"
-    data_plane: DataPlane = "auto"
-    direction: Direction = "out"
-    udp: bool = False
-    allow_master: tuple[str, ...] = ()
-    allow_peer: tuple[str, ...] = ()
-    max_ports: int = 100
-    allow_data_plane: tuple[DataPlane, ...] = ()
-    slave_control: SlaveControl = "any"
-    redirect: bool = True
-    proxy_memory: int = GIBIBYTE
-    proxy_pids: int = 8192
-    proxy_bounds: ProxyBounds = OWN_BOUNDS
-    ros2_peer: tuple[str, ...] = ()
-    ros2_lan: str = ""
-    policy: tuple[PolicyLayer, ...] = ()
-    secret: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True, slots=True)

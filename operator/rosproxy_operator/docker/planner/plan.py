@@ -16,7 +16,7 @@ from rosproxy_operator.docker.planner.desired import assign_aliases, desire
 from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
 from rosproxy_operator.docker.planner.label_policy import within_bounds
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.specs import master, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
@@ -26,6 +26,7 @@ from rosproxy_operator.docker.planner.steps import (
     removal_steps,
     wanted_steps,
 )
+from rosproxy_operator.docker.settings import PlanSettings
 
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""

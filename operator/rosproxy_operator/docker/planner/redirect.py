@@ -33,7 +33,6 @@ from rosproxy_operator.docker.planner.model import (
     HostState,
     Key,
     Member,
-    PlanSettings,
     RedirectContainer,
 )
 from rosproxy_operator.docker.planner.specs import (
@@ -46,6 +45,7 @@ from rosproxy_operator.docker.planner.specs import (
     proxy_name,
     redirect_name,
 )
+from rosproxy_operator.docker.settings import PlanSettings
 
 _SET = Template("""\
 table ip $table {

@@ -28,7 +28,8 @@ from rosproxy_operator.docker.planner.actions import (
     CreateRedirect,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.model import STARTED_LABEL, Key, PlanSettings
+from rosproxy_operator.docker.planner.model import STARTED_LABEL, Key
+from rosproxy_operator.docker.settings import PlanSettings
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"

@@ -32,7 +32,6 @@ from rosproxy_operator.docker.planner.actions import (
 from rosproxy_operator.docker.planner.desired import answers_to, needed_by
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
-    NOWHERE,
     SERVING,
     STARTED,
     Attachment,
@@ -41,7 +40,6 @@ from rosproxy_operator.docker.planner.model import (
     HostState,
     Key,
     OwnContainer,
-    PlanSettings,
     Proxy,
 )
 from rosproxy_operator.docker.planner.selection import Selection, free_name, select
@@ -51,6 +49,8 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
     sandbox_name,
 )
+from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.docker.values import NOWHERE
 
 _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 

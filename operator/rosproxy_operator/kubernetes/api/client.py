@@ -36,9 +36,9 @@ from rosproxy import __version__
 from rosproxy_operator.kubernetes.api.gate import Gate
 from rosproxy_operator.kubernetes.api.kubeconfig import NoCluster, configuration
 from rosproxy_operator.kubernetes.api.rbac import missing_rule
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
-from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 JsonObject = dict[str, Any]
 Timeout = tuple[float, float]

@@ -15,10 +15,10 @@ from msgspec.structs import replace
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
-from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 FAILED = "FailedCreatePodSandBox"
 """The reason of the kubelet's Event, which alone says that a hostPort could not be had."""

@@ -23,8 +23,8 @@ from rosproxy_operator.kubernetes.api.client import (
     ApiNotFound,
     ApiUnavailable,
 )
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rosproxy_operator.kubernetes.resources.values import quoted
+from rosproxy_operator.kubernetes.resources.checks import quoted
 
 N = TypeVar("N", int, float)
 V = TypeVar("V")

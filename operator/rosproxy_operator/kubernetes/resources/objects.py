@@ -7,6 +7,15 @@ is missing is as if it were empty.
 from collections.abc import Iterator
 
 from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.checks import (
+    int_at,
+    is_label,
+    port_range,
+    submap,
+    submaps,
+    text_at,
+    texts_at,
+)
 from rosproxy_operator.kubernetes.resources.cluster import (
     EarPod,
     MasterService,
@@ -23,15 +32,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     PodContainer,
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
-from rosproxy_operator.kubernetes.resources.values import (
-    int_at,
-    is_label,
-    port_range,
-    submap,
-    submaps,
-    text_at,
-    texts_at,
-)
 
 VARIABLE = "ROS_MASTER_URI"
 ROS2_VARIABLES = frozenset(

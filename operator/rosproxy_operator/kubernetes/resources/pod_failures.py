@@ -7,10 +7,10 @@ import re
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, EAR
-from rosproxy_operator.kubernetes.resources.values import int_at, submap, submaps, text_at
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 """``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the

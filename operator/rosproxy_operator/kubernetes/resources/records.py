@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.cluster import (
     EarPod,
     MasterService,
@@ -28,7 +29,6 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
-from rosproxy_operator.kubernetes.resources.values import submap, text_at, texts_at
 
 PodRecord = Pod | ProxyPod | EarPod
 Record = (

@@ -16,6 +16,18 @@ from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_addr
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.values import DataPlane, Direction
 from rosproxy_operator.common.policy import too_much
+from rosproxy_operator.kubernetes.resources.checks import (
+    int_at,
+    is_label,
+    is_label_key,
+    is_label_value,
+    is_subdomain,
+    port_range,
+    submap,
+    submaps,
+    text_at,
+    texts_at,
+)
 from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, stripped
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
@@ -31,18 +43,6 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, service_id
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.kubernetes.resources.ros2_spec import check_ports, ros2_spec, versions
-from rosproxy_operator.kubernetes.resources.values import (
-    int_at,
-    is_label,
-    is_label_key,
-    is_label_value,
-    is_subdomain,
-    port_range,
-    submap,
-    submaps,
-    text_at,
-    texts_at,
-)
 
 MOST_PORTS = 500
 MOST_NAME = 46

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Iterator
 
 from rosproxy.admin.findings import DoctorFinding, error, ok, warning
+from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import INJECT
-from rosproxy_operator.kubernetes.resources.values import int_at, submaps, text_at
 
 _WRONG = {
     "MasterReachable": "False",

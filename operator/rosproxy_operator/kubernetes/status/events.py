@@ -16,9 +16,9 @@ from rosproxy_operator.kubernetes.planner.actions import (
     EvictPod,
     SetImage,
 )
+from rosproxy_operator.kubernetes.resources.checks import int_at, text_at
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
 from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, NODE, PORT_RANGE
-from rosproxy_operator.kubernetes.resources.values import int_at, text_at
 
 QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""

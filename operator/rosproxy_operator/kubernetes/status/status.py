@@ -8,6 +8,7 @@ import msgspec
 
 from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     PodFailure,
@@ -21,7 +22,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import INJECT, master_uri
-from rosproxy_operator.kubernetes.resources.values import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.status.findings import (
     CONFLICT,
     EXHAUSTED,

@@ -27,10 +27,10 @@ from rosproxy_operator.kubernetes.api.client import (
     Event,
     Watch,
 )
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import GROUP, PLURAL
 from rosproxy_operator.kubernetes.resources.records import READERS, Record, key_of
-from rosproxy_operator.kubernetes.resources.values import submap, text_at
 
 log = logging.getLogger(__name__)
 

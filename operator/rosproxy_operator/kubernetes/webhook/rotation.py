@@ -20,8 +20,8 @@ from rosproxy_operator.kubernetes.api.client import (
     ApiUnavailable,
     NotLeading,
 )
+from rosproxy_operator.kubernetes.resources.checks import submap, submaps, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import submap, submaps, texts_at
 from rosproxy_operator.kubernetes.settings import WebhookSettings
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair

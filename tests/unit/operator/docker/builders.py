@@ -17,7 +17,6 @@ from rosproxy_operator.docker.planner.model import (
     Key,
     Member,
     Network,
-    PlanSettings,
     Proxy,
     Sandbox,
 )
@@ -31,6 +30,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 
 ROBOT = "http://robot:11311"
 HERE = "192.0.2.10"

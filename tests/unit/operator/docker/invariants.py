@@ -7,7 +7,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.docker.planner.actions import Create, CreateEar, CreateSandbox
 from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane, chosen_udp
-from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.model import STARTED, Key, Member
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_EAR,
@@ -23,6 +23,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
     sandbox_name,
 )
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import read_members
 from tests.unit.operator.docker.simulation import GATEWAY, SERVING, Box, Controller, Engine
 

@@ -29,7 +29,6 @@ from rosproxy_operator.docker.planner.model import (
     HostState,
     Key,
     Network,
-    PlanSettings,
     Proxy,
     RedirectContainer,
     Sandbox,
@@ -47,6 +46,7 @@ from rosproxy_operator.docker.planner.specs import (
     read_own,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import planned
 
 SERVING = {"running", "paused", "restarting"}

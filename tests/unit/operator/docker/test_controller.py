@@ -15,7 +15,6 @@ from rosproxy_operator.docker import snapshot
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.planner.actions import Create, CreateRedirect, CreateSandbox
-from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.plan import plan
 from rosproxy_operator.docker.planner.redirect import _with_fingerprint, redirect_config
 from rosproxy_operator.docker.planner.specs import (
@@ -27,6 +26,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
 from tests.unit.operator.docker.builders import IMAGE, KEY, RANGE, inspection

@@ -7,7 +7,7 @@ from msgspec import structs
 
 from rosproxy.values import DataPlane
 from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox
-from rosproxy_operator.docker.planner.model import Container, PlanSettings, Proxy, Sandbox
+from rosproxy_operator.docker.planner.model import Container, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     container_config,
@@ -17,6 +17,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker import builders
 from tests.unit.operator.docker.builders import (
     ENABLED,

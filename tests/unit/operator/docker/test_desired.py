@@ -7,16 +7,10 @@ import pytest
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.desired import assign_aliases, desire
-from rosproxy_operator.docker.planner.model import (
-    Container,
-    Desired,
-    HostState,
-    Key,
-    Network,
-    PlanSettings,
-)
+from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Network
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory, with_exited
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,

@@ -24,7 +24,6 @@ from rosproxy_operator.docker.planner.model import (
     EarContainer,
     HostState,
     Key,
-    PlanSettings,
     Proxy,
     Sandbox,
 )
@@ -45,6 +44,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     APP,
     HERE,

@@ -10,7 +10,7 @@ from rosproxy.access.rules import MOST_RULES, Rule, parse_rules
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, within_bounds
-from rosproxy_operator.docker.planner.labels.values import MOST_LABEL_RULES
+from rosproxy_operator.docker.planner.labels.readers import MOST_LABEL_RULES
 from rosproxy_operator.docker.planner.model import Attachment, Key, Member
 from rosproxy_operator.docker.planner.proxy_news import ProxyNews, network_facts
 from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
-from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.model import Container, Key, Member
 from rosproxy_operator.docker.planner.specs import proxy_name
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,

@@ -15,7 +15,6 @@ from rosproxy_operator.docker.planner.model import (
     Container,
     HostState,
     Key,
-    PlanSettings,
     Proxy,
     RedirectContainer,
     Sandbox,
@@ -26,6 +25,7 @@ from rosproxy_operator.docker.planner.proxy_news import network_facts
 from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import own_labels, read_own
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     APP,
     HERE,

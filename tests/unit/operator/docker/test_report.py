@@ -22,8 +22,8 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.report import render
+from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import KEY, RANGE
 
 PROXY = {

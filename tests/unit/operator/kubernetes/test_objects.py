@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import read_status
 from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT, no_answer, report
+from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.model import VALUE_AT_RUNTIME, Name
 from rosproxy_operator.kubernetes.resources.objects import node, pod, proxy_pod, service
-from rosproxy_operator.kubernetes.resources.values import host_problem
 from tests.unit.operator.kubernetes.builders_api import (
     CLUSTER_IP,
     NAMESPACE,

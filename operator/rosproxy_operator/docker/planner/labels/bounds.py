@@ -9,7 +9,6 @@ A master that is not allowed leaves the container out. Of anything else that goe
 container gets what is allowed, and a warning.
 """
 
-import re
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import get_args
@@ -17,7 +16,8 @@ from typing import get_args
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.values import DataPlane, read_peer
-from rosproxy_operator.docker.planner.model import Member, PlanSettings
+from rosproxy_operator.docker.planner.model import Member
+from rosproxy_operator.docker.settings import PlanSettings
 
 LEAST_PORT = 1024
 """Where no master is named, the least port of one that a label may name.
@@ -25,22 +25,6 @@ LEAST_PORT = 1024
 rosmaster is started by people who are not root, at 11311 as a rule, and can have none below. There
 are the web and mail servers in whose place a proxy must not stand.
 """
-_PATTERN = re.compile(
-    r"(?:http://)?(?P<host>[a-z0-9_.*?-]+|\[[0-9a-f:.*?]+\])(?::(?P<port>[0-9*?]{1,5}))?/?"
-)
-
-
-def read_host_pattern(text: str) -> str:
-    """A pattern of masters or peers, ``host:port`` in lower case; * and ? are wildcards.
-
-    It may begin with ``http://``, as a master's URI does. Raises ValueError.
-    """
-    match = _PATTERN.fullmatch(text.strip().lower())
-    if match is None:
-        raise ValueError(
-            f"{text[:40]!r} is not of the form HOST or HOST:PORT, such as robot*:11311"
-        )
-    return f"{match['host']}:{match['port'] or '*'}"
 
 
 def refused_master(uri: str, settings: PlanSettings) -> str:

@@ -7,23 +7,17 @@ from functools import lru_cache
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels import bounds, ros2, values
-from rosproxy_operator.docker.planner.labels.values import (
+from rosproxy_operator.docker.planner.labels import bounds, readers, ros2
+from rosproxy_operator.docker.planner.labels.readers import (
     ADVERTISE_HOST,
     ENABLE,
     LABELS,
     REDIRECT,
     UnusableLabel,
 )
-from rosproxy_operator.docker.planner.model import (
-    ALIVE,
-    Container,
-    HostState,
-    Key,
-    Member,
-    PlanSettings,
-)
+from rosproxy_operator.docker.planner.model import ALIVE, Container, HostState, Key, Member
 from rosproxy_operator.docker.planner.specs import MANAGED, master, unresolved_master
+from rosproxy_operator.docker.settings import PlanSettings
 
 _PREFIX = "rosproxy"
 _COUNTED = ALIVE | {"exited"}
@@ -57,7 +51,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
-            if values.enabled(container.labels, _exposed(container, settings)):
+            if readers.enabled(container.labels, _exposed(container, settings)):
                 granted, texts = _requests(container, observed, settings, proxies)
                 requests += granted
                 wrong += [_problem(container, text, False) for text in texts]
@@ -100,16 +94,16 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
     container, key = request.container, request.key
     if key.is_ros2:
         return request, ""
-    needs, text = values.proxy_alias(container, key)
-    by_address = values.master_by_address(container, key, observed.masters)
+    needs, text = readers.proxy_alias(container, key)
+    by_address = readers.master_by_address(container, key, observed.masters)
     if by_address is None:
         return replace(request, wanted_alias=needs), text
     internal = {network.name for network in observed.networks if network.internal}
     if not settings.redirect:
         text += "; the operator's --no-redirect keeps it from being led to the proxy"
     elif request.redirect is False:
-        text += f"; without {values.named(REDIRECT, container.labels)} it is led to the proxy"
-    elif (joined := values.network_owner(container, observed).networks) and joined <= internal:
+        text += f"; without {readers.named(REDIRECT, container.labels)} it is led to the proxy"
+    elif (joined := readers.network_owner(container, observed).networks) and joined <= internal:
         text += "; it is not led to the proxy, since its networks have no way outwards"
     else:
         return replace(request, redirected_master=by_address), ""
@@ -145,17 +139,17 @@ def _requests(
 
 
 def _ros2_request(container: Container, observed: HostState, settings: PlanSettings) -> Member:
-    labels, host = container.labels, values.advertise_host(container.labels, settings)
+    labels, host = container.labels, readers.advertise_host(container.labels, settings)
     ros2.refuse_unserved(container, host)
-    networks = values.networks(container, observed, settings.uplink)
+    networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
         Key("", host, ros2.domain(container)),
-        ports=values.ports(labels),
+        ports=readers.ports(labels),
         networks=networks,
-        data_plane=values.data_plane(labels),
-        direction=values.direction(labels, networks, observed.networks),
-        policy=values.policy(labels),
+        data_plane=readers.data_plane(labels),
+        direction=readers.direction(labels, networks, observed.networks),
+        policy=readers.policy(labels),
         peers=ros2.peers(labels),
     )
 
@@ -163,19 +157,19 @@ def _ros2_request(container: Container, observed: HostState, settings: PlanSetti
 def _request(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> Member:
-    labels, uri = container.labels, values.master_uri(container, settings, proxies)
-    networks = values.networks(container, observed, settings.uplink)
+    labels, uri = container.labels, readers.master_uri(container, settings, proxies)
+    networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
-        Key(uri, values.advertise_host(labels, settings)),
-        ports=values.ports(labels),
+        Key(uri, readers.advertise_host(labels, settings)),
+        ports=readers.ports(labels),
         networks=networks,
-        data_plane=values.data_plane(labels),
-        direction=values.direction(labels, networks, observed.networks),
-        udp=values.udp(labels),
-        slave_control=values.slave_control(labels),
-        policy=values.policy(labels),
-        redirect=values.redirect(labels),
+        data_plane=readers.data_plane(labels),
+        direction=readers.direction(labels, networks, observed.networks),
+        udp=readers.udp(labels),
+        slave_control=readers.slave_control(labels),
+        policy=readers.policy(labels),
+        redirect=readers.redirect(labels),
     )
 
 

@@ -15,7 +15,7 @@ from rosproxy_operator.common.ros2 import (
     is_dds,
     read_peer_name,
 )
-from rosproxy_operator.docker.planner.labels.values import (
+from rosproxy_operator.docker.planner.labels.readers import (
     DOMAIN,
     MASTER_URI,
     PEERS,

@@ -17,6 +17,7 @@ from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.values import read_peer
 from rosproxy_operator.common.allocation import within
+from rosproxy_operator.kubernetes.resources.checks import quoted
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
@@ -26,7 +27,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
 )
 from rosproxy_operator.kubernetes.resources.names import ALLOW_FROM
-from rosproxy_operator.kubernetes.resources.values import quoted
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
 NOT_ALLOWED = "NotAllowed"

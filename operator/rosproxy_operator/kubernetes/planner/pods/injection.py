@@ -13,6 +13,7 @@ import msgspec
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
+from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,
     ClusterFinding,
@@ -30,7 +31,6 @@ from rosproxy_operator.kubernetes.resources.names import (
     service_id,
 )
 from rosproxy_operator.kubernetes.resources.objects import VARIABLE
-from rosproxy_operator.kubernetes.resources.values import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"

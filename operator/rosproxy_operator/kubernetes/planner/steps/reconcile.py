@@ -30,6 +30,7 @@ from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.view import View, serves
+from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     Obstacle,
@@ -43,7 +44,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id, token_of
-from rosproxy_operator.kubernetes.resources.values import host_problem
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 LOST_FOR = 10.0

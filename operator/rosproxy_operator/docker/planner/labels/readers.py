@@ -14,15 +14,10 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.values import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.planner.labels import bounds
-from rosproxy_operator.docker.planner.model import (
-    MOST_PORTS,
-    Container,
-    HostState,
-    Key,
-    Network,
-    PlanSettings,
-)
+from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
+from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.docker.values import MOST_PORTS
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"

@@ -1,0 +1,13 @@
+"""The name of a container image, as options have it."""
+
+from rosproxy.values import Text
+
+
+def read_image(text: str) -> str:
+    """The name of a container image. Raises ValueError."""
+    if not text or any(c.isspace() for c in text):
+        raise ValueError(f"{text!r} is not the name of an image")
+    return text
+
+
+IMAGE = Text("IMAGE", read_image)

@@ -1,0 +1,111 @@
+"""Kinds of values of the Docker operator's options; see `rosproxy.values`."""
+
+import re
+from pathlib import Path
+
+from rosproxy.net.addresses import is_loopback
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.values import Number, Text, read_address, read_master_uri
+from rosproxy_operator.common.ros2 import read_peer_name
+
+MOST_PORTS = 1000
+"""Ports that a proxy can have: each costs rules and, by default, a process of the engine."""
+NOWHERE = "none"
+"""What stands for no LAN."""
+LEAST_MEMORY, MOST_MEMORY = 64 * 1024**2, 1024**4
+"""Bytes that a proxy may be bounded to: one that does nothing has 32 MiB."""
+LEAST_PIDS = 256
+"""Threads that a proxy needs for a hundred connections."""
+LEAST_SECRET = 32
+_MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
+_UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
+_NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_PATTERN = re.compile(
+    r"(?:http://)?(?P<host>[a-z0-9_.*?-]+|\[[0-9a-f:.*?]+\])(?::(?P<port>[0-9*?]{1,5}))?/?"
+)
+
+
+def read_host_pattern(text: str) -> str:
+    """A pattern of masters or peers, ``host:port`` in lower case; * and ? are wildcards.
+
+    It may begin with ``http://``, as a master's URI does. Raises ValueError.
+    """
+    match = _PATTERN.fullmatch(text.strip().lower())
+    if match is None:
+        raise ValueError(
+            f"{text[:40]!r} is not of the form HOST or HOST:PORT, such as robot*:11311"
+        )
+    return f"{match['host']}:{match['port'] or '*'}"
+
+
+def read_shared_master_uri(text: str) -> str:
+    """The URI of a master as all containers can use it; empty for no text. Raises ValueError."""
+    master = parse_slave_uri(read_master_uri(text)) if text else None
+    if master and is_loopback(master.host):
+        raise ValueError(
+            f"{text!r} means another machine to each container; give the address or name of the "
+            "master's host, or http://host.docker.internal:PORT for this one"
+        )
+    return text
+
+
+def read_lan(text: str) -> str:
+    """An IPv4 address of this host on the LAN, or the word for none. Raises ValueError."""
+    if text in ("", NOWHERE):
+        return text
+    address = read_address(text)
+    if address is None or ":" in address:
+        raise ValueError(f"{text[:40]!r} is not an IPv4 address such as 192.0.2.10, or {NOWHERE}")
+    return address
+
+
+def read_memory(text: str) -> int:
+    """Bytes, as ``docker run --memory`` has them: 512m, 1g; 0 for no bound. Raises ValueError."""
+    match = _MEMORY.fullmatch(text.strip().lower())
+    size = int(match[1]) * _UNITS[match[2]] if match else -1
+    if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
+        raise ValueError(f"{text[:40]!r} is not a size from 64m on, such as 1g; or 0 for no bound")
+    return size
+
+
+def read_pids(text: str) -> int:
+    """How many threads and processes; 0 for no bound. Raises ValueError."""
+    digits = text.strip()
+    count = int(digits) if re.fullmatch(r"[0-9]{1,7}", digits, re.ASCII) else -1
+    if count and count < LEAST_PIDS:
+        raise ValueError(f"{text[:40]!r} is not a number from {LEAST_PIDS} on, or 0 for no bound")
+    return count
+
+
+def read_secret(path: str) -> str:
+    """The secret in a file, without blanks around it; empty for no path. Raises ValueError."""
+    if not path:
+        return ""
+    try:
+        secret = Path(path).read_text("utf-8").strip()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8"
+        raise ValueError(f"{path} can't be read: {reason}") from None
+    if len(secret) < LEAST_SECRET:
+        raise ValueError(
+            f"{path} must hold at least {LEAST_SECRET} characters: openssl rand -hex 32 gives them"
+        )
+    return secret
+
+
+def read_uplink(text: str) -> str:
+    """The name of a network. Raises ValueError."""
+    if not _NETWORK.fullmatch(text):
+        raise ValueError(f"{text!r} is not a network's name")
+    return text
+
+
+PORTS = Number("N", 1, MOST_PORTS)
+SHARED_MASTER_URI = Text("URI", read_shared_master_uri)
+HOST_PATTERN = Text("HOST[:PORT]", read_host_pattern)
+PEER_NAME = Text("HOST[:PORT]", read_peer_name)
+LAN = Text("ADDRESS|none", read_lan)
+MEMORY = Text("SIZE", read_memory)
+PIDS = Text("N", read_pids)
+SECRET = Text("FILE", read_secret)
+NETWORK = Text("NETWORK", read_uplink)
