@@ -56,8 +56,9 @@ WhenReadable = Callable[[socket.socket, Callable[[], object]], None]
 class Relay:
     """One relayed connection.
 
-    ``kind`` is topic or service and ``name`` which; ``caller_id`` and ``peer`` tell who connected
-    at ``port``: somebody outside, or a node inside if ``inside_asks``. ``sent`` are bytes towards
+    ``kind`` and ``name`` say of what; ``caller_id`` and ``peer`` who connected at ``port``:
+    somebody outside, or a node inside if ``inside_asks``. ``client_listens``: that one is expected
+    to say nothing more. ``sent`` are bytes towards
     outside, ``received`` bytes towards the inside node; ``sent_rate`` and ``received_rate`` are in
     bytes per second, as of the last `sample`. Without ``splice`` all bytes are copied.
     """
@@ -71,6 +72,7 @@ class Relay:
     inside: socket.socket
     splice: bool = True
     inside_asks: bool = False
+    client_listens: bool = False
     sent: int = 0
     received: int = 0
     failed: bool = False
@@ -85,14 +87,14 @@ class Relay:
     def start(self, finished: Finished, when_readable: WhenReadable) -> None:
         """Relay both directions in the background; ``finished`` is called from any thread.
 
-        A subscriber says nothing after its header: its direction gets a thread when it does.
+        The direction of a client that listens gets a thread when it says something.
         """
         for sock in (self.outside, self.inside):
             _prepare(sock)
         client = self.inside if self.inside_asks else self.outside
         request, reply = (0, 1) if self.inside_asks else (1, 0)
         if self._start_direction(reply, finished):
-            if self.kind == "topic":
+            if self.client_listens:
                 when_readable(client, lambda: self._start_direction(request, finished, second=True))
             else:
                 self._start_direction(request, finished, second=True)

@@ -58,7 +58,7 @@ class KernelPorts(Protocol):
     def may_forward(self, endpoint: LeaseHolder, /) -> bool:
         """Whether an endpoint's topics could be forwarded if it had a fast port."""
 
-    async def forwards(self, endpoint: LeaseHolder, tcpros_port: int, /) -> bool:
+    async def forwards(self, endpoint: LeaseHolder, node_port: int, /) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port; waits a moment."""
 
     async def cleared(self, port: int, /) -> None:
@@ -184,7 +184,7 @@ class Leases(Generic[_H]):
         """Wait a moment until the kernel no longer forwards a new lease, which was a fast port."""
         await self._kernel.cleared(endpoint.port)
 
-    async def fast_port(self, endpoint: _H, tcpros_port: int) -> int | None:
+    async def fast_port(self, endpoint: _H, node_port: int) -> int | None:
         """The port that the kernel forwards to a TCPROS port of an endpoint's node; None if none.
 
         It is handed out when a subscriber first asks for a topic, while the range has ports left.
@@ -192,7 +192,7 @@ class Leases(Generic[_H]):
         if self._kernel.may_forward(endpoint):
             if endpoint.fast_port is None and fast_ports.claim(self._holders.pool, endpoint):
                 self.open(endpoint)
-            if endpoint.fast_port and await self._kernel.forwards(endpoint, tcpros_port):
+            if endpoint.fast_port and await self._kernel.forwards(endpoint, node_port):
                 return endpoint.fast_port
         self._kernel.log_reason(endpoint)
         return None

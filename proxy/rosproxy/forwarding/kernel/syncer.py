@@ -147,11 +147,11 @@ class ForwardSyncer:
             self._logged[endpoint] = why
             log.info("%s: the proxy forwards its topics: %s", endpoint.label, why)
 
-    async def forwards(self, endpoint: LeaseHolder, tcpros_port: int) -> bool:
+    async def forwards(self, endpoint: LeaseHolder, node_port: int) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
 
         def leads() -> bool:
-            target, port = HostPort(endpoint.address, tcpros_port), endpoint.fast_port
+            target, port = HostPort(endpoint.address, node_port), endpoint.fast_port
             return self.usable and port is not None and self._table.forwards.get(port) == target
 
         if not leads():

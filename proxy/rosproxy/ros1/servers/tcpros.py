@@ -132,7 +132,7 @@ class TcprosServer:
         outside, inside = (conn, node) if target.inside else (node, conn)
         relay = Relay(
             target.port, kind, target.label(kind, name), caller_id, peer, outside, inside,
-            splice=self._may_splice, inside_asks=not target.inside,
+            splice=self._may_splice, inside_asks=not target.inside, client_listens=kind == "topic",
         )  # fmt: skip
         target.note_connection()
         self._context.gate.enter(peer, target.port)
