@@ -10,8 +10,9 @@ from xml.sax.saxutils import escape
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.master_methods import Kind, method_spec
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
+from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
@@ -183,11 +184,8 @@ def exchange(
 ) -> Exchange:
     """What the shell does with a call: admit, export, ask the master, note, import."""
     request = master_calls.read_request(body, caller)
-    admissions = [
-        _admit(addressing, master_calls.registering_uri(call), caller, refuse)
-        for call in request.calls
-    ]
-    exported = master_api.export_request(request, admissions, addressing)
+    outcomes = [_outcome(addressing, call, caller, refuse) for call in request.calls]
+    exported = master_api.export_request(request, outcomes, addressing)
     if exported.body is None:
         return Exchange(b"", exported.local_reply())
     answer = master_calls.read_reply(exported, reply)
@@ -204,6 +202,14 @@ def note(registry: Registry, fact: RegistryChange) -> None:
         registry.register(fact.endpoint, held)
     else:
         registry.unregister(held.kind, held.name, held.caller_id)
+
+
+def _outcome(
+    addressing: Addressing, call: Call | None, caller: Caller, refuse: Refuse
+) -> CallOutcome:
+    if call and method_spec(call.method).unregisters:
+        return master_api.unregistering_endpoint(call, caller, addressing)
+    return _admit(addressing, master_calls.registering_uri(call), caller, refuse)
 
 
 def _admit(addressing: Addressing, uri: str | None, caller: Caller, refuse: Refuse) -> CallOutcome:

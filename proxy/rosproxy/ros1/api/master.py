@@ -5,9 +5,9 @@ addresses are exported, the master is called, what it accepted is noted in the r
 addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All other calls pass as
 they are; long ones, parameters above all, unread.
 
-The policy is asked twice (`AccessChecks`): about what needs no endpoint before, and about
-registrations once their node is admitted. What it denies the master does not get; the nodes inside
-that have to know are told (`PublisherUpdates`).
+The policy is asked (`AccessChecks`) when it is settled what becomes of each call, and what it
+changes in the reply. What it denies the master does not get; the nodes inside that have to know are
+told (`PublisherUpdates`).
 """
 
 import asyncio
@@ -34,6 +34,7 @@ from rosproxy.ros1.rewriting.master_calls import (
     Refusal,
     RegistryChange,
     Request,
+    caller_id_of,
 )
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
@@ -119,9 +120,8 @@ class MasterApi:
     ) -> bytes:
         """Admit nodes, export URIs, call the master, note what it accepted, import its URIs."""
         addressing, version = self._context.addressing, self._context.policy.version
-        async with self._admitted(request, replies, call) as admitted:
-            admissions = self._judge_registrations(request, admitted)
-            exported = master_api.export_request(request, admissions, addressing)
+        async with self._outcomes(request, replies, call) as outcomes:
+            exported = master_api.export_request(request, outcomes, addressing)
             self._note(exported.registry_changes(), request.caller.address)
             if exported.body is None:
                 return exported.local_reply()
@@ -136,42 +136,44 @@ class MasterApi:
                 self._enforcer.look_again()
             return master_api.import_reply(reply, addressing, self._access.reply_changes(reply))
 
-    def _judge_registrations(
-        self, request: Request, admissions: Sequence[CallOutcome]
-    ) -> list[CallOutcome]:
-        """The admissions, with the proxy's own replies to what the master does not get."""
-        judge, now = self._access.judge_registration, self._context.now()
-        pairs = zip(request.calls, admissions, strict=True)
-        return [judge(c, outcome, request.caller, now) if c else outcome for c, outcome in pairs]
-
     @asynccontextmanager
-    async def _admitted(
+    async def _outcomes(
         self, request: Request, replies: Sequence[LocalReply | None], incoming: IncomingCall
     ) -> AsyncIterator[Sequence[CallOutcome]]:
-        """What becomes of each call of a request. Raises Unreachable.
+        """What becomes of each call of a request; some have a reply already. Raises Unreachable.
 
-        Within the context their endpoints are *pending*: their leases do not end while the calls
-        are on their way. If the caller goes away meanwhile, the master is told nothing.
+        Within the context the endpoints that they register are *pending*: their leases do not end
+        while the calls are on their way. If the caller goes away meanwhile, the master is told
+        nothing.
         """
         self._context.refresh_networks(request.caller.address)
-        admissions: list[CallOutcome] = []
+        outcomes, pending = list[CallOutcome](), list[Endpoint]()
         try:
             # One after the other: they may register the same new node.
             for call, reply in zip(request.calls, replies, strict=True):
                 if incoming.gone:
                     raise Unreachable("the caller has gone")
-                admission: CallOutcome = reply
+                outcome: CallOutcome = reply
                 if call and reply is None:
-                    admission = await self._admit(call, request)
-                admissions.append(admission)
-                if isinstance(admission, Endpoint):
-                    admission.hold()
-                    await self._adopter.take_over(admission, call.string(0) or "" if call else "")
-            yield admissions
+                    outcome = await self._outcome(call, request, pending)
+                outcomes.append(outcome)
+            yield outcomes
         finally:
-            for admission in admissions:
-                if isinstance(admission, Endpoint):
-                    admission.release()
+            for endpoint in pending:
+                endpoint.release()
+
+    async def _outcome(self, call: Call, request: Request, pending: list[Endpoint]) -> CallOutcome:
+        """What becomes of a call; the endpoint that it registers is pending from now on."""
+        caller = request.caller
+        if method_spec(call.method).unregisters:
+            endpoint = master_api.unregistering_endpoint(call, caller, self._context.addressing)
+            return self._access.judge_unregistration(call, endpoint, caller) or endpoint
+        admission = await self._admit(call, request)
+        if isinstance(admission, Endpoint):
+            admission.hold()
+            pending.append(admission)
+            await self._adopter.take_over(admission, caller_id_of(call))
+        return self._access.judge_registration(call, admission, caller, self._context.now())
 
     async def _admit(self, call: Call, request: Request) -> CallOutcome:
         """What becomes of one call; what is too long, or one too many, is refused."""

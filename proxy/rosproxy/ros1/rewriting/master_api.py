@@ -1,8 +1,8 @@
 """The master API as inside nodes call it: calls rewritten on the way out, replies on the way in.
 
 A request goes one way through four steps, each of which makes a new value of the one before and
-changes nothing: `master_calls.read_request`, `export_request` (once it is known which nodes are
-admitted), `master_calls.read_reply`, which tells what the registry has to learn, and
+changes nothing: `master_calls.read_request`, `export_request` (once it is known what becomes of
+each call), `master_calls.read_reply`, which tells what the registry has to learn, and
 `import_reply`. Rows and traps: http://wiki.ros.org/ROS/Master_API and
 ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
@@ -11,12 +11,13 @@ from collections.abc import Iterator, Sequence
 
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import Kind, Reply, method_spec, resolve_name
+from rosproxy.ros1.protocol.master_methods import Kind, Reply, method_spec
 from rosproxy.ros1.protocol.uris import parse_service_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.multicall import insert_items
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.rewriting import hidden_graph
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
@@ -36,25 +37,20 @@ from rosproxy.ros1.rewriting.slave_api import replace_value
 
 
 def export_request(
-    request: Request, admissions: Sequence[CallOutcome], addressing: Addressing
+    request: Request, outcomes: Sequence[CallOutcome], addressing: Addressing
 ) -> ExportedRequest:
     """The request for the master: URIs exported, calls that the proxy answers left out.
 
-    ``admissions`` has one for each call. A call that unregisters concerns the endpoint of its
-    registration instead.
+    ``outcomes`` has one for each call.
     """
-    caller, edits, outcomes = request.caller, list[Edit](), list[CallOutcome]()
-    for call, admission in zip(request.calls, admissions, strict=True):
-        outcome = admission
-        if call and outcome is None and method_spec(call.method).unregisters:
-            outcome = unregistering_endpoint(call, caller, addressing)
+    edits: list[Edit] = []
+    for call, outcome in zip(request.calls, outcomes, strict=True):
         if call and not isinstance(outcome, LocalReply):
-            edits += _export_call(call, outcome, caller, addressing)
-        outcomes.append(outcome)
+            edits += _export_call(call, outcome, request.caller, addressing)
     local = [isinstance(outcome, LocalReply) for outcome in outcomes]
     if local and all(local):
         return ExportedRequest(request, tuple(outcomes), None)
-    edits += [xmlrpc.remove(item) for item, out in zip(request.items, local, strict=False) if out]
+    edits += [item.removed() for item, out in zip(request.items, local, strict=False) if out]
     return ExportedRequest(request, tuple(outcomes), xmlrpc.apply(request.body, edits))
 
 
@@ -117,15 +113,15 @@ def _export_call(
     service_api = call.string_value(method_spec(call.method).service_api)
     if isinstance(admission, Endpoint):
         if caller_api:
-            yield xmlrpc.replace(caller_api, addressing.advertised_uri(admission))
+            yield caller_api.with_text(addressing.advertised_uri(admission))
         if service_api and parse_service_uri(with_caller_address(service_api.text, caller.address)):
-            yield xmlrpc.replace(service_api, addressing.advertised_service(admission))
+            yield service_api.with_text(addressing.advertised_service(admission))
         return
     if caller_api:
-        yield xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, caller))
+        yield caller_api.with_text(addressing.export_slave(caller_api.text, caller))
     if service_api:
         text = addressing.export_service(service_api.text, second_parameter_name(call), caller)
-        yield xmlrpc.replace(service_api, text)
+        yield service_api.with_text(text)
 
 
 def _import_result(
@@ -138,11 +134,11 @@ def _import_result(
     if method_spec(result.call.method).reply is Reply.SLAVE_URIS:
         return _import_uris(result.call, value, caller, addressing, changes)
     if result.call.method == "getParamNames":
-        return [xmlrpc.remove(item) for item in value.items if item.text in changes.params]
+        return [item.removed() for item in value.items if item.text in changes.params]
     if changes.graph and result.call.method in hidden_graph.METHODS:
         listing = xmlrpc.python_value(value)
         completed = hidden_graph.with_hidden(result.call, listing, addressing.registry)
-        return [Edit(*value.outer, xmlrpc.dump_value(completed))]
+        return [value.replaced_by(xmlrpc.dump_value(completed))]
     return _import_uri(result.call, triple, caller, addressing)
 
 
@@ -168,22 +164,9 @@ def _import_uris(
     if extra:
         uris = [*(item.text for item in array.items), *extra]
         imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
-        return [Edit(*array.outer, xmlrpc.dump_value([*imported]))]
+        return [array.replaced_by(xmlrpc.dump_value([*imported]))]
     return [
-        xmlrpc.replace(item, addressing.import_slave(item.text, caller))
+        item.with_text(addressing.import_slave(item.text, caller))
         for item in array.items
         if item.kind == "string"
     ]
-
-
-def registration(call: Call, now: float, source: str) -> Registration | None:
-    """What a call from an address registers or unregisters; None for any other call."""
-    spec, caller_id = method_spec(call.method), caller_id_of(call)
-    kind, name = spec.registers or spec.unregisters, call.string(spec.name)
-    if kind is None or not name:
-        return None
-    name, type_ = resolve_name(name, caller_id), call.string(spec.type) or "*"
-    service_api = call.string(spec.service_api)
-    if service_api is not None:
-        service_api = with_caller_address(service_api, source)
-    return Registration(kind, name, caller_id, type_, service_api, now)

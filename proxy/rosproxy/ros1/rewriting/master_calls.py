@@ -67,7 +67,7 @@ _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 LocalReply = Refusal | LocalAnswer
 """The reply to a call that the master does not get."""
 CallOutcome = Endpoint | LocalReply | None
-"""What became of a call: the endpoint that it registers, or the proxy's own reply to it."""
+"""What becomes of a call: the endpoint that it registers or unregisters, or the proxy's reply."""
 
 
 class Request(msgspec.Struct, frozen=True):

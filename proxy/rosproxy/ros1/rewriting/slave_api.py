@@ -17,8 +17,9 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
+from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 
 MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
@@ -73,7 +74,7 @@ def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
     edits, listed = [], set()
     for item in _publishers(call):
         uri = view.rewrite_in_call(item.text)
-        edits.append(xmlrpc.remove(item) if uri in listed else xmlrpc.replace(item, uri))
+        edits.append(item.removed() if uri in listed else item.with_text(uri))
         listed.add(uri)
     return xmlrpc.apply(body, edits)
 
@@ -92,9 +93,9 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
         edits = send_to(triple, reached)
     elif call.method == "requestTopic" and _is_udpros(triple):
         # Datagrams come from there, by a relay or by NAT; some libraries drop any other's.
-        edits = [xmlrpc.replace(triple.items[2].items[1], reached.host)]
+        edits = [triple.items[2].items[1].with_text(reached.host)]
     elif call.method == "getBusInfo":
-        edits = [xmlrpc.replace(peer, view.rewrite_in_reply(peer.text)) for peer in _peers(triple)]
+        edits = [peer.with_text(view.rewrite_in_reply(peer.text)) for peer in _peers(triple)]
     elif call.method in _URI_REPLIES:
         edits = _rewrite_uri(call.method, triple, view)
     return xmlrpc.apply(reply, edits)
@@ -122,7 +123,7 @@ def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
     offers = [offer.items for offer in call.params[2].items if len(offer.items) > 2]
     hosts = [items[2] for items in offers if items[0].string() == "UDPROS"]
     return xmlrpc.apply(
-        body, [xmlrpc.replace(h, address) for h in hosts if (h.string() or "").lower() == host]
+        body, [h.with_text(address) for h in hosts if (h.string() or "").lower() == host]
     )
 
 
@@ -177,20 +178,20 @@ def tcpros_address(triple: Value) -> HostPort | None:
 def send_to(triple: Value, target: HostPort) -> list[Edit]:
     """Edits by which a reply to ``requestTopic`` sends the subscriber elsewhere."""
     _, host, port = triple.items[2].items
-    edits = [xmlrpc.replace(host, target.host), xmlrpc.replace(port, str(target.port))]
+    edits = [host.with_text(target.host), port.with_text(str(target.port))]
     return edits + _in_message(triple, f"{host.text}:{port.text}", str(target))
 
 
 def replace_value(triple: Value, text: str) -> list[Edit]:
     """Edits by which a reply gives another text, also where its status message quotes it."""
     value = triple.items[2]
-    return [xmlrpc.replace(value, text), *_in_message(triple, value.text, text)]
+    return [value.with_text(text), *_in_message(triple, value.text, text)]
 
 
 def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
     """The edit of a status message that quotes a text; none if it does not."""
     text = triple.items[1].string() or ""
-    return [xmlrpc.replace(triple.items[1], text.replace(before, after))] if before in text else []
+    return [triple.items[1].with_text(text.replace(before, after))] if before in text else []
 
 
 def _publishers(call: Call) -> list[Value]:

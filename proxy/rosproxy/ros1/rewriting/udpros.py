@@ -11,8 +11,8 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header
-from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 
 PROTOCOL = "UDPROS"
 
@@ -42,9 +42,9 @@ def read_offers(call: Call) -> list[UdprosOffer]:
 def redirect_offer(offer: UdprosOffer, target: HostPort | None) -> list[Edit]:
     """The edits by which an offer leads elsewhere; None takes it out of the call."""
     if target is None or offer.receiver is None:
-        return [xmlrpc.remove(offer.value)]
+        return [offer.value.removed()]
     _, _, host, port, *_ = offer.value.items
-    return [xmlrpc.replace(host, target.host), xmlrpc.replace(port, str(target.port))]
+    return [host.with_text(target.host), port.with_text(str(target.port))]
 
 
 def _topic(items: list[Value]) -> str:

@@ -17,11 +17,10 @@ from rosproxy.ros1.protocol.master_methods import Kind, method_spec, prefix
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from rosproxy.ros1.rewriting.master_api import unregistering_endpoint
 from rosproxy.ros1.rewriting.master_calls import (
     NO_REPLY_CHANGES,
     CallOutcome,
@@ -98,14 +97,12 @@ class AccessChecks:
     def judge_registration(
         self, call: Call, admission: CallOutcome, caller: Caller, now: float
     ) -> CallOutcome:
-        """What becomes of a call that registers or unregisters, once it is admitted."""
+        """What becomes of a call that registers, once its node is admitted."""
         if self.idle or isinstance(admission, LocalReply):
             return admission
-        affected, spec = registration_of(call, now, caller.address), method_spec(call.method)
+        affected = registration_of(call, now, caller.address)
         if affected is None or affected.kind is Kind.PARAM:  # parameters were judged before
             return admission
-        if spec.unregisters:
-            return self._judge_end(affected, call, caller) or admission
         address = admission.address if isinstance(admission, Endpoint) else caller.address
         kind, callers = policing.KINDS[affected.kind], [affected.caller_id]
         verdict = self._policy.ask(kind, affected.name, callers, address)
@@ -115,6 +112,16 @@ class AccessChecks:
             return _refusal(verdict)  # a URI of somebody else, whom the proxy could not hide
         concealed = replace(affected, hidden=True)
         return policing.hidden_registration(concealed, admission, caller, self._addressing)
+
+    def judge_unregistration(
+        self, call: Call, endpoint: Endpoint | None, caller: Caller
+    ) -> LocalAnswer | None:
+        """The answer to a call that ends a registration of which the master does not know."""
+        ended = registration_of(call, 0.0, caller.address)
+        if self.idle or endpoint is None or ended is None or ended.kind is Kind.PARAM:
+            return None
+        current = endpoint.registrations.get(ended.key)
+        return policing.hidden_unregistration(current) if current and current.hidden else None
 
     def reply_changes(self, reply: MasterReply) -> ReplyChanges:
         """What the policy changes in the master's reply."""
@@ -290,12 +297,6 @@ class AccessChecks:
         below = [name for name in await params.names() if name.startswith(starts)]
         verdicts = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
         return strictest([*exact, *verdicts])
-
-    def _judge_end(self, ended: Registration, call: Call, caller: Caller) -> LocalAnswer | None:
-        """The answer to a call that ends what the master does not know of."""
-        endpoint = unregistering_endpoint(call, caller, self._addressing)
-        current = endpoint.registrations.get(ended.key) if endpoint else None
-        return policing.hidden_unregistration(current) if current and current.hidden else None
 
 
 class _KnownParams:

@@ -34,7 +34,8 @@ from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit
+from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.registry.stand_ins import PORTS, StandIn

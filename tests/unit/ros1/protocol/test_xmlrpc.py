@@ -3,8 +3,9 @@
 import pytest
 
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Edit, XmlRpcError
+from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
+from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from tests.unit.builders import DIALECTS, cpp_call, py_call, py_reply, python_values, raw_call
 
 URI = "http://10.0.0.5:40001/"
@@ -65,7 +66,7 @@ def test_a_value_is_found_with_its_kind_text_and_place(sent: str, found: tuple[s
 def test_a_string_is_replaced_however_it_is_written(sent: str) -> None:
     body = raw_call("<value>before</value>", sent, "<value><int>3</int></value>")
     value = xmlrpc.parse_call(body).params[1]
-    rewritten = xmlrpc.apply(body, [xmlrpc.replace(value, "a<b>&'é")])
+    rewritten = xmlrpc.apply(body, [value.with_text("a<b>&'é")])
     assert python_values(rewritten) == ["before", "a<b>&'é", 3]
     head, tail = body.split(sent.strip().encode())
     assert rewritten.startswith(head)
@@ -76,7 +77,7 @@ def test_a_string_is_replaced_however_it_is_written(sent: str) -> None:
 def test_a_scalar_replaced_by_its_own_text_stays_byte_for_byte(sent: str) -> None:
     body = raw_call(sent)
     value = xmlrpc.parse_call(body).params[0]
-    assert xmlrpc.apply(body, [xmlrpc.replace(value, value.text)]) == body
+    assert xmlrpc.apply(body, [value.with_text(value.text)]) == body
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_a_scalar_replaced_by_its_own_text_stays_byte_for_byte(sent: str) -> Non
 )
 def test_a_replaced_string_keeps_its_type_tag(sent: str, becomes: str) -> None:
     body = raw_call(sent)
-    edit = xmlrpc.replace(xmlrpc.parse_call(body).params[0], URI)
+    edit = xmlrpc.parse_call(body).params[0].with_text(URI)
     assert xmlrpc.apply(body, [edit]) == raw_call(becomes)
 
 
@@ -101,7 +102,7 @@ def test_a_replaced_string_keeps_its_type_tag(sent: str, becomes: str) -> None:
 def test_a_replaced_number_keeps_its_type_tag(dialect: str) -> None:
     call, _ = DIALECTS[dialect]
     body = call("m", 40001)
-    edit = xmlrpc.replace(xmlrpc.parse_call(body).params[0], "45003")
+    edit = xmlrpc.parse_call(body).params[0].with_text("45003")
     assert xmlrpc.apply(body, [edit]) == call("m", 45003)
 
 
@@ -119,7 +120,7 @@ def test_text_is_written_in_the_encoding_that_the_document_declares(
     encoding: str, text: str, written: bytes
 ) -> None:
     body = raw_call("<value>x</value>", encoding=encoding)
-    rewritten = xmlrpc.apply(body, [xmlrpc.replace(xmlrpc.parse_call(body).params[0], text)])
+    rewritten = xmlrpc.apply(body, [xmlrpc.parse_call(body).params[0].with_text(text)])
     assert written in rewritten
     assert python_values(rewritten) == [text]
 
@@ -133,7 +134,7 @@ def test_latin1_strings_are_read_as_such(sent: str) -> None:
 
 def test_a_byte_order_mark_moves_no_offset() -> None:
     body = b"\xef\xbb\xbf" + py_call("m", "before", "x")
-    edit = xmlrpc.replace(xmlrpc.parse_call(body).params[1], URI)
+    edit = xmlrpc.parse_call(body).params[1].with_text(URI)
     assert xmlrpc.apply(body, [edit]) == b"\xef\xbb\xbf" + py_call("m", "before", URI)
 
 
@@ -142,7 +143,7 @@ def test_a_self_closing_value_ends_where_its_tag_ends() -> None:
     body = raw_call("<value><array><data><value/>\n<value>x</value><value/></data></array></value>")
     array = xmlrpc.parse_call(body).params[0]
     assert [item.raw for item in array.items] == [b"<value/>", b"<value>x</value>", b"<value/>"]
-    removed = xmlrpc.apply(body, [xmlrpc.remove(array.items[0]), xmlrpc.remove(array.items[2])])
+    removed = xmlrpc.apply(body, [array.items[0].removed(), array.items[2].removed()])
     assert python_values(removed) == [["x"]]
 
 

@@ -82,10 +82,10 @@ def test_only_the_replaced_strings_change(values: list[Any], new: str, data: st.
     body = py_call("m", *values)
     found = [string for param in xmlrpc.parse_call(body).params for string in strings(param)]
     old = data.draw(st.sampled_from([string.text for string in found])) if found else ""
-    edits = [xmlrpc.replace(string, new) for string in found if string.text == old]
+    edits = [string.with_text(new) for string in found if string.text == old]
     before = python_values(body)
     assert python_values(xmlrpc.apply(body, edits)) == swapped(before, old, new)
-    assert xmlrpc.apply(body, [xmlrpc.replace(string, string.text) for string in found]) == body
+    assert xmlrpc.apply(body, [string.with_text(string.text) for string in found]) == body
 
 
 @given(st.lists(PLAIN, max_size=4), st.sampled_from([py_call, cpp_call]))

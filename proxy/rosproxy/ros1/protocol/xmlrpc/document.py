@@ -12,14 +12,13 @@ import re
 from collections.abc import Iterable
 from typing import Any
 from xml.parsers import expat
-from xml.sax.saxutils import escape
 from xmlrpc.client import Fault, dumps
 
 import msgspec
 
 from rosproxy.ros1.protocol.xmlrpc import fast, values
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
-from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, text_of
+from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, Edit, text_of
 
 Value = values.Value
 PARSE_ERROR = -32700
@@ -66,33 +65,6 @@ class Call(msgspec.Struct, frozen=True):
         """The text of parameter ``index`` if it is there and a string, else None."""
         value = self.string_value(index)
         return value.text if value else None
-
-
-class Edit(msgspec.Struct, frozen=True):
-    """Replace the bytes ``start`` to ``end`` of a document by ``text``."""
-
-    start: int
-    end: int
-    text: bytes
-
-
-def replace(value: Value, text: str) -> Edit:
-    """An edit that gives a scalar another text and leaves its type as it is.
-
-    It changes no byte if the scalar has that text already, however that is written.
-    """
-    start, end = value.inner
-    if text == value.text:
-        return Edit(start, start, b"")
-    raw = escape(text).encode(value.encoding, "xmlcharrefreplace")
-    if value.body[start - 2 : start] == b"/>":  # <value/> or <string/>: no inside to write to
-        return Edit(*value.outer, b"<value>" + raw + b"</value>")
-    return Edit(start, end, raw)
-
-
-def remove(value: Value) -> Edit:
-    """An edit that takes a value out of its array."""
-    return Edit(*value.outer, b"")
 
 
 def apply(body: bytes, edits: Iterable[Edit]) -> bytes:

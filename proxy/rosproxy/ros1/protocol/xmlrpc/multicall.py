@@ -10,13 +10,13 @@ from xml.sax.saxutils import escape
 from rosproxy.ros1.protocol.xmlrpc.document import (
     INVALID_PARAMS,
     Call,
-    Edit,
     Value,
     XmlRpcError,
     dump_value,
     parse_response,
 )
 from rosproxy.ros1.protocol.xmlrpc.limits import REPLY
+from rosproxy.ros1.protocol.xmlrpc.values import Edit
 
 MULTICALL = "system.multicall"
 MOST_CALLS = 1000

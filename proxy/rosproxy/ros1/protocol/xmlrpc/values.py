@@ -1,8 +1,15 @@
-"""The values of XML-RPC documents, as `rosproxy.ros1.protocol.xmlrpc.document` finds them."""
+"""The values of XML-RPC documents, as `rosproxy.ros1.protocol.xmlrpc.document` finds them.
+
+A value tells the edits that change it, so that a document is entered twice: to be read, and to have
+all edits done.
+"""
 
 from dataclasses import dataclass, field
 from typing import Literal
 from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+import msgspec
 
 Kind = Literal["string", "int", "array", "struct", "other"]
 KINDS: dict[str, Kind] = {
@@ -15,6 +22,14 @@ KINDS: dict[str, Kind] = {
 """The elements that a value holds (http://xmlrpc.com/spec.md, and nil, which it lacks)."""
 SCALARS = KINDS.keys() - {"array", "struct"}
 """Those of them that hold text."""
+
+
+class Edit(msgspec.Struct, frozen=True):
+    """Replace the bytes ``start`` to ``end`` of a document by ``text``."""
+
+    start: int
+    end: int
+    text: bytes
 
 
 @dataclass(slots=True)
@@ -64,6 +79,27 @@ class Value:
     def member(self, name: str) -> "Value | None":
         """The value of a struct's member, or None."""
         return self.items[self.members.index(name)] if name in self.members else None
+
+    def with_text(self, text: str) -> Edit:
+        """The edit that gives a scalar another text and leaves its type as it is.
+
+        It changes no byte if the scalar has that text already, however that is written.
+        """
+        start, end = self.inner
+        if text == self.text:
+            return Edit(start, start, b"")
+        raw = escape(text).encode(self.encoding, "xmlcharrefreplace")
+        if self.body[start - 2 : start] == b"/>":  # <value/> or <string/>: no inside to write to
+            return self.replaced_by(b"<value>" + raw + b"</value>")
+        return Edit(start, end, raw)
+
+    def replaced_by(self, raw: bytes) -> Edit:
+        """The edit that puts another value, as it is written, in its place."""
+        return Edit(*self.outer, raw)
+
+    def removed(self) -> Edit:
+        """The edit that takes it out of its array."""
+        return self.replaced_by(b"")
 
 
 def text_of(raw: bytes, encoding: str) -> str:
