@@ -1,15 +1,34 @@
 """What happens by the clock or by an event rather than by a node's call.
 
-Where to look:
-
-- Dead nodes stay in ``rosnode list``, a port refuses or is not freed: `prober`.
-- The master was restarted or can't be reached: `master_monitor`.
-- After a start of the proxy nodes are missing, or have other ports: `recovery`.
-- A subscriber hears nothing after the proxy or a node was away: `resubscriber`.
-- A node registered around the proxy, or was shut down for it: `adopter`.
-- A container went, moved or arrived, or the proxy is to retire: `containers`.
-- What the proxy itself registers and unregisters at the master: `registrar`.
-
 Data goes one way: an answer of the master or a node is read by a client, a module of `decisions`
-says what follows, and the `Registrar` makes the calls. Nothing below knows who asked for it.
+says what follows (pure: of what is seen, and the time), and the `Registrar` makes the calls, or a
+port opens or refuses. Nothing below knows who asked for it.
+
+    when                    who                looks at           decided by      what is done
+    ----------------------  -----------------  -----------------  --------------  --------------
+    the master answers      recovery           the master's       recovery        leases as
+    first                                      graph, its nodes                   before
+    --master-interval       master_monitor     the master's pid                   the next row
+    its pid is new, or      registrar          the master's       registration    what it lost
+    every fifth time                           graph                              is registered
+    PROBE_TICK; each node:  prober             the node's pid     liveness        ports refuse,
+    --probe-interval                                                              nodes and
+                                                                                  leases end
+    RESUBSCRIBE_TICK,       resubscriber       the graph, nodes'  resubscription  they are told
+    until nobody is missed                     connections                        es
+    ENFORCE_TICK, once the  policy_enforcer    the registry,      AccessChecks    hidden, shown,
+    policy has changed                         connections                        cut
+    TIDY_INTERVAL           standins.ports     problems with                      those of ended
+                                               nodes outside                      nodes go
+    RETRY_BLOCKED           leases             ports that others                  they open
+                                               had
+    POST /containers        containers         the nodes there    liveness        unregistered,
+                                                                                  moved, adopted
+    a node registers that   adopter            the node, the      adoption        registered
+    did around the proxy                       master                             anew
+    what is hidden changes  publisher_updates  the registry                       they are told
+                                                                                  again
+    a hidden service is     service_finder     the nodes inside                   the registry
+    looked up after a                                                             learns it
+    start
 """

@@ -23,6 +23,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.upkeep.decisions import liveness
+from rosproxy.ros1.upkeep.decisions.liveness import AfterAnswer
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
@@ -124,17 +125,17 @@ class Prober:
             await self._registrar.clean_up(endpoint)
 
     async def _note_answer(self, endpoint: Endpoint, pid: int | None) -> None:
-        health = endpoint.health
-        if not endpoint.trusted:
+        due = liveness.after_answer(endpoint, pid)
+        if due is AfterAnswer.VERIFY:
             await self._recovery.serve(endpoint)
             return
-        if health.cleaned:
+        if due is AfterAnswer.COME_BACK:
             await self._registrar.come_back(endpoint, pid)
-        elif health.pid not in (None, pid):
+        elif due is AfterAnswer.UNREGISTER_LEFT_OVER:
             await self._registrar.unregister_left_over(endpoint)
-        elif endpoint.has_registered_directly:
+        elif due is AfterAnswer.RECONCILE:
             await self._registrar.reconcile(endpoint)
-        health.pid = pid
+        endpoint.health.pid = pid
         if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label, extra=endpoint.log_fields)
             self._leases.open(endpoint)

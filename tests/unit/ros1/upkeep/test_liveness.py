@@ -10,6 +10,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import NodeLocation
 from rosproxy.ros1.registry.health import Health, ProbeResult
 from rosproxy.ros1.upkeep.decisions import liveness
+from rosproxy.ros1.upkeep.decisions.liveness import AfterAnswer
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 
@@ -156,3 +157,25 @@ def test_a_process_that_hangs_up_is_called_from_then_on_and_another_is_not() -> 
     assert liveness.may_be_kept(endpoint)
     health.suspect()
     assert not liveness.may_be_kept(endpoint)
+
+
+@pytest.mark.parametrize(
+    ("trusted", "cleaned", "known_pid", "direct", "due"),
+    [
+        (False, True, 7, True, AfterAnswer.VERIFY),
+        (True, True, 7, True, AfterAnswer.COME_BACK),
+        (True, False, 8, True, AfterAnswer.UNREGISTER_LEFT_OVER),
+        (True, False, 7, True, AfterAnswer.RECONCILE),
+        (True, False, None, False, AfterAnswer.NOTHING),
+        (True, False, 7, False, AfterAnswer.NOTHING),
+    ],
+)
+def test_what_is_due_first_once_a_node_has_answered(
+    trusted: bool, cleaned: bool, known_pid: int | None, direct: bool, due: AfterAnswer
+) -> None:
+    endpoint = add_node(make_addressing())
+    endpoint.trusted = trusted
+    endpoint.health.cleaned, endpoint.health.pid = cleaned, known_pid
+    if direct:
+        endpoint.note_former_uri(endpoint.uri)
+    assert liveness.after_answer(endpoint, 7) is due

@@ -6,6 +6,7 @@ the node itself is asked before anything is done.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from enum import Enum
 
 from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
@@ -17,6 +18,28 @@ FORGET_AFTER = 3600.0
 """Seconds after which a node that was cleaned up while it was silent is forgotten."""
 NO_PATIENCE = 0.001
 """Seconds: less than between any two probes. Zero would mean that nothing is ever cleaned up."""
+
+
+class AfterAnswer(Enum):
+    """What is due first once a node has answered."""
+
+    VERIFY = "the master alone has told of it: is it the one?"
+    COME_BACK = "it was unregistered meanwhile: register it again"
+    UNREGISTER_LEFT_OVER = "it is another process: take back what the former one left"
+    RECONCILE = "it has registered around the proxy: compare what it has"
+    NOTHING = "all is as it was"
+
+
+def after_answer(endpoint: Endpoint, pid: int | None) -> AfterAnswer:
+    """What is due for an endpoint whose node has answered with a pid."""
+    health = endpoint.health
+    if not endpoint.trusted:
+        return AfterAnswer.VERIFY
+    if health.cleaned:
+        return AfterAnswer.COME_BACK
+    if health.pid not in (None, pid):
+        return AfterAnswer.UNREGISTER_LEFT_OVER
+    return AfterAnswer.RECONCILE if endpoint.has_registered_directly else AfterAnswer.NOTHING
 
 
 def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> list[Endpoint]:
