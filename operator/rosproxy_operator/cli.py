@@ -108,6 +108,7 @@ def docker(
     logs.set_up(log_format, log_level)
     for library in ("docker", "urllib3"):  # they log each request otherwise
         logging.getLogger(library).setLevel(logging.INFO)
+    # The proxy's variables have the same prefix, ROSPROXY_, and are no mistake here.
     unknown_variables(main, proxy_main)
     with setting_errors():
         context.obj = make_plan_settings(options)
@@ -202,8 +203,10 @@ def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
     from rosproxy.admin.client import AdminClient, AdminError, default_url
 
+    # default_url() alone falls back to the port of a proxy, 11312, and the operator's is 11313.
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
+        # With an HTTP status the operator has answered, and its text says what is wrong with it.
         fail(error if "HTTP" in str(error) else f"no operator answers at {url}")

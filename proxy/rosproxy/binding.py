@@ -27,7 +27,7 @@ def setting_error_if_taken(
     except OSError as error:
         text = f"{subject} can't be bound: {error.strerror}"
         if error.errno == errno.EADDRINUSE:
-            text += f" by {'; '.join(map(str, holders))}" if holders else " (ss -ltunp: by whom)"
+            text += f" by {'; '.join(map(str, holders))}" if holders else " (see ss -ltunp)"
         raise SettingError(option, text) from None
 
 

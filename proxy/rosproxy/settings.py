@@ -309,7 +309,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:
-            raise SettingError("--admin-token-hash", "goes instead of --admin-token, not with it")
+            raise SettingError("--admin-token-hash", "give either this or --admin-token, not both")
         self._check_ranges()
         try:
             check_bounds((*self.policy, *self.policy_layers))
@@ -340,7 +340,7 @@ class Settings:
                 text = f"port {port} lies in --port-range {self.port_range}; move one of them"
                 raise SettingError(option, text)
             if port in taken:
-                text = f"port {port} is that of {taken[port]}; move one of them"
+                text = f"port {port} is taken by {taken[port]}; move one of them"
                 raise SettingError(option, text)
             taken[port] = option
 
@@ -362,7 +362,7 @@ class Settings:
             raise SettingError("--ros2-ear", f"an ear is for one domain: {cure}")
         for peer in self.ros2_peer:
             if peer.port:
-                text = f"{peer} is one domain of another proxy: {cure}"
+                text = f"{peer} has a port, which is for one domain: {cure}"
                 raise SettingError("--ros2-peer", text)
 
     @property

@@ -280,6 +280,7 @@ def host_port(example: HostPort) -> Text:
 PORT = Number("PORT", 1, 65535)
 MEBIBYTES = Number("MiB", 1, 65536)
 CONNECTIONS = Number("N", 16, 1_000_000)
+# RTPS's ports of a domain begin at 7400 + 250 * ID: those of 233 would exceed 65535.
 DOMAIN = Number("ID", 0, 232)
 PORT_RANGE = Text("A-B", read_range)
 HOST = Text("HOST", read_host)

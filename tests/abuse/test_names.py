@@ -68,7 +68,9 @@ async def test_names_that_hang(start_apart, make_node):
                 for i in range(300)
             ]
             attack = asyncio.gather(*calls)
-            await until(lambda: "too many look-ups" in apart.text, "it has all that it may have")
+            await until(
+                lambda: "too many name look-ups" in apart.text, "it has all that it may have"
+            )
             assert (await named.publish(apart.master, "/named"))[0] == 1
             assert await seen_by(apart.master, other, "/named") == [named.uri]
             assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid

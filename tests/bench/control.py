@@ -175,7 +175,7 @@ def proxy(machines: World, loop: str) -> Iterator[Way]:
         process.wait_for("ready: ", timeout=60)
         with machines.running("inside", *node, env=ros) as rospy:
             uri = rospy.wait_for(r"^uri (\S+)", timeout=30)[1]
-            process.wait_for(rf"{name} at \S+ is http://{HOST}:(\d+)/")
+            process.wait_for(rf"{name} at \S+ is advertised as http://{HOST}:(\d+)/")
             with machines.entered("outside"):
                 line = Line((OUTSIDE, MASTER_PORT))
             lease = where(line.call("lookupNode", name, name)[2])

@@ -52,7 +52,7 @@ def test_a_pair_that_never_met(lab: Lab, browser: Browser) -> None:
         heard = lab.node("roscpp", "out", "sub", name="listener", topic="/chatter")
         lab.wait_registered("listener")
         broken = row(browser, "/chatter", State="BROKEN", To="/listener")
-        assert "has not come to" in broken["text"]
+        assert "has not connected to" in broken["text"]
         assert f"nc -vz {OUT_HOST} {port}" in broken["fix"]
     heard.wait_for("^got ")
     row(browser, "/chatter", State="ok", To="/listener")

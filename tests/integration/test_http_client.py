@@ -337,7 +337,7 @@ async def test_bodies_of_any_size_arrive(client, peer, size):
 
 @pytest.mark.parametrize("bad", ["/a b", "/a\r\nX: y", ""])
 async def test_nothing_else_than_a_path_gets_into_a_header(client, peer, bad):
-    with pytest.raises(ValueError, match="can't be asked for"):
+    with pytest.raises(ValueError, match="can't be requested"):
         await client.post(peer.where, bad, "robot", b"", 1)
     assert peer.accepted == 0
 

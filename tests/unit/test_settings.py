@@ -145,7 +145,7 @@ BAD: list[tuple[str, str, list[Any]]] = [
 
 
 def test_a_token_and_a_hash_do_not_go_together() -> None:
-    with pytest.raises(SettingError, match="--admin-token-hash: goes instead of --admin-token"):
+    with pytest.raises(SettingError, match="--admin-token-hash: give either this or --admin-token"):
         parse_settings({**GIVEN, "admin_token": "0123456789abcdef", "admin_token_hash": HASH})
 
 
@@ -153,7 +153,7 @@ def test_a_token_and_a_hash_do_not_go_together() -> None:
     ("name", "value", "complaint"),
     [
         ("ros2_ear", "172.17.0.1:7500", "an ear is for one domain"),
-        ("ros2_peer", ("robot", "other:11400"), "other:11400 is one domain of another proxy"),
+        ("ros2_peer", ("robot", "other:11400"), "other:11400 has a port, which is for one domain"),
     ],
 )
 def test_what_has_one_port_is_for_one_domain(name: str, value: object, complaint: str) -> None:

@@ -151,7 +151,7 @@ class ControlLoop:
             self._failed(error)
         else:
             if self._failures:
-                log.info("looking works again")
+                log.info("looks succeed again")
             self._failures, self._error = 0, None
             self._metrics.looks.labels("ok").inc()
             self._metrics.up.set(1)
@@ -178,6 +178,7 @@ class ControlLoop:
             async with asyncio.timeout(seconds):
                 await reason.wait()
         now = asyncio.get_running_loop().time()
+        # Events that come in this time cost no look of their own: `_try` clears them.
         await asyncio.sleep(self._looked_at + self._pace.debounce - now)
 
     @contextlib.asynccontextmanager

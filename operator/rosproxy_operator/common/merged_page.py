@@ -56,6 +56,7 @@ def merged(documents: Mapping[str, Document | str], version: str) -> Json:
                 links.append((name, replace(link, source=names[link.source], target=target)))
         findings += (replace(f, subject=f"{name}: {f.subject}") for f in document.findings)
         left_out += document.left_out
+    # Beyond MOST_LINKS the last are left out: links that are broken are the first to be shown.
     links.sort(key=lambda proxy_link: (proxy_link[1].state != BROKEN, proxy_link[1].quiet))
     shown = dict(list(nodes.items())[:MOST_NODES])
     kept = [proxy_link for proxy_link in links if proxy_link[1].source in shown][:MOST_LINKS]

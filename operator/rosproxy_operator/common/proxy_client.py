@@ -133,12 +133,12 @@ class ProxyClient:
         except ProxyError as error:
             if error.status == 404 and layers:
                 text = (
-                    "knows no policies, so that it is told of nobody new who may use it: its image "
-                    "is that of a former release: let it have the operator's"
+                    "does not support policies, so nobody new may use it: its image is that of a "
+                    "former release; let it have the operator's"
                 )
                 raise PolicyRefused(text, status=404) from None
             if error.status == 400:
-                text = f"does not take its policy, and is told of nobody new till then: {error}"
+                text = f"refuses its policy, so nobody new may use it until it takes one: {error}"
                 raise PolicyRefused(text, status=400) from None
             if error.status not in (404, 503):
                 raise
@@ -186,6 +186,7 @@ class ProxyClient:
             # No limit: each proxy that is waited for takes one; the callers bound the others.
             connector = aiohttp.TCPConnector(limit=0, socket_factory=_kept_alive)
             self._session = aiohttp.ClientSession(connector=connector, auto_decompress=False)
+        # One that is not there is to be found out soon, however long an answer may take.
         limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
         headers = {"Accept-Encoding": "identity"}
         if token:

@@ -19,6 +19,7 @@ _SEVERITIES = {severity.name.lower(): severity for severity in Severity}
 
 def command(names: Sequence[str]) -> tuple[str, ...]:
     """What is run in a proxy's container, for all or for some topics, nodes and services."""
+    # After "--" a name is never taken for an option.
     return ("rosproxy", "doctor", "--json", "--", *names)
 
 

@@ -68,5 +68,7 @@ class MasterResolver:
                 continue
             self._asked_at[host] = time.monotonic()
             usable = [a for a in addresses if not is_loopback(a) and a not in self._excluded]
+            # A name with several addresses keeps the one that was chosen: name servers change the
+            # order of their answers, and each change would be told to the proxy.
             if usable and self._resolved.get(host) not in usable:
                 self._resolved[host] = usable[0]

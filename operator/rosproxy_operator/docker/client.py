@@ -87,6 +87,8 @@ class DockerClient:
         before or is going to be an event.
         """
         with self._translated():
+            # A client for the stream alone, which is read for good. The SDK sets no time-out for
+            # it, so that an engine with nothing to tell is no failure.
             stream = self._connect().events(filters=FILTERS, decode=True)
         return self._read_events(stream)
 

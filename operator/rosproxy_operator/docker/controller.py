@@ -177,6 +177,7 @@ class DockerController:
         if self._last is None or self._executor.busy or self._loop.woken:
             return False
         snapshot, planned = self._last
+        # --once does not wait for what has failed to be tried again: it ends and tells of it.
         if self._executor.problems or self._proxy_sync.problems(snapshot):
             return True
         waiting = snapshot.state.busy or self._observer.waiting
@@ -189,7 +190,7 @@ class DockerController:
 
     def _unsolved(self) -> list[Problem]:
         if self._last is None:
-            return [Problem("engine", self._loop.unready() or "was not looked at")]
+            return [Problem("engine", self._loop.unready() or "has not been looked at yet")]
         snapshot, planned = self._last
         problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
         subjects = {problem.subject for problem in problems}
@@ -200,7 +201,7 @@ class DockerController:
         ]
         unfinished = planned.groups or planned.deferred or snapshot.state.busy
         if unfinished and not problems:
-            problems.append(Problem("operator", "there was not enough time for all actions"))
+            problems.append(Problem("operator", "not all was done in time: run --once again"))
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:

@@ -80,4 +80,5 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
 
 def _order(problem: Json) -> tuple[bool, int]:
     kinds = [kind for kind in _CAUSES if problem["subject"].startswith(kind)]
+    # The first: "proxy image" stands before "proxy", which begins alike.
     return not problem["fatal"], _CAUSES.index(kinds[0]) if kinds else len(_CAUSES)

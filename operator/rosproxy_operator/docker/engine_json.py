@@ -15,6 +15,7 @@ from rosproxy_operator.docker.planner.model import Attachment, Container, Networ
 from rosproxy_operator.docker.planner.own import Making
 from rosproxy_operator.docker.planner.specs import SECRET
 
+# Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
 _VARIABLES = frozenset(
     {"ROS_VERSION", "ROS_DISTRO", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY", "RMW_IMPLEMENTATION"}
@@ -153,6 +154,8 @@ def read_container(
     row: Json, inspected: Json | None, networks: Iterable[Network] = ()
 ) -> Container:
     """A container from its row in the engine's list and its inspection, if there is one."""
+    # Engines tell a network by its id where the container was created so, and by "default" where it
+    # was created without one; newer engines store "bridge" instead (moby: container_routes.go).
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
     name, short_id = name_of(row), row["Id"][:12]

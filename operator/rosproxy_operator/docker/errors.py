@@ -41,6 +41,8 @@ class PortTaken(EngineError):
 def refusal(status: int, text: str, request: str) -> EngineError:
     """The error for what an engine (or a proxy in front of it) answered to a request."""
     message = _IDS.sub(lambda match: match[0][:12], " ".join(text.split()))
+    # "page not found" is about the path of the request, not about an object: engines answer so to
+    # calls that they don't know (moby: daemon/server/server.go, CreateMux).
     if status == 404 and "page not found" not in message:
         return Gone(message)
     if status == 409:
@@ -48,6 +50,7 @@ def refusal(status: int, text: str, request: str) -> EngineError:
     if _PORT_TAKEN.search(message):
         # The endpoint's name before the ports may hold anything.
         ports = map(int, _PORT.findall(message.rpartition("endpoint ")[2]))
+        # Docker Desktop names port 0 as well: "exposing port TCP 0.0.0.0:80 -> 127.0.0.1:0".
         return PortTaken(message, next(filter(None, ports), None))
     if foreign := _FOREIGN_ADDRESS.search(message):
         message = (

@@ -62,6 +62,7 @@ QUIET = 120.0
 STOP_TIMEOUT = 2
 """Seconds that a process has to end before it is killed."""
 DONE: dict[type, tuple[str, ...]] = {
+    # moby has them in libnetwork and in daemon/{unpause,rename,delete,container_operations}.go.
     CreateNetwork: ("already exists",),
     Start: ("is not running",),
     Restart: (),
@@ -154,6 +155,7 @@ class Executor:
         for job in sorted(by_job, key=lambda job: job[0] is not None):  # the uplink first
             actions = [action for group in by_job[job] for action in group.actions]
             failure = self._failures.get(job)
+            # Other actions than those that failed are tried at once: something has changed.
             waiting = failure and failure.actions == actions and now < failure.retry_at
             if actions and not waiting and job not in self._busy:
                 work = self._run(job, by_job[job], actions, carry_out)
@@ -266,6 +268,7 @@ class DockerApplier:
         match action:
             case CreateNetwork(name):
                 labels = {MANAGED: "true", SECRET: snapshot.new_secret}
+                # Without check_duplicate engines before API 1.44 may make a second one of the name.
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
                 self._create(action.name, self._config(action, snapshot), snapshot.state.image_id)
@@ -330,11 +333,13 @@ class DockerApplier:
         try:
             self._engine.do("create_container_from_config", config, name)
         except Conflict:
+            # Our own of that name is all right: an earlier call may have made it and its answer
+            # been lost. The next look compares it with what is wanted.
             container = self._engine.container(name)
             own = read_own(container["Config"].get("Labels") or {})
             making = engine_json.read_making(container)
             if own is None or forgery_reason(own, name, making, image_id):
                 raise EngineError(
-                    f"a container that is not this operator's is called {name}; "
+                    f"the name is taken by a container {name} that this operator did not make; "
                     f"rename it (docker rename {name} …) or remove it"
                 ) from None

@@ -8,6 +8,7 @@ from rosproxy.net.addresses import is_loopback
 from rosproxy.net.interfaces import address_towards
 
 _USUAL_EPHEMERAL = "32768 60999"
+# TCP_LISTEN of the kernel's include/net/tcp_states.h, as hexadecimal digits.
 _LISTEN = "0A"
 _ELSEWHERE = "192.0.2.1"
 """An address of no network (RFC 5737), to find out where connections to far hosts leave."""

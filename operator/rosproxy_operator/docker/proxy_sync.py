@@ -89,9 +89,10 @@ class ProxyUpdater:
                 )
                 failures, logged = 0, ""
             except ProxyError as error:
+                # Not logged before all pauses are used up, which takes 19 s, and then once.
                 if not error.is_unreachable and failures >= len(PAUSES) and str(error) != logged:
                     logged = str(error)
-                    text = "%s could not be told who may use it: %s"
+                    text = "%s could not be told which addresses may use it: %s"
                     log.warning(text, self._name, error, extra={"proxy": self._name})
                 self._selecting.set()
                 await asyncio.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
@@ -99,6 +100,7 @@ class ProxyUpdater:
 
     async def _tell_policy(self) -> None:
         """Tell the policy, unless this run of the proxy has heard it. Raises ProxyError."""
+        # Both tasks of `run` tell it: the second one waits, and finds that it is told.
         async with self._telling_policy:
             policy = self._news.policy
             if policy != self._policy:
@@ -120,6 +122,7 @@ class ProxyUpdater:
                 failures = 0
             except ProxyError as error:
                 failures += 1
+                # It has answered, and only its master can't be asked: that is no silence.
                 self._heard(None if error.lacks_master else error)
 
     async def _tell(self) -> None:

@@ -212,7 +212,7 @@ class Inspector:
             log.debug("inspecting %s: %s", container[:12], error)
         except msgspec.ValidationError as error:
             if container not in self._unreadable:
-                log.warning("what the engine tells of %s can't be read: %s", container[:12], error)
+                log.warning("container %s: its inspection can't be read: %s", container[:12], error)
             self._unreadable.add(container)
         finally:
             del self._asking[container]
@@ -261,6 +261,8 @@ class DockerObserver:
         await self._inspector.update(rows, own_roles, patience)
         networks = tuple(map(engine_json.read_network, net_rows))
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
+        # A bridge's gateway is an address of the host's own network namespace. In another one, the
+        # ports on which something listens here say nothing of those of the host.
         at_host = any(map(host.has, bridges))
         state = self._read(rows, networks, image)
         if at_host:

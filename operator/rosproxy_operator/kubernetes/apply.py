@@ -79,7 +79,7 @@ Count = Callable[[Action, str], None]
 class ClusterApplier:
     """Carries out actions, those of one RosProxy one after the other.
 
-    ``count_patch`` is called with each action and its outcome (ok, failed); ``doubted`` if the
+    ``counted`` is called with each action and its outcome (ok, failed); ``doubted`` if the
     watched state still differs from what is read: a watch has missed something. ``busy`` is the
     number of actions that are under way or wait for their turn.
     """
@@ -137,6 +137,8 @@ class ClusterApplier:
                 if error is not None:
                     text = f"its status can't be written: {error}"
                     self.problems[name] = Problem(f"rosproxy {name}", text)
+        # A Normal Event says that an action was done. It does not name its action: so after a
+        # failure none of them is made.
         emits = [action for action in actions if isinstance(action, Emit)]
         wanted = [emit for emit in emits if not (failures and emit.type == "Normal")]
         await asyncio.gather(*(self._perform(emit, observed) for emit in wanted))
@@ -152,7 +154,7 @@ class ClusterApplier:
             async with self._room:
                 await in_thread(self._call_api, action, observed)
         except StateChanged as error:
-            log.debug("%s: not now: %s has changed meanwhile", describe(action), error)
+            log.debug("%s: put off: %s has changed meanwhile", describe(action), error)
             self._doubt(_subject(action))
             return None
         except NotLeading:
@@ -193,7 +195,7 @@ class ClusterApplier:
         assert isinstance(action, DeleteProxy)  # noqa: S101 - no other is to be retired
         if action.uid in self._retired:
             return True
-        if not self._api.gate.open():
+        if not self._api.gate.open():  # the proxy is asked directly, so no request passes the gate
             return False
         if action.uid not in self._retiring:
             self._retiring.add(action.uid)
@@ -217,6 +219,7 @@ class ClusterApplier:
                 confirm(api, action, observed)
                 api.evict(action.id, action.uid)
             case SetImage():
+                # A JSON patch finds a container by its index alone: the test makes sure of which.
                 container = "/spec/containers/0"
                 name_test = {"op": "test", "path": f"{container}/name", "value": CONTAINER}
                 image = {"op": "replace", "path": f"{container}/image", "value": action.image}
@@ -225,6 +228,7 @@ class ClusterApplier:
                 spec = {"op": "replace", "path": "/spec", "value": action.spec}
                 api.patch(POLICIES, action.id, [_uid_test(action.uid), spec])
             case PatchStatus():
+                # `add` replaces as well, and works if there is no status yet (RFC 6902, 4.1).
                 status = {"op": "add", "path": "/status", "value": action.status}
                 api.patch(f"{PLURAL}/status", action.of, [_uid_test(action.uid), status])
             case Emit():
@@ -249,7 +253,7 @@ class ClusterApplier:
             text = "%s could not unregister its nodes at the master: %s"
             log.info(text, action.id, reason, extra=fields)
         finally:
-            self._retired.add(action.uid)
+            self._retired.add(action.uid)  # a proxy that could not unregister them goes as well
             self._retiring.discard(action.uid)
             await self._perform(action, observed)
 
@@ -276,7 +280,7 @@ def describe(action: Action) -> str:
 
 def _change_line(action: SetImage | SetPolicy | EvictPod) -> str:
     if isinstance(action, SetPolicy):
-        return f"mend NetworkPolicy {action.id}"
+        return f"correct NetworkPolicy {action.id}"
     if isinstance(action, EvictPod):
         return f"evict Pod {action.id}: {action.why}"
     return f"set image of Pod {action.id} to {action.image}"
@@ -341,8 +345,8 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
     owners = {text_at(owner, "kind") for owner in submaps(metadata, "ownerReferences")}
     if not is_own(texts_at(metadata, "labels")) or KIND not in owners:
         raise ApiConflict(
-            f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
-            "or rename the RosProxy"
+            f"there is already a {body.get('kind')} of this name that is not the operator's: "
+            "rename it, or rename the RosProxy"
         )
 
 

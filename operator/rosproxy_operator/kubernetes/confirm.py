@@ -32,7 +32,10 @@ class StateChanged(Exception):
 
 
 def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
-    """The version in which the object may be deleted; empty for any. Raises Stale, ApiError."""
+    """The version in which the object may be deleted; empty for any.
+
+    Raises StateChanged, ApiError.
+    """
     is_gone = _check_rosproxy(api, action.of, observed)
     if isinstance(action, EvictPod):
         _check_pod(api, action, observed)
@@ -51,7 +54,7 @@ def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
     if _by_uid(current) != _by_uid(expected):
         raise StateChanged(f"the pods on node {target.node}")
     if target.pod.node != target.node:
-        return ""
+        return ""  # it is not on that node yet, so it is not in this list
     return next((_version(obj) for obj in raw_pods if _uid(obj) == action.uid), "")
 
 
@@ -94,6 +97,8 @@ def _wiring(pod: Pod) -> tuple[object, ...]:
 
 
 def _requested(rosproxy: RosProxy | InvalidRosProxy) -> tuple[object, ...]:
+    # The generation counts changes of the spec, not of annotations, which `remakes` comes from
+    # (k8s.io/apiextensions-apiserver, pkg/registry/customresource/strategy.go, PrepareForUpdate).
     flags = (rosproxy.deleting, rosproxy.remakes) if isinstance(rosproxy, RosProxy) else ()
     return rosproxy.uid, rosproxy.generation, *flags
 

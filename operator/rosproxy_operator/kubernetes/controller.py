@@ -133,6 +133,7 @@ class KubernetesController:
         except ApiError as error:
             raise LookFailed(str(error), away=isinstance(error, ApiUnavailable)) from error
         except BaseException:
+            # The store tells each change once, and this look may have planned none of them.
             self._due.mark_all_due()
             raise
 
@@ -163,7 +164,7 @@ class KubernetesController:
         if remaining > 0:
             return remaining
         self._secret = await in_thread(self._key.read)
-        self._store.take_changes()
+        self._store.take_changes()  # not needed: a term begins with a plan for everything
         observed = self._store.snapshot(self._secret)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(observed, reports=self._proxy_sync.reports)
@@ -173,6 +174,7 @@ class KubernetesController:
 
     async def _act(self) -> float | None:
         started = time.monotonic()
+        # A key that was removed from its Secret, or replaced, is noticed at the next resync.
         if self._due.is_all(started, self._settings.resync):
             self._secret = await in_thread(self._key.read)
         self._due.at_once(await self._sandbox.read(self._store.snapshot()))

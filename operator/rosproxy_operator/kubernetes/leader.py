@@ -51,7 +51,7 @@ class LeaderElection:
         self._api, self._lease, self._metrics = api, lease, metrics
         self._candidate = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
         self._leaving, self._lock = False, asyncio.Lock()
-        self._shown = (-1, "")
+        self._shown = (-1, "")  # no term has this number, so the first state is reported
         self._error = ""
         metrics.leader.set(lease is None)
 
@@ -73,7 +73,7 @@ class LeaderElection:
             # Candidates are spread in time; a leader that fails to renew has little time left.
             calm = self.leads() and not self._error
             await asyncio.sleep(RENEW if calm else LOOK * random.uniform(0.5, 1.0))  # noqa: S311
-        await asyncio.Event().wait()
+        await asyncio.Event().wait()  # the process ends with the first task that does (`run`)
 
     def resign(self) -> None:
         """Lead no more. The Lease is kept until `release`."""
@@ -83,6 +83,7 @@ class LeaderElection:
     async def release(self) -> None:
         """Let another operator lead at once: this one has stopped acting."""
         async with self._lock:  # a renewal may be under way
+            # If one was, its result has replaced what `resign` had noted.
             self._candidate = leadership.after_resignation(self._candidate)
             if self._lease is not None:
                 await in_thread(self._release, self._lease)
@@ -111,9 +112,13 @@ class LeaderElection:
             record = leadership.released_record(self._read(lease), self._candidate.name)
             if record is not None:
                 self._write(lease, record)
-                log.info("leads no more: released the Lease %s", lease)
+                log.info("this operator leads no more: it has released the Lease %s", lease)
         except ApiError as error:
-            log.warning("Lease %s: %s; another operator leads once it has run out", lease, error)
+            log.warning(
+                "the Lease %s was not released: %s; another operator leads once it has run out",
+                lease,
+                error,
+            )
 
     def _read(self, lease: Name) -> LeaseRecord | None:
         try:
@@ -147,9 +152,9 @@ class LeaderElection:
         if previous[1] != holder and previous[0] >= 0:
             self._metrics.leader_changes.inc()
         if term:
-            log.info("leads: this operator acts (%s)", holder)
+            log.info("this operator leads now (%s)", holder)
         else:
-            log.info("stands by: %s leads", holder or "nobody")
+            log.info("this operator stands by: %s leads", holder or "nobody")
         changed()
 
 

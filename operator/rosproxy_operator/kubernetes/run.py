@@ -83,6 +83,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     tasks = [asyncio.ensure_future(work) for work in running]
     serving.start()
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    # Without a Lease there is no other operator to hand over to.
     if settings.lease and stopped.is_set():
         await hand_over(api, controller, election)
         if webhook:

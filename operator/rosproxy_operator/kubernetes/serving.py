@@ -88,14 +88,16 @@ class ClusterServing:
 
     async def configure(self, settings: kopf.OperatorSettings, **_: Any) -> None:
         """Set kopf up."""
-        settings.posting.enabled = False
+        settings.posting.enabled = False  # the operator makes its own Events
+        # To watch namespaces and definitions takes rights that the operator has not.
         settings.scanning.disabled = True
-        settings.peering.standalone = True
+        settings.peering.standalone = True  # `leader` says who acts
         # It would kill this thread some minutes after kopf was only started again.
         settings.process.ultimate_exiting_timeout = None
         settings.networking.error_backoffs = EndlessBackoff()
         settings.networking.request_timeout = 30.0
         settings.networking.connect_timeout = 5.0
+        # The chart makes the webhook's configuration; kopf would write it anew, and take it away.
         settings.admission.managed = None
         settings.admission.server = self._webhook[1] if self._webhook else None
 
@@ -112,7 +114,7 @@ class ClusterServing:
             with warnings.catch_warnings(action="ignore"):
                 asyncio.run(self._operate())
         except asyncio.CancelledError:
-            pass
+            pass  # by `restart`
         except Exception as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
             log.warning("serving the webhook has ended (%s); starting it again", reason)

@@ -36,6 +36,7 @@ class PolicyFile:
         """Take in what the file says. Raises ValueError, which says what is wrong with it."""
         try:
             with self._path.open("rb") as file:
+                # Taken first: what changes while it is read is read at the next look.
                 self._last_signature = _signature(os.fstat(file.fileno()))
                 text = file.read(LONGEST_FILE + 1)
             if len(text) > LONGEST_FILE:
@@ -58,6 +59,7 @@ class PolicyFile:
             self.read()
         except ValueError as error:
             text = f"{error}; the rules that were read before stay in force"
+            # A file that can't be opened is tried at each look, and told of once.
             if text not in (problem.text for problem in self._problems.all()):
                 log.error("%s: %s", OPTION, text)
                 self._problems.solved(OPTION)

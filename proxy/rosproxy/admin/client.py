@@ -57,11 +57,14 @@ class AdminClient:
         """Let the proxy find out whether its range can be reached. Raises AdminError."""
         from rosproxy.admin.requests import read_probe  # noqa: PLC0415
 
+        # With a master that answers it takes 15 s at most: twice two time-outs of 3 s
+        # (`range_probe`), and 3 s by UDP (`udp_probe`).
         return read_probe(self._json(self._ask("POST", "/probe", 20.0), "probes"))
 
     def page(self) -> str:
         """Where a browser finds the live page; with a key, if a token is set. Raises AdminError."""
         if not _authorization():
+            # Only to find out whether anybody is there: without a token the page needs no key.
             self.get("/healthz")
             return f"{self.url}/"
         return f"{self.url}/?key={self._json(self._ask('POST', '/page-key', 5.0), 'key')['key']}"
@@ -98,6 +101,8 @@ class AdminClient:
 def _authorization() -> dict[str, str]:
     """The header that lets callers change things from elsewhere than the proxy's own loopback."""
     token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
+    # http.client raises ValueError for a header with other characters (putheader). Without the
+    # header the proxy answers 403, and says what it takes.
     fits = token and token.isascii() and token.isprintable()
     return {"Authorization": f"Bearer {token}"} if fits else {}
 

@@ -15,6 +15,7 @@ from rosproxy.telemetry.text import clean, shorten
 from rosproxy.values import read_peer
 
 Body = TypeVar("Body", bound=msgspec.Struct)
+# Not the narrower rule of DNS: names of containers have underscores as well.
 _NAME = re.compile(r"[\w.-]{1,253}")
 _PREFIX = re.compile(r"[0-9a-f]{2}(\.[0-9a-f]{2}){11}")
 MOST_PEERS = 1024
@@ -97,7 +98,7 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         msgspec.structs.force_setattr(self, "moved", moved)
         for prefix in self.former:
             if not _PREFIX.fullmatch(prefix):
-                raise ValueError(f"former: must be by GUID prefixes, not {prefix[:40]!r}")
+                raise ValueError(f"former: keys must be GUID prefixes, not {prefix[:40]!r}")
         if len(self.peers or ()) > MOST_PEERS:
             raise ValueError(f"peers: must be {MOST_PEERS} at most")
         for i, peer in enumerate(self.peers or ()):
@@ -159,6 +160,8 @@ def read_body(body: object, kind: type[Body]) -> Body:
     try:
         return msgspec.convert(body, kind)
     except msgspec.ValidationError as error:
+        # For example: Expected `str`, got `int` - at `$.gone[0]`. A ValueError of __post_init__ is
+        # its cause and has named the field already.
         fault, _, path = str(error).partition(" - at `$")
         field = path.removeprefix(".").removesuffix("`")
         if error.__cause__ is None:  # msgspec's own, which does not begin with a field

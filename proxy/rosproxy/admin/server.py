@@ -83,6 +83,7 @@ class AdminServer:
 
     async def stop(self) -> None:
         """Stop listening."""
+        # Else aiohttp waits for those handlers, up to a minute (web_runner.py, shutdown_timeout).
         self._changes.end()
         if self._runner is not None:
             await self._runner.cleanup()
@@ -135,11 +136,11 @@ class AdminServer:
                 since, within, lambda: transport is not None and not transport.is_closing()
             )
         except TooManyWaiting:
-            return web.Response(status=503, text="rosproxy: too many wait already; ask /status\n")
+            return web.Response(status=503, text="rosproxy: too many callers wait; ask /status\n")
         return web.json_response({"version": version, "status": to_json(status)})
 
     def _forbidden(self, operation: str) -> web.Response:
-        hint = "" if self._token_hash else "; this proxy has none"
+        hint = "" if self._token_hash else "; this proxy has no token"
         return web.Response(status=403, text=FORBIDDEN.format(operation, hint))
 
     async def _post(self, request: web.BaseRequest) -> web.Response:
@@ -179,6 +180,7 @@ class _BoundedServer(web.Server):
     """Serves MOST_CONNECTIONS from one address at most."""
 
     def __init__(self, answer: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]) -> None:
+        # Nothing is inflated: a small body may become a very large one.
         super().__init__(
             answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT, auto_decompress=False
         )

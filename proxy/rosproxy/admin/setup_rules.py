@@ -27,7 +27,7 @@ _NO_WAY_BACK = ("refused", "silent", "unreachable")
 _TEXT_BY_OUTCOME = {
     "refused": "nothing listens there: the range is not published, or the host is another machine",
     "silent": "no answer: a firewall drops it, or the host is not this one",
-    "unreachable": "no way leads there",
+    "unreachable": "there is no route to it",
     "unresolvable": "the host name is unknown here",
     "closed": "something takes the connection and drops it: published to another port or container",
     "stranger": "something else answers there, not this proxy",
@@ -47,8 +47,8 @@ def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iter
         yield error(HOST, HOST, f"the host name {host} can't be resolved here", BY_ADDRESS)
     elif len(loopback) == len(addresses) and not all_here:
         text = (
-            f"{host} leads to {listed(loopback)} here, which is loopback (/etc/hosts of many "
-            "systems has the machine's own name so): fine only if outside finds another address"
+            f"{host} leads to {listed(loopback)} here, a loopback address (/etc/hosts of many "
+            "systems gives that to the host's own name): fine only if outside finds another address"
         )
         yield warning(HOST, HOST, text, BY_ADDRESS)
 
@@ -61,6 +61,7 @@ def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterato
         outcomes.setdefault((trial.transport, trial.from_proxy, trial.from_master), []).append(port)
     for (transport, from_proxy, from_master), tried_ports in outcomes.items():
         target = f"{host}, port {' and '.join(tried_ports)}"
+        # If all tries ended alike, the whole range is out of reach, and not only a part of it.
         is_uniform = len({key for key in outcomes if key[0] == transport}) == 1
         if transport == "udp":
             yield _by_udp(host, ports, from_proxy, target)
@@ -104,13 +105,14 @@ def _reached(host: str, from_proxy: str, from_master: str, target: str) -> Docto
     if from_master == "unknown":
         return ok(RANGE, RANGE, f"the proxy reaches {target}; the master could not be asked to try")
     text = (
-        f"{target}: reached from here, but not from the master's machine. For that it is another "
-        "machine, an address that only this side has, or behind a firewall"
+        f"{target}: reached from here, but not from the master's machine. There this host is known "
+        "as another machine or by another address, or a firewall is in between"
     )
     fix = (
         "--advertise-host ADDRESS: this host as the master's machine knows it "
         "(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz"
     )
+    # `target` ends with the last port that was tried.
     return error(RANGE, RANGE, text, f"{fix} {host} {target.rpartition(' ')[2]}")
 
 
@@ -128,7 +130,7 @@ def _not_reached(
     if from_master == "missed":
         return error(RANGE, RANGE, f"{text}. The master does not get through either", fix)
     if from_proxy in _NO_WAY_BACK:
-        text += ". Or only the way back is missing; the master, which could tell, is not there"
+        text += ". Or only the way back is missing; the master could not be asked to try"
         return warning(RANGE, RANGE, text, fix)
     return error(RANGE, RANGE, text, fix)
 

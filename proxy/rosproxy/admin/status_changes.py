@@ -44,7 +44,8 @@ class StatusChanges:
     ) -> tuple[str, ProxyStatus]:
         """The state and its version, once that is another one than ``since``.
 
-        Or after ``within`` seconds, or once the caller is no longer ``connected``. Raises Crowded.
+        Or after ``within`` seconds, or once the caller is no longer ``connected``.
+        Raises TooManyWaiting.
         """
         if self._waiting >= MOST_WAITING:
             raise TooManyWaiting

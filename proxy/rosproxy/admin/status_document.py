@@ -17,6 +17,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import msgspec
 
+# json.loads accepts NaN, Infinity and integers of any length, none of which is within these bounds.
+# 2**63 - 1 is the largest one that msgspec takes.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
 Rate = Annotated[float, msgspec.Meta(ge=0, le=1e18)]
@@ -354,6 +356,7 @@ def to_json(document: msgspec.Struct) -> dict[str, Any]:
 
 def _convert_leniently(value: object, kind: type[Document]) -> Document:
     """A document with defaults in place of what does not fit."""
+    # Nearly always all of it fits, and one step in C is enough.
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
@@ -375,5 +378,6 @@ def _convert_field(value: Any, kind: Any) -> Any:
         return _convert_leniently(value, inner)
     if get_origin(kind) is not tuple or not isinstance(value, list):
         return msgspec.convert(value, kind)
+    # All lists in these documents are of structs or of texts.
     items = [item for item in value if isinstance(item, dict if is_struct else str)]
     return tuple(_convert_leniently(item, inner) if is_struct else item for item in items)

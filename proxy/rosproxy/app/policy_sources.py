@@ -52,8 +52,9 @@ class PolicySources:
         try:
             self._use_operator_layers(body)
         except BodyError as error:
+            # A former refusal has another text, and would be kept beside this one (`Problems.add`).
             problems.solved(OPERATOR_POLICY)
-            problems.add(OPERATOR_POLICY, f"refused, that of before stays in force: {error}")
+            problems.add(OPERATOR_POLICY, f"refused; the previous policy stays in force: {error}")
             raise
         problems.solved(OPERATOR_POLICY)
         counts = Counter[str]()

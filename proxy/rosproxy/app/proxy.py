@@ -28,6 +28,7 @@ from rosproxy.settings import Settings
 log = logging.getLogger(__name__)
 
 new_event_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop
+# uvloop is an extra (pyproject.toml); the image has it.
 with contextlib.suppress(ImportError):
     from uvloop import new_event_loop
 
@@ -69,8 +70,11 @@ class App:
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
         settings = self.settings
+        # Any free port: an address that this host does not have is the fault of --bind, and would
+        # otherwise look as if all ports of the range were taken.
         with setting_error_if_taken("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
+        # Before any node can register, or a former process's nodes are found again.
         self._policy.start()
         for stack in self.stacks:
             await stack.start()
@@ -85,6 +89,8 @@ class App:
         """End everything."""
         if self._sign:
             self._sign.close()
+        # The page's streams end first: aiohttp waits up to a minute for handlers under way
+        # (web_runner.py, shutdown_timeout).
         await self.page.close()
         await self._admin.stop()
         for stack in self.stacks:
@@ -156,5 +162,6 @@ def _raise_file_limit() -> None:
     Each relayed connection takes up to six: two sockets and two pipes.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    # Where that is refused the proxy runs as well, with fewer connections.
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

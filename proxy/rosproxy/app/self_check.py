@@ -82,6 +82,7 @@ class SelfCheck:
         if settings.for_ros1:
             master = parse_authority(settings.master_uri)
             hosts += [settings.master_address or (master.host if master else "")]
+        # A host name that can't be resolved counts as one of another machine.
         resolved = [await resolve(host) or [host] for host in hosts]
         return bool(resolved) and all(any(map(is_loopback, addresses)) for addresses in resolved)
 

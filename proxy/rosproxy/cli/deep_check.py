@@ -37,6 +37,7 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
         advertise_host=host,
         advertised_addresses=tuple(await resolve(host)),
         is_all_local=not settings.for_ros1 and all(is_loopback(p.host) for p in settings.ros2_peer),
+        # The master is not asked for its graph here; None would be reported as its silence.
         graph=SystemState(),
         status=ProxyStatus(
             settings=StatusSettings(ros=settings.ros, advertise_host=host),
@@ -50,6 +51,8 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
     try:
         facts = replace(facts, probe=await _try_ports(runtime))
     except SettingError as failure:
+        # An empty one is not reported; None would be, as a range that was not tried. How many
+        # ports are free means nothing once some can't be had.
         facts = replace(facts, probe=RangeProbe())
         findings = [f for f in rules.setup(facts) if f.check != "ports"]
         return [*findings, error("ports", "ports", str(failure))]

@@ -33,7 +33,7 @@ def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
 def _summary(domain: document.DomainStatus) -> str:
     targets = [f"peers {listed(map(clean, domain.peers))}"] if domain.peers else []
     targets += [f"ear {clean(domain.ear)}"] if domain.ear else []
-    announced_to = "; ".join(targets) or "neither peers nor an ear: outside is told of nobody"
+    announced_to = "; ".join(targets) or "neither peers nor an ear: inside is announced to nobody"
     ports = f"{domain.ports_used} ports used, {domain.ports_free} free"
     lost = f"; {domain.dropped} datagrams refused, {domain.lost} lost"
     trouble = lost if domain.dropped or domain.lost else ""
@@ -51,6 +51,7 @@ def _plane(plane: document.DataPlaneStatus) -> str:
 def _row(participant: document.ParticipantStatus, side: str) -> tuple[str, ...]:
     return (
         clean(participant.guid_prefix),
+        # It has not shown yet that it gets what is sent to it.
         side if participant.proven else f"{side}?",
         clean(participant.address),
         clean(participant.vendor),

@@ -44,7 +44,7 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
     from rosproxy.telemetry import logs
 
     if deep and not check:
-        raise click.UsageError("--deep goes with --check")
+        raise click.UsageError("--deep needs --check")
     with options.setting_errors():
         settings = values.make_settings(Settings, given)
         logs.set_up(log_format, log_level)

@@ -21,6 +21,8 @@ WAIT_INTERVAL = 0.5
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
     from rosproxy.admin.client import AdminClient, default_url
 
+    # As for the proxy itself, what is given on the command line or in a variable comes before the
+    # file.
     bound = None if url or "ROSPROXY_ADMIN_BIND" in os.environ else _bound_by_file()
     try:
         return AdminClient(url or default_url(bound))
@@ -71,7 +73,7 @@ def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> 
     not.
     """
     if as_json + watch + opens > 1:
-        raise click.UsageError("one of --json, --watch and --open, not several")
+        raise click.UsageError("--json, --watch and --open exclude each other; give one of them")
     from rosproxy.cli import terminal
 
     if opens:
@@ -172,6 +174,7 @@ def doctor(
         None if outside else admin,
         master_uri or "",
         advertise_host or "",
+        # Names are global in what the master says; people leave the slash out.
         tuple(f"/{name.strip('/')}" for name in names),
         master_address,
     )

@@ -26,6 +26,7 @@ INDENT = "    "
 
 def render(status: document.ProxyStatus, columns: int, lines: int | None = None) -> str:
     """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
+    # Each line of the head begins with a label of nine characters, below which it goes on.
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
     problems = [*_problems(status, columns)]
     hidden = [*_hidden(status, columns)]
@@ -36,6 +37,7 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
     full = [*head, *nodes, *domains, *hidden, *problems]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
+    # The end is cut off where even this is too long, so problems come before nodes.
     short = [*head, *problems, *brief, *domains]
     if len(short) > lines:
         short[lines - 1 :] = [f"… {plural(len(short) - lines + 1, 'line')} more: rosproxy status"]

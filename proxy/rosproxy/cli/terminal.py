@@ -66,6 +66,7 @@ def watch(draw: Callable[[int, int | None], str]) -> None:
             if console.is_terminal:
                 live.update(text, refresh=True)
             else:
+                # Into a pipe or a file: one after the other, with an empty line between.
                 console.print(text, "", sep="\n", soft_wrap=True)
             time.sleep(WATCH_INTERVAL)
 

@@ -31,6 +31,8 @@ def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> lis
     variables = []
     for name, value in sorted(environment.items()):
         upper, prefixed = name.upper(), name.upper().startswith(_PREFIX)
+        # NAME_PORT=tcp://10.96.0.7:11311 is of a service, too (pkg/kubelet/envvars/envvars.go,
+        # makeLinkVariables); without a URL it is judged as any other.
         linked = _SERVICE_LINK.search(upper) or (upper.endswith("_PORT") and "://" in value)
         if name in known_names or linked or not upper.startswith("ROS"):
             continue

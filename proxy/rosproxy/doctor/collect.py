@@ -66,6 +66,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
         facts = replace(facts, heard_participants=heard, status=status)
     address = master.address if master.pinned else None
     uri = master.uri if status.settings.for_ros1 else ""
+    # The proxy tries its range meanwhile; each of the two may take some seconds.
     graph_task = asyncio.create_task(ask_graph(facts, uri, address))
     probe, reason = None, ""
     try:

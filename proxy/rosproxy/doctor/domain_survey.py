@@ -38,6 +38,7 @@ DOMAINS = 233
 ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
 WITHIN = 2.0
 """Seconds in which participants answer."""
+# Seconds after which participants forget the doctor if its farewell does not arrive.
 LEASE = 5.0
 MOST_HEARD = 200
 
@@ -74,6 +75,8 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
     """Who answers on the network where this machine has this address. Raises OSError."""
     by_prefix: dict[str, HeardParticipant] = {}
     with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
+        # Not heard on this machine: the proxy, which hears the groups, would take the doctor for
+        # a participant.
         send_through(sock, own_address, loop=False)
         prefix, targets = os.urandom(PREFIX), list(_targets(own_address, domains))
         own_locator = HostPort(own_address, sock.getsockname()[1])
@@ -95,6 +98,7 @@ def _targets(own_address: str, domains: Collection[int]) -> Iterator[tuple[str, 
             yield group, SPDP_MULTICAST + PORTS_PER_DOMAIN * domain
     for domain in domains:
         first = SPDP_UNICAST + PORTS_PER_DOMAIN * domain
+        # Every second port: the others are those of user data.
         for port in range(first, min(first + 2 * PARTICIPANTS_TRIED, 65536), 2):
             yield ALL_HOSTS[family_of(own_address)], port
 

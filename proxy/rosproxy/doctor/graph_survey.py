@@ -104,8 +104,11 @@ class _Collector:
         started = time.monotonic()
         attempt, _ = await _attempt(self._master.call_master("getPid"))
         trip = time.monotonic() - started
+        # The words of a proxy that is called by itself (`MasterApi._refuse_loop`).
         looped = "leads back to the proxy itself" in attempt.reason
         master = MasterFacts(uri, attempt, addresses, is_this_proxy=looped, round_trip=trip)
+        # rosmaster answers at / and /RPC2 alone (xmlrpc.server, rpc_paths): a URI with another path
+        # looks as if no master was there.
         root = parse_slave_uri(uri)
         if attempt.reach is Reach.STRANGER and root and urlsplit(uri).path not in ("", "/"):
             at_root = await self._ask_pid(root)
@@ -155,6 +158,7 @@ class _Collector:
 
     async def _simulated_time(self) -> bool:
         _, answer = await _attempt(self._master.call_master("getParam", "/use_sim_time"))
+        # A boolean is read as its text; the parameter may have been set as a text or a number, too.
         return answer in ("1", "true", 1)
 
     async def _try_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
@@ -214,8 +218,12 @@ class _Collector:
             return "", attempt
         if target is None:
             return "", Attempt(Reach.STRANGER, "no TCPROS address")
+        # That port is the proxy's own, which the try of the range has judged; NAT may have no way
+        # back to it from here.
         if facts.is_ours(node.slave):
             return str(target), Attempt()
+        # Any type will do (roscpp Publication::validateHeader; rospy tcpros_pubsub.py,
+        # topic_connection_handler): the way is tried here, and types are compared elsewhere.
         header = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
         return str(target), await _shake_hands(self._nodes.reach(target), header)
 
@@ -287,10 +295,12 @@ async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
     except (Unreachable, MasterError) as error:
         if isinstance(error, Unreachable) and error.refused:
             return Attempt(Reach.REFUSED), None
+        # The failure of the connection (`_failures_of`).
         if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
             return Attempt(Reach.SILENT), None
+        # Without the name of who was asked, which comes first; the finding has it already.
         reason = str(error).partition("\n")[0].partition(": ")[2][:200]
-        return Attempt(Reach.STRANGER, reason or "no sense"), None
+        return Attempt(Reach.STRANGER, reason or "its answer can't be read"), None
 
 
 async def _gather(

@@ -29,6 +29,7 @@ def bind(address: str, port: int) -> socket.socket:
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         if sock.family == socket.AF_INET6:
+            # `::` is for IPv4, too, whatever net.ipv6.bindv6only says (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         sock.bind((address, port))
     except OSError:
@@ -57,6 +58,7 @@ class DatagramRelay:
         self._sources, self._ended = frozenset(sources), ended
         self._in, self._out = sock, _socket(target.host)
         try:
+            # Linux passes ICMP errors to connected sockets only (net/ipv4/udp.c, __udp4_lib_err).
             self._out.connect((target.host, target.port))
         except OSError:
             self.close()

@@ -58,9 +58,9 @@ class Relay:
 
     ``kind`` and ``name`` say of what; ``caller_id`` and ``peer`` who connected at ``port``:
     somebody outside, or a node inside if ``inside_asks``. ``client_listens``: that one is expected
-    to say nothing more. ``sent`` are bytes towards
-    outside, ``received`` bytes towards the inside node; ``sent_rate`` and ``received_rate`` are in
-    bytes per second, as of the last `sample`. Without ``splice`` all bytes are copied.
+    to say nothing more. ``sent`` are bytes towards outside, ``received`` bytes towards the inside
+    node; ``sent_rate`` and ``received_rate`` are in bytes per second, as of the last `sample`.
+    Without ``splice`` all bytes are copied.
     """
 
     port: int
@@ -95,6 +95,7 @@ class Relay:
         request, reply = (0, 1) if self.inside_asks else (1, 0)
         if self._start_direction(reply, finished):
             if self.client_listens:
+                # The end of its connection counts as well: a socket that has ended is readable.
                 when_readable(client, lambda: self._start_direction(request, finished, second=True))
             else:
                 self._start_direction(request, finished, second=True)
@@ -139,6 +140,7 @@ class Relay:
         count = self._count_sent if index == 0 else self._count_received
         try:
             _Pump(*pair, count, self.splice).run()
+            # After `_pass_reset_on` the source only seems to have ended: no FIN before the reset.
             if not self.failed:
                 pair[1].shutdown(socket.SHUT_WR)
         except OSError as error:
@@ -155,6 +157,8 @@ class Relay:
     def _pass_reset_on(self, index: int) -> None:
         """Wake the other direction without a FIN on the wire, so that closing sends a reset."""
         self.failed = True
+        # SHUT_RD wakes a thread that reads, and sends nothing. One that can't write is woken by
+        # SHUT_WR alone, which sends a FIN: so that comes last.
         for how in (socket.SHUT_RD, socket.SHUT_WR):
             for sock in (self.outside, self.inside):
                 with contextlib.suppress(OSError):
@@ -184,6 +188,8 @@ def _prepare(sock: socket.socket) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     if hasattr(socket, "TCP_KEEPIDLE"):
+        # After 60 s, as roscpp (transport_tcp.cpp, initializeSocket) and rospy (tcpros_base.py,
+        # connect) do; Linux would begin after two hours (tcp(7), tcp_keepalive_time).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 15)
 

@@ -87,6 +87,7 @@ class _QuietSockets:
         self._selector.close()
 
     def _look(self) -> None:
+        # Those that are left out stay readable, so that the loop calls this again.
         for key, _ in self._selector.select(0)[:STARTS_PER_TURN]:
             self._selector.unregister(key.fileobj)
             key.data()

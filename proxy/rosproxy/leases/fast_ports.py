@@ -151,10 +151,10 @@ def why_no_fast_port(pool: PortPool, endpoint: LeaseHolder) -> str:
     """Why an endpoint that could have a fast port has none."""
     port = partner(pool.range, endpoint.port)
     if port is None:
-        return f"no port of the range goes with port {endpoint.port}"
+        return f"port {endpoint.port} has no second port in the range to be its fast port"
     if pool.is_free(port):
         return "nobody has asked for a topic of it lately"
-    return f"port {port}, which goes with its port {endpoint.port}, is in use"
+    return f"its fast port would be {port}, which is in use"
 
 
 def fast_port_count(holders: Iterable[LeaseHolder]) -> int:

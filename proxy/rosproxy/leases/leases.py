@@ -218,7 +218,7 @@ class Leases(Generic[_H]):
         self._lent.add(port)
         try:
             await self._kernel.cleared(port)
-            if port in self._lent:
+            if port in self._lent:  # a node may have needed it meanwhile
                 self._accept(port, handler)
             yield port
         finally:
@@ -270,6 +270,7 @@ class Leases(Generic[_H]):
         if acceptor is not None and port is not None:
             acceptor.close()
             self.server.end_calls(port)
+            # If another program is quicker, `_accept` tries again when the port is next needed.
             self._reserve(port)
 
     def _give_fast_port_back(self) -> int | None:
@@ -278,6 +279,10 @@ class Leases(Generic[_H]):
         if holder is None:
             return None
         port = holder.fast_port
-        log.info("%s: port %s is needed otherwise", holder.label, port)
+        log.info(
+            "%s: its fast port %s is taken back, since no other port of the range is free",
+            holder.label,
+            port,
+        )
         self.withdraw_fast_port(holder)
         return port

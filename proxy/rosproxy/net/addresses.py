@@ -108,6 +108,7 @@ def parse_authority(uri: str) -> HostPort | None:
         port = split_uri.port
     except ValueError:
         return None
+    # `hostname` would be in lower case and without what stands before an @, which is refused here.
     host = split_uri.netloc.rpartition(":")[0].removeprefix("[").removesuffix("]")
     return HostPort(host, port) if port and _HOST.fullmatch(host) else None
 

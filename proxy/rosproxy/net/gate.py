@@ -70,7 +70,7 @@ class Gate:
         """
         number, connections = next(self._numbers), self._waiting.setdefault(source, {})
         if len(connections) >= MOST_WAITING:
-            text = f"{MOST_WAITING} connections from one source that say nothing"
+            text = f"{MOST_WAITING} silent connections from one source"
             self._note_refusal("silent_connections", source, text)
             self._end_oldest(source)
         self._waiting.setdefault(source, {})[number] = end

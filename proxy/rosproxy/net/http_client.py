@@ -34,6 +34,11 @@ PIECE_TIMEOUT = 30.0
 LONG_TIMEOUT = 600.0
 """Seconds that a long body may take in all: 64 MiB at 0.9 Mbit/s."""
 CONNECT_TIMEOUT = 2.0
+"""Seconds for each address of a peer.
+
+rosmaster calls all subscribers from three threads (master_api.py, NUM_WORKERS): those that don't
+answer hold up the others.
+"""
 SEPARATE_BODY = 64 * 1024
 """Bytes from which on a body is not copied to stand behind its header."""
 
@@ -131,6 +136,7 @@ class HttpClient:
             head = self._head(path, host, len(body))
             async with asyncio.timeout(within), self._limit:
                 return await self._pass_reply(peer, *await self._ask(peer, head, body))
+        # A long body takes no place among the ``most``, or short calls would have to wait for it.
         head = self._head(path, host, body.size)
         async with asyncio.timeout(within):
             handler = await self._connect(peer)
@@ -157,7 +163,7 @@ class HttpClient:
             handler.close()
         self._idle.clear()
         await self.late.end()
-        await asyncio.sleep(0)
+        await asyncio.sleep(0)  # asyncio closes a transport's socket in the loop's next turn
 
     def leave(self, sock: socket.socket) -> None:
         """Close a connection that is not of this client once it has its answer."""
@@ -165,7 +171,10 @@ class HttpClient:
 
     def _head(self, path: str, host: str, size: int) -> bytes:
         if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
-            raise ValueError(f"{host}{path} can't be asked for")
+            raise ValueError(
+                f"{host}{path} can't be requested: "
+                "its host or path is empty or has spaces or control characters in it"
+            )
         start = f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
         return f"{start}{self._headers}Content-Length: {size}\r\n\r\n".encode()
 
@@ -324,6 +333,7 @@ async def read_bounded(
 
 
 def _expect(handler: ResponseHandler) -> None:
+    # read_until_eof: a reply that tells no length ends with its connection, as in HTTP/1.0.
     handler.set_response_params(read_until_eof=True, auto_decompress=False, read_bufsize=LONG)
 
 
@@ -344,7 +354,7 @@ async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int |
         while 100 <= message.code < 200:
             message, payload = await handler.read()
     except aiohttp.http.HttpProcessingError as error:
-        raise ValueError(f"no HTTP: {error.message}") from error
+        raise ValueError(f"the answer is not HTTP: {error.message}") from error
     if message.code != 200:
         raise BadResponse(f"HTTP status {message.code}")
     if not is_plain(message.headers):

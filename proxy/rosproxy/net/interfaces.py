@@ -24,6 +24,7 @@ def address_towards(address: str) -> str:
 
 def address_into(network: Network) -> str:
     """The address of this machine that connections into a network come from."""
+    # Towards its first host; a network of one address has no other.
     return address_towards(str(network[min(1, network.num_addresses - 1)]))
 
 
@@ -62,6 +63,7 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
     for line in _lines("/proc/net/if_inet6"):
         digits, _, prefix, _, _, interface = line.split()
         address = ip_address(bytes.fromhex(digits))
+        # Every interface is in fe80::/64, so that this network tells nothing.
         if interface != "lo" and not address.is_link_local:
             network = ip_network(f"{address}/{int(prefix, 16)}", strict=False)
             by_interface.setdefault(interface, []).append(network)
@@ -71,6 +73,7 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
 
 
 def _quad(digits: str) -> str:
+    # /proc/net/route shows an address as a number in the host's byte order: little-endian here.
     return socket.inet_ntoa(bytes.fromhex(digits)[::-1])
 
 

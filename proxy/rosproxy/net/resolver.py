@@ -43,6 +43,7 @@ async def resolve(host: str, source: str = "") -> list[str]:
     _, lookup = _running.get(host) or ("", _start(host, source))
     try:
         async with asyncio.timeout(RESOLVE_TIMEOUT):
+            # Shielded, since others may wait for the same look-up.
             return await asyncio.shield(asyncio.wrap_future(lookup))
     except TimeoutError:
         return []
@@ -52,7 +53,7 @@ def _start(host: str, source: str) -> Future[list[str]]:
     lookup: Future[list[str]] = Future()
     if not _may_start(source):
         label = source or "the proxy"
-        log.warning("%s has too many look-ups under way; %s counts as unresolvable", label, host)
+        log.warning("too many name look-ups for %s; %s is taken as unresolvable", label, host)
         lookup.set_result([])
         return lookup
     _running[host] = source, lookup

@@ -33,6 +33,7 @@ SILENCE_TIMEOUT = 30.0
 Handler = Callable[[socket.socket, str], Awaitable[None]]
 """Takes over an accepted socket; the second argument is the peer's address."""
 
+# struct linger (socket(7)): on, with a time of 0, for which close() sends a reset.
 _LINGER_RESET = struct.pack("ii", 1, 0)
 
 
@@ -43,6 +44,7 @@ def bind(address: str, port: int) -> socket.socket:
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if family == socket.AF_INET6:
+            # `::` is for IPv4, too, whatever net.ipv6.bindv6only says (ipv6(7)).
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         sock.bind((address, port))
     except OSError:
@@ -55,11 +57,12 @@ def bind(address: str, port: int) -> socket.socket:
 def reserve(address: str, port: int) -> socket.socket:
     """A bound socket that refuses connections, and whose port nobody else can bind. Raises OSError.
 
-    Merely bound it would not keep others out: SO_REUSEADDR, without which a port can't be bound
-    while connections of a former process linger, lets any number bind that don't listen. It counts
-    at that moment only, for either side; so it is taken off once the port is had. Linux looks again
-    who has a port when a socket listens; after ``shutdown`` that socket listens no more and is
-    still bound.
+    A socket that is only bound does not keep others out. It needs SO_REUSEADDR, or connections that
+    linger from a former process would be in its way; but with that option any number of sockets may
+    be bound to one port, as long as none listens. Linux asks both sockets for the option when the
+    second one is bound, so it is taken off once the port is had. Whether it is had shows when the
+    socket listens, since Linux then looks again who has the port. After ``shutdown`` the socket
+    listens no more and is still bound.
     """
     sock = bind(address, port)
     try:

@@ -32,7 +32,7 @@ class Tasks:
             try:
                 await step()
             except Exception:
-                log.exception("%s failed; going on", name)
+                log.exception("%s failed; trying again", name)
             await asyncio.sleep(interval)
 
     async def cancel(self) -> None:

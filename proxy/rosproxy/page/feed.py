@@ -129,11 +129,12 @@ class Feed:
     async def _keep_making(self) -> None:
         while True:
             try:
+                # Closed here, so that its questions to nodes end at once, and not with the garbage.
                 async with contextlib.aclosing(self._make()) as documents:
                     async for document in documents:
                         await self._publish(document)
             except Exception:
-                log.exception("the live page failed; going on")
+                log.exception("the live page failed; trying again")
             await asyncio.sleep(TICK)
 
     async def _publish(self, document: Json) -> None:
@@ -155,7 +156,9 @@ class PageWatch:
         self._status, self._own_findings, self._admin = status, own_findings, admin
         self._measures = Measures()
         self._judged: Judged | None = None
+        # Taken once: were the clock set meanwhile, the times of all links would change.
         self._epoch = time.time() - time.monotonic()
+        # A document is made in a thread, and counters may not change while that reads them.
         self._counting = asyncio.Lock()
 
     async def documents(self) -> AsyncGenerator[Json]:
@@ -200,5 +203,5 @@ async def _again_and_again(ask: Callable[[], Awaitable[float]]) -> None:
         try:
             pause = await ask()
         except Exception:
-            log.exception("the live page: asking nodes failed; going on")
+            log.exception("the live page: asking the nodes failed; trying again")
         await asyncio.sleep(pause)

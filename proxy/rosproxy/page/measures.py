@@ -81,7 +81,9 @@ class Link:
         sent, arrived = self.counters.get("given"), self.counters.get("taken")
         if sent is None or arrived is None:
             self.mark = None
+        # Anew also when the publisher counts from the beginning: that is another connection.
         elif self.mark is None or (arrived.grew or 0.0) > self.mark[1] or sent.value < self.mark[0]:
+            # The two nodes are asked one after the other: nothing is late before the later answer.
             self.mark = sent.value, max(sent.at, arrived.at)
 
     def is_stalled(self, now: float) -> bool:

@@ -34,6 +34,7 @@ FORM_TIMEOUT = 10.0
 """Seconds in which it must have arrived."""
 _HEADERS = {
     "Content-Security-Policy": (
+        # data: is for the empty icon in the pages' heads, which keeps browsers from asking for one.
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
         "img-src 'self' data:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
@@ -92,13 +93,14 @@ class Page:
                 body = await read_bounded(request.content, MOST_OF_FORM)
             fields = parse_qs(body.decode("utf-8", "surrogateescape"), max_num_fields=4)
         except (TimeoutError, TooLong, ValueError):
-            return web.Response(status=400, text="rosproxy: no such form\n", headers=_HEADERS)
+            return web.Response(status=400, text="rosproxy: unreadable form\n", headers=_HEADERS)
         if self.visitors.knows_token(fields.get("token", [""])[0]):
             return self._let_in(request)
         return self._turn_away(_WRONG)
 
     def _let_in(self, request: web.BaseRequest) -> web.Response:
         response = web.Response(status=303, headers={**_HEADERS, "Location": "./"})
+        # Not Secure, since all of this is HTTP without TLS (docs/guide/live-page.md).
         response.set_cookie(
             cookie_name(request),
             self.visitors.new_session(),
@@ -123,6 +125,7 @@ class Page:
         """The document and then, as long as the browser is there, what changes in it."""
         if not self.visitors.may_look(request):
             return _refusal()
+        # It has no body, and the stream has no end.
         if request.method == "HEAD":
             return web.Response(headers=_HEADERS)
         response = web.StreamResponse(headers={**_HEADERS, "Cache-Control": "no-store"})
@@ -146,6 +149,7 @@ class Page:
         former: Json | None = None
         while True:
             newest = await self.feed.after(former, HEARTBEAT)
+            # A line that begins with a colon is a comment (HTML standard, server-sent events).
             await response.write(b":\n\n" if newest is None else self._event(former, newest))
             former = newest or former
 
@@ -183,7 +187,7 @@ def _html(name: str, status: int = 200, remark: str = "") -> web.Response:
 
 
 def _refusal() -> web.Response:
-    text = "rosproxy: this needs 'Authorization: Bearer TOKEN', or the cookie that / gives for it\n"
+    text = "rosproxy: this needs 'Authorization: Bearer TOKEN', or the cookie of the page at /\n"
     return web.Response(status=403, text=text, headers=_HEADERS)
 
 

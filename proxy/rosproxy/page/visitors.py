@@ -48,7 +48,10 @@ class ExpiringTokens:
         return text
 
     def is_good(self, text: str) -> bool:
-        """Whether it was issued here and is not too old. Their hashes say nothing to be guessed."""
+        """Whether it was issued here and is not too old.
+
+        Hashes are compared, so that the time it takes tells nothing of the text.
+        """
         self._forget()
         return _hash(text) in self._until
 
@@ -124,6 +127,7 @@ class Visitors:
 def cookie_name(request: web.BaseRequest) -> str:
     """Cookies are for all ports of a host: the name tells which one is meant."""
     _, _, port = request.headers.get("Host", "").rpartition(":")
+    # The header is the caller's: only digits of it may get into a cookie's name.
     return f"rosproxy-{port}" if port.isascii() and port.isdecimal() else "rosproxy"
 
 

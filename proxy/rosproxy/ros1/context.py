@@ -128,6 +128,7 @@ class Context:
             networks = self.addressing.networks
             if self.selected is not None:
                 networks = [ip_network(address) for address in self.selected]
+            # nft takes no intervals that overlap in one set (`near4` of the kernel's table).
             ipv4 = collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
             ipv6 = collapse_addresses(n for n in networks if isinstance(n, IPv6Network))
             self._client_networks = [*ipv4, *ipv6]
@@ -159,6 +160,7 @@ class Context:
         self._client_kinds.clear()
         self._client_networks = None
         self._networks_read = self.now()
+        # With --direction both the network of the default route leads outside, so it is not inside.
         configured, both = self.settings.inside_networks, self.stand_ins.is_bidirectional
         self.addressing.networks = configured or interface_networks(without_uplink=both)
 

@@ -50,6 +50,8 @@ class _Trial:
                     break
                 request += chunk
             if self._recognize(request):
+                # A triple, which rosmaster takes apart (master_api.py, param_update_task), with the
+                # secret by which the proxy knows itself.
                 body = xmlrpc.dump_reply([1, self.proxy_secret, 0])
                 head = "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length:"
                 await loop.sock_sendall(conn, f"{head} {len(body)}\r\n\r\n".encode() + body)
@@ -144,6 +146,8 @@ async def _ask_master(context: Context, trial: _Trial, target: HostPort) -> str:
 @asynccontextmanager
 async def _subscribed(context: Context, trial: _Trial, target: HostPort) -> AsyncIterator[None]:
     """A parameter with the port under test as its subscriber, for as long as it takes."""
+    # A subscriber's name that nobody else has: rosmaster calls shutdown at the former URI of a name
+    # that registers with another (registrations.py, _register_node_api).
     name, uri = f"{CALLER_ID}_probe_{trial.master_secret}", slave_uri(target)
     multicall = context.upstream.multicall
     try:

@@ -71,6 +71,7 @@ class Ros1:
 
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
+        # Callers may make up methods without end; those of other names share one label.
         runtime.metrics.known_methods = KNOWN_METHODS
         self.context = context = Context(runtime)
         self._access = access = AccessChecks(
@@ -154,6 +155,7 @@ class Ros1:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
         settings, context = self.settings, self.context
         self.reserve_range()
+        # Before any port listens, as the kernel has to see connections from their beginning.
         await self.plane.start()
         master = self._make_master_api()
         context.tasks.spawn(self._callers.await_operator(), "waiting for an operator")
@@ -200,6 +202,7 @@ class Ros1:
         self.stand_ins.close()
         await self.context.tasks.cancel()
         self.prober.kept_connections.close_all()
+        # After the tasks, one of which would put the kernel's table right again.
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
         await asyncio.gather(self.tcpros.relays.stop(), *servers)
@@ -211,7 +214,7 @@ class Ros1:
         return self.context.retired
 
     async def settle(self) -> None:
-        """Wait until the master has answered: it tries the range, and is the first cause else."""
+        """Wait until the master has answered: `probe` has it call the ports under test."""
         await self.master_monitor.answered.wait()
 
     async def probe(self, or_fast: bool) -> tuple[PortProbe, ...]:
@@ -277,8 +280,9 @@ class Ros1:
         ports = self.settings.ports.listen
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         if files != resource.RLIM_INFINITY and files < len(ports) + SPARE_FILES:
-            text = f"{ports} are more ports than this process may have open files (ulimit -Hn)"
+            text = f"{ports} are more ports than this process may have open files: raise ulimit -Hn"
             raise SettingError(RANGE_OPTION, text)
+        # Half of what is left may go to kept connections, one for each node; clients get the rest.
         spare = max(files, 0) - len(ports) - SPARE_FILES
         self.prober.kept_connections.most = max(0, min(len(ports), spare // 2))
         self.context.gate.bound(spare - self.prober.kept_connections.most)

@@ -132,7 +132,7 @@ class Ros1State(Collector):
             labels=["node", "direction"],
         )
         for labels, size in self._plane.traffic.totals():
-            forwarded.add_metric(labels[1:], size)
+            forwarded.add_metric(labels[1:], size)  # the first one is "node" for all
         return relayed, forwarded
 
     def _settings(self, common: document.StatusSettings) -> document.StatusSettings:

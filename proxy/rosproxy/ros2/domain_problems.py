@@ -36,13 +36,13 @@ _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.LOOPBACK: (
         "it announces loopback addresses alone, which mean its own machine to everybody",
         "where it runs: ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, unset ROS_LOCALHOST_ONLY, and no "
-        "loopback in CYCLONEDDS_URI or an interface list; it was perhaps started before its "
-        "network: restart it",
+        "loopback in CYCLONEDDS_URI or an interface list; if it was started before its network "
+        "was up, restart it",
     ),
     LocatorFault.ELSEWHERE: (
         "the addresses that it announces are not the one that it sends from",
         "where it runs: let it use the network that it shares with the proxy (the interface list "
-        "of its profile, or CYCLONEDDS_URI); NAT between them can't be",
+        "of its profile, or CYCLONEDDS_URI), without NAT between the two",
     ),
     LocatorFault.MISSING: (
         "it announces no address of UDP",
@@ -51,7 +51,7 @@ _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
 }
 _DEFAULT_CURE = "give both the same {policy}"
 _CURES = {
-    "type": "mend one of the programs, or remap its name",
+    "type": "use the same type in both programs, or remap the name in one of them",
     "reliability": "make the publisher RELIABLE, or the subscription BEST_EFFORT",
     "durability": "make the publisher TRANSIENT_LOCAL (latched), or the subscription VOLATILE",
     "deadline": "a shorter deadline for the publisher, or a longer one for the subscription",
@@ -69,7 +69,7 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
     if domain.mismatches_left_out:
         text = f"{plural(domain.mismatches_left_out, 'more pair')} of endpoints don't match"
         yield DomainProblem(
-            "qos", f"domain {domain.domain}", text, "mend those that are named first"
+            "qos", f"domain {domain.domain}", text, "first correct the pairs that are named"
         )
 
 
@@ -107,7 +107,7 @@ def _problems(
     label = participant_label(participant, is_inside)
     if participant.domain is not None and participant.domain != domain.domain:
         text = (
-            f"{label}: it is of domain {participant.domain}, and was heard in "
+            f"{label}: it says that it is in domain {participant.domain}, but was heard in "
             f"domain {domain.domain}"
         )
         fix = (
@@ -119,6 +119,7 @@ def _problems(
     if fault:
         yield DomainProblem("transport", participant.guid_prefix, f"{label}: {fault[0]}", fault[1])
     if is_inside:
+        # Locators in the SEDP of one outside stay as they are, unless the direction is both.
         yield from _security(participant, label)
     if participant.problem:
         fix = "give a longer --port-range, and publish it"
@@ -127,7 +128,10 @@ def _problems(
         )
     if not participant.proven:
         text = f"{label}: nothing has come from it at the ports of the range"
-        fix = f"see that it reaches {domain.discovery.rpartition(':')[0]} there, by UDP"
+        fix = (
+            "publish the range for UDP, and let it through firewalls, so that it reaches "
+            f"{domain.discovery.rpartition(':')[0]}"
+        )
         yield DomainProblem("reached", participant.guid_prefix, text, fix, grave=False)
 
 
@@ -143,6 +147,7 @@ def _security(participant: ParticipantStatus, label: str) -> Iterator[DomainProb
     text += "addresses of its readers and writers: what outside sends does not reach them"
     fix = "a governance with discovery_protection_kind and rtps_protection_kind NONE; or "
     fix += "ROS_SECURITY_ENABLE=false"
+    # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
     yield DomainProblem(
         "security", participant.guid_prefix, text, fix, grave=participant.vendor == FAST_DDS
     )

@@ -27,6 +27,7 @@ class DomainWatch:
     async def look(self) -> None:
         """Report what was found this time and the last, and forget what has gone."""
         problems = {p for domain in self._state.status() for p in domain_problems(domain)}
+        # The grave ones first, since no more than MOST_NOTED are noted.
         lasting = sorted(problems & self._previous, key=lambda p: (not p.grave, p.subject))
         self._previous = problems
         current: dict[str, set[DomainProblem]] = {}
@@ -38,6 +39,7 @@ class DomainWatch:
 
     def _note(self, subject: str, former: set[DomainProblem], current: set[DomainProblem]) -> None:
         if former - current:
+            # This forgets all of the subject, so that what lasts is added again below.
             self._problems.solved(subject)
         for problem in sorted(current, key=lambda p: p.text):
             if former - current or problem not in former:

@@ -77,11 +77,13 @@ class Ros2:
         """Bind all ports and begin. Raises SettingError if one is taken that has to be had."""
         tasks = self._runtime.tasks
         self._hosts = await self._advertised_addresses()
+        # Before any port is opened: the table of a former process tells whose its ports were.
         await self.plane.start()
         self._leases.note_former(self.plane.forwards)
         self._start_servers()
         self._runtime.metrics.registry.register(self.state)
         self._runtime.metrics.registry.register(self._domain_plane)
+        # Unlike in ROS 1 there is no registry to rebuild: what was forwarded is among the leases.
         self.plane.recovered([])
         tasks.spawn(self._forget_former(), "waiting for participants of before the start")
         await self._refresh()
@@ -115,11 +117,13 @@ class Ros2:
                 self._runtime.now,
                 self._is_inside,
                 self.plane.syncer.note_change,
+                # An operator tells whom it selects by the admin endpoint, which takes its token.
                 NEWS_TIMEOUT if settings.admin_token_hash else 0.0,
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
             self._leases.domains.append(server.domain.inside)
+            # Any proxy for ROS 2: these ports follow from the domain, not from the range.
             other_proxies = signs.overlapping_proxies("2", 1, 65535, settings.admin)
             with setting_error_if_taken(
                 "--ros2-domain", f"a port of domain {number}", other_proxies
@@ -165,6 +169,7 @@ class Ros2:
         """
         news = read_body(body, ContainerNews)
         self._look_at_networks()  # the proxy may have just joined that of new containers
+        # Before anybody is selected: those who wait for that get their ports at once.
         for server in self.servers:
             server.note_former(news.former_ports)
         if news.selected is not None:
@@ -181,6 +186,7 @@ class Ros2:
         read_body(body, EmptyBody)
         ended = 0
         for server in self.servers:
+            # Before they are ended, or their next announcement would let them in again.
             server.select(())
             participants = server.domain.inside.by_prefix.values()
             ended += server.end({p.address for p in participants})
@@ -281,6 +287,7 @@ class Ros2:
             text = f"{host} can't be resolved; ROS 2 needs its address: give that instead"
             raise SettingError("--advertise-host", text)
         served = [a for a in resolved if bind == "::" or (":" in a) == (":" in bind)]
+        # Reversed: the last that is put in stays, which is then the first of its family.
         by_family = {":" in a: a for a in reversed(served or resolved)}
         return tuple(sorted(by_family.values(), key=resolved.index))
 
@@ -298,6 +305,7 @@ class Ros2:
         self.networks = self._settings.inside_networks or interface_networks()
         own_addresses = {address_into(network) for network in self.networks}
         for server in self.servers:
+            # The way into a network that the proxy is not in begins at an address outside of it.
             server.join(address for address in own_addresses if self._is_inside(address))
 
     async def _sample_rates(self) -> None:
@@ -310,6 +318,9 @@ class Ros2:
         subject, resolved = f"peer {peer.host}", await resolve(peer.host)
         self._runtime.problems.solved(subject)
         if not resolved:
-            text = "its name can't be resolved: participants there are not told of those inside"
+            text = (
+                "its name can't be resolved, so that participants inside are not announced there: "
+                "give its address"
+            )
             self._runtime.problems.add(subject, text)
         return [HostPort(address, peer.port) for address in resolved]

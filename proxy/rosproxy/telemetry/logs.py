@@ -160,6 +160,7 @@ def set_up(form: str, level: str) -> None:
     """Log to standard error in ``form`` (text or json) from ``level`` on."""
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines() if form == "json" else TextLines())
+    # At the handler: a logger's filter does not see what the loggers below it log.
     handler.addFilter(LogRateLimit())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     # Strangers that speak no HTTP are not errors of ours.

@@ -32,7 +32,7 @@ BOUNDS = (
     *("connections_per_source", "connections_per_lease", "silent_connections"),
     *("malformed", "participants", "rate", "stand_ins"),
 )
-"""Reasons of refusals (docs/reference/limits.md) that a system that behaves does not meet."""
+"""Reasons of refusals (docs/reference/limits.md) that a well-behaved system does not meet."""
 RELAY_ERRORS = ("bad header", "denied", "node unreachable", "not offered")
 STRANGERS = ("outside", "unselected")
 

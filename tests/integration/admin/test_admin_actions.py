@@ -71,7 +71,7 @@ async def test_a_proxy_that_has_the_hash_alone_lets_in_who_has_the_token(
     for said in ("wrong-token", hash_token(TOKEN), ""):
         reply = await post(proxy, "/retire", "{}", f"Authorization: Bearer {said}")
         assert reply.status == 403
-        assert b"this proxy has none" not in reply.body
+        assert b"this proxy has no token" not in reply.body
     assert (await post(proxy, "/retire", "{}", f"Authorization: Bearer {TOKEN}")).status == 200
 
 
@@ -80,7 +80,7 @@ async def test_without_a_token_nobody_from_afar_may(proxy: Proxy) -> None:
     for headers in ([], ["Authorization: Bearer None"], ["Authorization: Bearer "]):
         reply = await post(proxy, "/retire", "", *headers)
         assert reply.status == 403
-        assert b"this proxy has none" in reply.body
+        assert b"this proxy has no token" in reply.body
 
 
 @pytest.mark.usefixtures("from_afar")

@@ -264,7 +264,7 @@ async def test_a_page_goes_on_after_a_mistake_of_ours(
         await page.follow()
         assert "rosproxy" in page.document["nodes"]
     assert [one.getMessage() for one in caplog.records if one.exc_info] == [
-        "the live page failed; going on"
+        "the live page failed; trying again"
     ]
     caplog.clear()
 

@@ -216,7 +216,7 @@ async def test_a_subscriber_that_did_not_come(
 ) -> None:
     await node.publish(proxy.master)
     found = await only(proxy, "/chatter")
-    assert "/listener has not come" in found.text
+    assert "/listener has not connected" in found.text
 
 
 async def outside_publisher(master: FakeMaster, make_node: MakeNode) -> FakeNode:

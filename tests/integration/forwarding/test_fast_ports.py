@@ -67,7 +67,7 @@ async def test_a_subscriber_is_sent_to_the_fast_port(make_proxy, make_node, kern
     assert kernel.forwards == {lease + 4: (NODE, node.tcpros_port)}
     assert (await greet((host, lease + 4), topic_header()))["callerid"] == "/a"
     assert (await greet((host, lease), topic_header()))["callerid"] == "/a"
-    status = proxy.stack.status()
+    status = proxy.app.status()
     assert status["ports"]["free"] == 7
     assert status["data_plane"]["plane"] == "kernel"
     assert status["nodes"][0]["data_plane"]["port"] == lease + 4
@@ -130,7 +130,7 @@ async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
     told = await tell(proxy, "/probe")
     assert [(p["port"], p["from_proxy"]) for p in told["probes"]] == [(lost, "ok")]
     assert set(kernel.forwards) == {kept}
-    assert proxy.stack.status()["ports"]["free"] == 2
+    assert proxy.app.status()["ports"]["free"] == 2
     for node in nodes:
         assert (await ask(proxy, node))[1] == proxy.lease(node)[1] + 2
     assert set(kernel.forwards) == {lost, kept}
@@ -142,14 +142,14 @@ async def test_a_range_without_partners_has_no_fast_ports(make_proxy, make_node,
     await node.publish(proxy.master)
     for _ in range(2):
         assert await ask(proxy, node) == proxy.lease(node)
-    assert caplog.text.count("the proxy forwards its topics: no port of the range goes with") == 1
+    assert caplog.text.count("has no second port in the range to be its fast port") == 1
 
 
 async def test_without_the_kernel_nobody_is_sent_to_a_fast_port(make_proxy, make_node, no_kernel):
     proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
     await node.publish(proxy.master)
     assert await ask(proxy, node) == proxy.lease(node)
-    assert proxy.stack.status()["data_plane"]["reason"] == "not in this test"
+    assert proxy.app.status()["data_plane"]["reason"] == "not in this test"
 
 
 async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
@@ -163,7 +163,7 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     await until(lambda: len(proxy.ros1.context.registry), "the node is found")
     await until(lambda: proxy.serves(node), "the node is served")
     assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
-    assert proxy.stack.status()["ports"]["free"] == 3
+    assert proxy.app.status()["ports"]["free"] == 3
     others = [await make_node(f"/n{number}", OTHER_NODE) for number in range(3)]
     for other in others:
         assert (await other.publish(proxy.master))[0] == 1

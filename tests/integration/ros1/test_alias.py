@@ -428,7 +428,7 @@ async def test_ports_in_use_are_kept(
             await read_header(wire)
         assert await look_up(proxy, crowd[2]) == crowd[2].uri
         assert set(stand_ins(proxy)) == {node.tcpros_port for node in crowd[:2]}
-        assert "one too many" in problems(proxy)[crowd[2].uri]
+        assert "all 2 stand-in ports are in use" in problems(proxy)[crowd[2].uri]
     await until(lambda: set(stand_ins(proxy).values()) == {0}, "the relays end")
     await look_up(proxy, crowd[2])
     assert crowd[2].uri not in problems(proxy)

@@ -300,7 +300,7 @@ async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
     assert (await publish(node, proxy))[0] == 1
     assert address_of(proxy, "/hidden") == OTHER_NODE
     code, text, _ = await call(proxy.master, "registerPublisher", "/evil2", *forged, source=HIDDEN)
-    assert (code, "says that it is /hidden" in text) == (-1, True)
+    assert (code, "gives its name as /hidden" in text) == (-1, True)
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")

@@ -83,5 +83,5 @@ def test_what_the_kernel_forwards_is_told() -> None:
 
 def test_who_is_told_nobody_is_told_so() -> None:
     text = shown(DomainStatus(domain=0))
-    assert "neither peers nor an ear: outside is told of nobody" in text
+    assert "neither peers nor an ear: inside is announced to nobody" in text
     assert "No participant has been heard yet." in text

@@ -163,13 +163,13 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
         (
             {"uri": "http://3f2a9c1b7d10:4000/", "attempt": UNRESOLVABLE},
             Severity.ERROR,
-            "looks like a container that uses the real master, past the proxy",
+            "looks like a container that uses the real master instead of the proxy",
             "ROS_MASTER_URI=http://PROXY:11311",
         ),
         (
             {"uri": "http://10.0.0.7:4000/", "addresses": ("10.0.0.7",)},
             Severity.WARNING,
-            "registered past it",
+            "registered around it",
             "ROS_MASTER_URI=http://PROXY:11311",
         ),
         (

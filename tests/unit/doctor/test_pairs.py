@@ -198,7 +198,7 @@ def test_any_type_fits_all() -> None:
 
 def test_a_subscriber_outside_that_does_not_come() -> None:
     found = apart(silent_talker(), listener())
-    assert "/listener has not come to robot-host:45000" in found.text
+    assert "/listener has not connected to robot-host:45000" in found.text
     assert found.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
 
 
@@ -212,14 +212,16 @@ def subscriber_inside(**settings: str | bool) -> DoctorFinding:
 
 def test_a_subscriber_inside_that_has_no_route_outwards() -> None:
     found = subscriber_inside()
-    assert "/listener, behind the proxy, has not come to 192.168.0.9:5000 by itself" in found.text
+    assert (
+        "/listener, behind the proxy, has not connected to 192.168.0.9:5000 by itself" in found.text
+    )
     assert found.fix.startswith("where /listener runs: nc -vz 192.168.0.9 5000; if there is no")
     assert "--direction both" in found.fix
 
 
 def test_a_subscriber_inside_that_has_the_proxy_as_its_way() -> None:
     found = subscriber_inside(direction="both")
-    assert f"has not come to the proxy's port for {OUTSIDE_URI}" in found.text
+    assert f"has not connected to the proxy's port for {OUTSIDE_URI}" in found.text
     assert "--direction" not in found.fix
     assert "if it wants UDP alone: --udp" in found.fix
     assert "--udp" not in subscriber_inside(direction="both", udp=True).fix

@@ -157,7 +157,8 @@ def test_a_proxy_that_has_just_started_may_know_them_and_not_tell() -> None:
 
 
 def test_what_was_refused_lately_is_told() -> None:
-    recent = ProblemStatus(10.0, "refused: no locator", "from 10.0.0.8: it names no locator (tcp)")
+    text = "from 10.0.0.8: it announces no locator for discovery at 10.0.0.8 (tcp)"
+    recent = ProblemStatus(10.0, "refused: no locator", text)
     old = ProblemStatus(1000.0, "refused: not a peer", "from 10.0.0.7")
     told = found(BOTH, problems=(recent, old))
     assert told["refused", "refused: no locator"][0] is Severity.WARNING

@@ -60,14 +60,14 @@ def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
     assert not fast_ports.claim(registry.pool, first)
     assert not fast_ports.claim(registry.pool, second)
     assert fast_ports.why_no_fast_port(registry.pool, first) == (
-        "port 1001, which goes with its port 1000, is in use"
+        "its fast port would be 1001, which is in use"
     )
 
 
 def test_the_odd_last_port_has_none() -> None:
     registry, endpoint = one_admitted(1)
     assert not fast_ports.claim(registry.pool, endpoint)
-    assert "goes with port 1000" in fast_ports.why_no_fast_port(registry.pool, endpoint)
+    assert "port 1000 has no second port" in fast_ports.why_no_fast_port(registry.pool, endpoint)
 
 
 def test_a_fast_port_is_given_back_once() -> None:

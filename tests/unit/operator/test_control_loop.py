@@ -197,7 +197,7 @@ async def test_a_failure_is_told_once_and_so_is_its_end(caplog: pytest.LogCaptur
         assert told == [
             ("WARNING", "no engine"),
             ("ERROR", "not allowed"),
-            ("INFO", "looking works again"),
+            ("INFO", "looks succeed again"),
         ]
 
 

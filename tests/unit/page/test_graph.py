@@ -75,7 +75,7 @@ def test_a_pair_that_is_apart_has_the_finding_and_the_command() -> None:
     silent = talker(report=SlaveReport(STRING))
     link = made(judged(nodes=by_name(silent, listener())))["links"][LINK]
     assert link["state"] == "broken"
-    assert "/listener has not come to robot-host:45000" in link["text"]
+    assert "/listener has not connected to robot-host:45000" in link["text"]
     assert "nc -vz robot-host 45000" in link["fix"]
 
 

@@ -128,9 +128,9 @@ def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
     assert {port: book.obstacle(port, own) for port in (45000, 45009, 11311, 11411, 11312)} == {
         45000: "lies in --port-range 45000-45009",
         45009: "lies in --port-range 45000-45009",
-        11311: "is that of --master-port",
-        11411: "is that of --publish-master",
-        11312: "is that of --admin-bind",
+        11311: "is taken by --master-port",
+        11411: "is taken by --publish-master",
+        11312: "is taken by --admin-bind",
     }
     assert book.obstacle(45010, own) is None
     assert book.obstacle(40001, settings()) is None

@@ -175,5 +175,6 @@ def test_what_is_logged_once_and_for_debugging_is_written(clock: Clock) -> None:
     floods = LogRateLimit(clock)
     debug = [record("look", level=logging.DEBUG) for _ in range(2 * KIND_BURST)]
     assert written(floods, debug) == debug
-    started = [record("%s at %s is %s", f"/{n}", "a", "b", level=logging.INFO) for n in range(1000)]
+    text = "%s at %s is advertised as %s"
+    started = [record(text, f"/{n}", "a", "b", level=logging.INFO) for n in range(1000)]
     assert written(floods, started) == started

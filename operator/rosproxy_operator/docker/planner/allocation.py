@@ -50,6 +50,8 @@ def _after_refusal(
     served, moved = memory.served.get(sandbox.key), dict(memory.moved)
     port = refusal.port
     suspects = {port} if port and port in sandbox.range else set(sandbox.range.ports())
+    # Of a range that was made longer only the added ports can be another's: on the others its proxy
+    # has served, and the engine may only be slow to let go of them.
     unserved = {port for port in suspects if served is None or port not in served}
     if served is not None and not unserved:
         if now - refusal.since < RETRY_FOR:

@@ -135,6 +135,8 @@ def _before_uplink(observed: HostState, uplink: str) -> set[str]:
     The engine gives both to the network whose name sorts first, internal ones aside, and moving
     them cuts all connections.
     """
+    # The order is that of moby's Endpoint.Less (libnetwork/sandbox.go): not internal, then with
+    # gateways for both IPv4 and IPv6, then by name, which Go compares by bytes.
     return {
         network.name
         for network in observed.networks
@@ -159,7 +161,7 @@ def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
             if member.udp and wanted.direction == "out":
                 yield Problem(
                     f"container {member.container.name}",
-                    f"label {UDP}=true is ignored: datagrams get in with both directions alone; "
+                    f"label {UDP}=true is ignored: datagrams from outside need both directions; "
                     f"add the label {DIRECTION}=both, or take this one off",
                     fatal=False,
                 )

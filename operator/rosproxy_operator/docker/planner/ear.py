@@ -93,6 +93,7 @@ def _ear_steps(context: PlanContext) -> Iterator[Action]:
     ear = _wanted(context)
     if context.settings.ros2_lan == NOWHERE:
         yield from _without(context, "the LAN is not to be heard")
+    # Where an address is not known now, the ear that is there stays as it is.
     elif ear is not None:
         yield from _ensure_ear(context, ear)
 

@@ -94,6 +94,7 @@ class RecentLayers:
             if now < since + OUTLIVES and pair[1] not in taken
         }
         self._last_seen = recent | current
+        # What is remembered is the first to give way: the proxy refuses a policy that is too large.
         joined = _joined(self._last_seen)
         fits = sum(len(layer.rules) for layer in joined) <= MOST_RULES and len(joined) < MOST_LAYERS
         return joined if fits else _joined(current)

@@ -100,6 +100,7 @@ class Key:
     has two proxies, since the containers of a master are not those of a domain.
     """
 
+    # Ordering never compares a domain with None: keys of ROS 1 have a master_uri, of ROS 2 none.
     master_uri: str
     advertise_host: str
     domain: int | None = None

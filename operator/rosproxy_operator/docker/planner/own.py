@@ -101,7 +101,7 @@ def forgery_reason(own: OwnLabels, name: str, making: Making, image_id: str) -> 
         ROLE_EAR: _odd_ear(making.host),
         ROLE_REDIRECT: _odd_redirect(making.host),
     }
-    return next((f"its HostConfig.{name} is none that it gives" for name in odd[own.role]), "")
+    return next((f"its HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
 
 
 def _name(own: OwnLabels) -> str:
@@ -131,6 +131,7 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
     if mode in ("host", "none") or mode.startswith("container:"):
         yield "NetworkMode"
     bindings = host.get("PortBindings") or {}
+    # No label says whether its ports are published for UDP as well, so both will do.
     expected = [
         {name: {str(port)} for name, port in published_ports(own.key, own.range, udp)}
         for udp in (False, True)

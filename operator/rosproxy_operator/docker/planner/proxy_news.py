@@ -55,6 +55,7 @@ class ContainerArrival:
     network: str
     address: str
     endpoint: str
+    # Not compared: aliases are known from a later inspection on, and make no other arrival of it.
     names: frozenset[str] = field(compare=False)
     redirect: str = ""
 
@@ -114,6 +115,8 @@ class AddressHistory:
     def _follow(self, latest: NetworkFacts, now: float) -> None:
         """Let nodes of a network that their container has left be found on one that it is on."""
         for container, network in list(self._absent):
+            # The first is a network that it was not on before (False sorts first): its nodes have
+            # moved there. Else it is one that it was on all the time.
             elsewhere = [
                 ((container, other_network) in self._at, address)
                 for (owner, other_network), address in latest.addresses.items()
@@ -265,7 +268,9 @@ def _arrivals(
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
-    if member.redirected_master:  # by name, no node reaches the master before its proxy is there
+    # Until the redirect is there, nodes reach the real master by its address, and register around
+    # the proxy with the host that these variables name.
+    if member.redirected_master:
         own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
         own = {name for name in own if not is_loopback(name)}
     return [

@@ -47,6 +47,8 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.settings import PlanSettings
 
+# The priorities are those of destination and source NAT (nf_ip_hook_priorities in the kernel). In
+# the hook output, nat chains see what this network namespace itself opens, which is enough here.
 _SET = Template("""\
 table ip $table {
   chain output {
@@ -99,9 +101,11 @@ def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str,
 def _rules(action: CreateRedirect) -> str:
     """One transaction of nft(8): whatever a redirect has had there goes, and comes as it is now."""
     table = f"rosproxy-redirect-{proxy_name(action.key).rpartition('-')[2]}"
+    # To delete a table that is not there is an error, and would undo the transaction: so add first.
     text = f"add table ip {table}\ndelete table ip {table}\n"
     if action.master is None:
         return text
+    # A CreateRedirect has both or neither: the second operand only satisfies the type checker.
     proxy = action.proxy or action.master
     return text + _SET.substitute(
         table=table, address=action.master.host, port=action.master.port, proxy=proxy.host
@@ -165,6 +169,7 @@ def _wanted(
                 continue
             if owners.setdefault((owner.id, member.redirected_master), proxy.key) == proxy.key:
                 site = proxy.key, owner.id
+                # Containers that share a network share the redirect.
                 wanted[site] = wanted.get(site) or _redirect_to(member, owner, observed, settings)
     return wanted
 
@@ -202,6 +207,7 @@ def _with_fingerprint(
     action: CreateRedirect, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect:
     """The same with what it is made of, and its name by that."""
+    # The proxy's range is a label alone, and no part of the rules: a longer range changes nothing.
     body = redirect_config(replace(action, range=PortRange(1, 1)), settings)
     fingerprint = digest({**body, "Image": observed.image_id})
     return replace(action, fingerprint=fingerprint, name=redirect_name(action.key, fingerprint))

@@ -104,6 +104,7 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
             for participant in container["participants"]:
                 yield from wrap(_participant(participant), columns, INDENT, most=MOST_LINES)
         yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
+        # A container of both versions of ROS has two rows; what is wrong with it is told once.
         subject = f"container {container['name']}"
         if subject not in reported:
             yield from _wrong(

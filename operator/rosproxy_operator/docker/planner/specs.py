@@ -228,6 +228,7 @@ def own_labels(action: CreateSandbox | Create | CreateEar | CreateRedirect) -> d
 def sandbox_fingerprint(action: CreateSandbox, settings: PlanSettings) -> str:
     """What a sandbox is made of, in 16 hex digits. Its name and the image are not in it."""
     body = sandbox_config(replace(action, fingerprint=""), settings)
+    # It only sleeps, so a new image is no reason to take its ports down.
     return digest({**body, "Image": ""})
 
 
@@ -261,11 +262,14 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
         "Image": settings.proxy_image,
         "User": USER,
         "Entrypoint": [*SANDBOX_COMMAND[:1]],
+        # The image's health check asks a proxy's admin endpoint (Dockerfile), which is not here.
         "Cmd": [*SANDBOX_COMMAND[1:]],
         "Healthcheck": {"Test": ["NONE"]},
         "Labels": own_labels(action),
         "ExposedPorts": {port: {} for port in bindings},
         "HostConfig": {
+            # As process 1, sleep would ignore SIGTERM (pid_namespaces(7)), and be killed only after
+            # the engine's time-out.
             **COMMON,
             "Init": True,
             "NetworkMode": settings.uplink,
@@ -342,6 +346,7 @@ def ear_config(action: CreateEar, settings: PlanSettings) -> dict[str, Any]:
     return {
         "Image": settings.proxy_image,
         "User": USER,
+        # The image's entry point is rosproxy already.
         "Cmd": [*EAR_COMMAND[1:]],
         "Healthcheck": {"Test": ["NONE"]},
         "Env": [f"{name}={value}" for name, value in variables.items()],

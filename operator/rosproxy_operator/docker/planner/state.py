@@ -7,6 +7,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import MOVED_FOR, TAKEN_FOR, Move, within
 from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Key, Member
 
+# One that is only created has published no port yet: its range may still turn out to be taken.
 _HAS_SERVED = SERVING | {"exited", "dead", "removing"}
 
 

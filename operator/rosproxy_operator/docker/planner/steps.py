@@ -193,6 +193,8 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
             *_connect(context, action.name),
         ]
         return actions, _Home(action.name, starts=True)
+    # One that is restarting has no network namespace until it is up again: nothing can be joined,
+    # and no proxy started in it (moby: daemon/container_operations.go, getNetworkedContainer).
     if kept is None or kept.state == "restarting":
         return actions, None
     name = kept.name if selection.waiting or action.name in taken else action.name
@@ -339,6 +341,7 @@ def _lost(kept: Container, home: _Home) -> bool:
     """Whether a proxy runs in the namespace that its sandbox had before it was started anew."""
     if home.starts:
         return True
+    # One that is restarting enters the sandbox's present namespace by itself.
     if not kept.started_at or not home.started_at or kept.state == "restarting":
         return False
     return _instant(kept.started_at) < _instant(home.started_at)
@@ -346,6 +349,7 @@ def _lost(kept: Container, home: _Home) -> bool:
 
 def _instant(text: str) -> tuple[str, str]:
     """A time in the engine's words, so that it can be compared: their fractions vary in length."""
+    # Go's RFC3339Nano, in which the engine writes times, leaves out zeros at the end.
     seconds, _, fraction = text.removesuffix("Z").partition(".")
     return seconds, fraction.ljust(9, "0")
 

@@ -229,6 +229,8 @@ class Api:
 
     def list_fresh(self, kind: str, namespace: str, selector: str) -> list[JsonObject]:
         """The objects that a field selector fits, as they are now in the API server's store."""
+        # Without a resourceVersion a list is "most recent", as the docs of Kubernetes have it (API
+        # Concepts). The operator has no right to `get` nodes and RosProxies.
         return self._items(self._ask("GET", _path(kind, namespace), {"fieldSelector": selector}))
 
     def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> JsonObject:
@@ -246,7 +248,7 @@ class Api:
         self._ask("DELETE", _path(kind, id.namespace, id.name), body=options)
 
     def evict(self, id: Name, uid: str) -> None:
-        """Delete a pod if it still has this uid. ApiAway: no PodDisruptionBudget allows it now."""
+        """Delete a pod if it has this uid. ApiUnavailable: a PodDisruptionBudget forbids it."""
         body = {
             "apiVersion": "policy/v1",
             "kind": "Eviction",
@@ -323,7 +325,7 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> Any:
-        """The answer, of which the body is yet to be read. Raises ApiAway."""
+        """The answer, of which the body is yet to be read. Raises ApiUnavailable."""
         is_patch = isinstance(body, list)
         headers = {
             "Accept": "application/json",
@@ -338,6 +340,7 @@ class Api:
                 body=body,
                 auth_settings=["BearerToken"],
             )
+            # Leases are written by operators that do not lead yet.
             if method == "GET" or path.startswith(_ROOTS[LEASES]):
                 return self._client.call_api(*request, _request_timeout=within)
             with self.gate.passing() as may_send:

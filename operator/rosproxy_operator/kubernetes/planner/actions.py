@@ -1,4 +1,4 @@
-"""What the operator can do to a cluster: data, carried out by `rosproxy_operator.kubernetes`."""
+"""What the operator can do to a cluster: data, carried out by `apply`."""
 
 import msgspec
 

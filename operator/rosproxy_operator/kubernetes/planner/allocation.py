@@ -92,6 +92,7 @@ class _Allocation:
 
     def run(self) -> None:
         """Proxies that have ports come before those that had some, and these before the rest."""
+        # In three rounds: nothing is given out anew before all is known that proxies keep.
         order = sorted(self.rosproxies, key=self._rank)
         for place in order:
             self._keep(place)
@@ -166,7 +167,7 @@ class _Allocation:
                 text = (
                     f"the master in the cluster is not published on port {port} of node "
                     f"{self.node}, which is held by {holder}: choose another spec.master.publish, "
-                    "or let that go"
+                    "or remove what holds it"
                 )
                 self.ranges.findings.append(finding(self.rosproxies[place], "PortConflict", text))
                 return
@@ -185,8 +186,8 @@ class _Allocation:
                 text = (
                     f"spec.ports is {spec.ports}, but the proxy on node {self.node} keeps its "
                     f"{len(kept)} at {kept}, since {missing} are not free or not in "
-                    "spec.portWindow: let the pods go that hold them, or move spec.portWindow away "
-                    "from there, so that all ports are given anew"
+                    "spec.portWindow: delete the pods that hold them, or move spec.portWindow away "
+                    "from there, so that the proxy gets another range"
                 )
                 self.ranges.findings.append(finding(self.rosproxies[place], "PortsExhausted", text))
             return
@@ -218,10 +219,10 @@ class _Allocation:
             str(pod.id) for pod in pods if any(p in error.window for p in pod.ports_of(spec))
         ]
         reasons += [f"others are held by {abbreviated(holders)}"] if holders else []
-        reason = ", ".join(reasons) or "the others were refused just now"
+        reason = ", ".join(reasons) or "the others were refused a short time ago"
         return (
             f"{error}; {reason}: enlarge spec.portWindow ({error.window}), lower spec.ports "
-            f"({error.count}), or let one of those pods go"
+            f"({error.count}), or delete one of those pods"
         )
 
     def _other_pods(self, place: ProxyPlace) -> list[Pod]:
@@ -231,6 +232,7 @@ class _Allocation:
 
     def _strangers(self, place: ProxyPlace) -> list[Pod]:
         """Pods that are no proxies, among them the ears of other RosProxies."""
+        # That of the same RosProxy holds the last port of the range: see `ProxySite.own_ports`.
         ears = (ear for ear in self.view.observed.ears if ear.node == self.node)
         return [*self.strangers, *(ear.pod for ear in ears if ear.of != place.of)]
 
@@ -244,6 +246,7 @@ class _Allocation:
                 yield PortRange(port, port)
 
     def _reserved(self, place: ProxyPlace) -> set[int]:
+        # The proxy listens on these itself, and a hostPort is the container's port of that number.
         spec = self.rosproxies[place].spec
         ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else frozenset[int]()
         return {MASTER_PORT, ADMIN_PORT, spec.master.publish, *ros2_ports}

@@ -62,6 +62,7 @@ def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) 
         unseen = {ip for ip in missing - last_seen[node.name].keys() if _is_pod_ip(ip, proxy, node)}
         since = {ip: state.strange.get((node.name, ip), now) for ip in unseen}
         strange |= {(node.name, ip): at for ip, at in since.items()}
+        # A pod that is listed without an address yet may be the one at the unseen address.
         has_pending = any(not pod.ip and not pod.host_network for pod in living)
         late = {
             ip for ip, at in since.items() if now - at >= UNKNOWN_ADDRESS_GRACE and not has_pending
@@ -98,6 +99,7 @@ def _kept(
 
 def next_checks(departed: Departures, now: float) -> Iterator[float]:
     """In how many seconds there may be something to tell the proxies."""
+    # The addresses that pods have at this moment were all seen at `now`.
     recent = (at for ips in departed.state.addresses.values() for at in ips.values() if at != now)
     if departed.addresses or any(now - at < REMEMBERED for at in recent):
         yield LOOK_AGAIN_AFTER

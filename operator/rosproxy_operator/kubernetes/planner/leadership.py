@@ -100,4 +100,6 @@ def released_record(record: LeaseRecord | None, name: str) -> LeaseRecord | None
     """What a candidate that acts no more is to write; None if the Lease is not its own."""
     if record is None or record.holder != name:
         return None
+    # Anybody may take it at once. 0 would be refused: ValidateLeaseSpec in k8s.io/kubernetes,
+    # pkg/apis/coordination/validation/validation.go.
     return replace(record, holder="", duration=1.0)

@@ -66,7 +66,10 @@ _TAINTS = (
     ("pid-pressure", "NoSchedule"),
     ("unschedulable", "NoSchedule"),
 )
-"""What pods of DaemonSets tolerate."""
+"""What pods of DaemonSets tolerate.
+
+``AddOrUpdateDaemonPodTolerations`` in k8s.io/kubernetes, pkg/controller/daemon/util.
+"""
 _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000, 30000))
 """Where a proxy's outgoing connections may start: never on a port that it is to listen on."""
 
@@ -148,6 +151,7 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     spec = {**_spec(site), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     identity = _digest(f"{site.master.uri}{_domain(rosproxy)} {site.advertise_host}")[:8]
+    # `meta` holds this map: the fingerprint is worked out without itself, and is on the pod then.
     annotations[FINGERPRINT] = f"{_fingerprint(body)}-{identity}"
     return {**body, "spec": {**spec, "containers": [container]}}
 
@@ -183,6 +187,7 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
     annotations[FINGERPRINT] = _fingerprint(body)
+    # No part of the fingerprint: a Service that has got another address is not made anew for that.
     if cluster_ip:
         spec["clusterIP"] = cluster_ip
     return body
@@ -264,6 +269,7 @@ def _spec(site: ProxySite) -> dict[str, Any]:
     """
     spec = site.rosproxy.spec
     aliases = [dict(alias) for alias in spec.host_aliases]
+    # No kubelet has to allow it: k8s.io/kubernetes, pkg/kubelet/sysctl/safe_sysctls.go.
     sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}]
     return {
         **bound_to(site.node.name, spec),
@@ -330,6 +336,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
         "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGERS)]}}},
+        # So the container's status has the last log lines, which `pod_failures` quotes.
         "terminationMessagePolicy": "FallbackToLogsOnError",
         "securityContext": {
             "allowPrivilegeEscalation": forwards,

@@ -132,7 +132,7 @@ def plan(
         problems=unique,
         state=replace(departed.state, attempts=retries.noted, reported=warnings.reported),
         departed_addresses=departed.addresses,
-        callers=callers(full_snapshot),
+        callers=callers(full_snapshot),  # also for RosProxies that ask for too much: they go on
         policies=policies(full_snapshot, settings),
         peers=peers(context),
         former_ports=former_ports(cluster_view, decided.former),

@@ -37,7 +37,7 @@ class Task(msgspec.Struct, frozen=True):
 class RetryRecord(msgspec.Struct, frozen=True):
     """How often a task was asked for, and when the last time.
 
-    ``note_effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the
+    ``effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the
     API server said of it.
     """
 
@@ -49,6 +49,7 @@ class RetryRecord(msgspec.Struct, frozen=True):
     @property
     def pause(self) -> float:
         """Seconds after which it may be tried again."""
+        # The exponents are bounded, since 2.0 ** 1024 raises OverflowError.
         if self.effect and not self.error:
             excess = self.count - PROMPT_RECREATIONS
             return min(FIRST * 2.0 ** min(excess, 10), LONGEST) if excess >= 0 else 0.0

@@ -31,13 +31,13 @@ class View(msgspec.Struct, frozen=True):
 
     ``rosproxies`` are those that are not being deleted; ``proxies`` those that belong to one of
     them, ``orphans`` those of RosProxies that are gone. ``current`` is the proxy of a place, under
-    the name that it is to have, unless it is being deleted. ``on`` are, by the node that they are
-    meant for, all proxies that hold ports, of any RosProxy. ``wanted`` are the places where pods
-    want a proxy, and those pods; ``places`` those where a proxy is wanted or exists, in order;
-    ``selected_pods`` all pods that a RosProxy has taken, wherever they are. ``other_pods_by_node``
-    are, by node, the pods that hold ports and are neither proxies nor ears, ``other_pod_names`` the
-    names of all such pods, with ports or not, ``names`` those of all proxies. ``findings`` are
-    those about pods.
+    the name that it is to have, unless it is being deleted. ``proxies_by_node`` are, by the node
+    that they are meant for, all proxies that hold ports, of any RosProxy. ``wanted`` are the
+    places where pods want a proxy, and those pods; ``places`` those where a proxy is wanted or
+    exists, in order; ``selected_pods`` all pods that a RosProxy has taken, wherever they are.
+    ``other_pods_by_node`` are, by node, the pods that hold ports and are neither proxies nor ears,
+    ``other_pod_names`` the names of all such pods, with ports or not, ``names`` those of all
+    proxies. ``findings`` are those about pods.
     """
 
     observed: ClusterSnapshot

@@ -139,7 +139,7 @@ class ProxyPoller:
                     long_poll = long_poll or asyncio.create_task(self._ask(_random_wait()))
                     await self._wait_for_either(long_poll)
                     if long_poll.done():
-                        long_poll = long_poll.result()
+                        long_poll = long_poll.result()  # None, or raises what it died of
                     continue
                 # Acting on that may take the proxy a moment: the next poll rechecks, not this one.
                 self._recheck = self._recheck and not told_gone

@@ -43,7 +43,7 @@ class TokenKey:
         self.problems: Sequence[Problem] = ()
 
     def read(self) -> bytes:
-        """The key as it is now. Raises ApiAway."""
+        """The key as it is now. Raises ApiUnavailable."""
         self.problems = ()
         if self._secret is None:
             return self._kept_key()
@@ -67,7 +67,7 @@ class TokenKey:
         try:
             self._api.fill_secret(secret, manifest, entries)
         except (ApiInvalid, ApiConflict) as error:
-            raise ApiUnavailable(f"somebody else writes {secret}: {error}") from None
+            raise ApiUnavailable(f"somebody else writes Secret {secret}: {error}") from None
         log.info("made a key for the proxies' tokens in Secret %s", secret)
 
     def _kept_key(self) -> bytes:

@@ -24,7 +24,7 @@ def host_problem(host: str) -> str:
     except SettingError:
         return f"{quoted(host)} is neither a host name nor an address"
     if is_loopback(host.strip("[]")):
-        return f"{quoted(host)} means another machine to everybody else"
+        return f"{quoted(host)} is loopback, which is another machine to everybody else"
     return ""
 
 

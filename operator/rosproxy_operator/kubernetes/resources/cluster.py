@@ -29,7 +29,7 @@ class PodFailure(Enum):
 class ProxyPod(msgspec.Struct, frozen=True):
     """A pod of the operator in which a proxy runs, or is to run.
 
-    ``of`` and ``owner`` are the name and uid of its RosProxy, ``on`` the node that it is meant for
+    ``of`` and ``owner`` are the name and uid of its RosProxy, ``node`` where it is meant to run
     (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
     say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
     condition Ready. ``restarts`` counts those of its container. ``token`` is that of its admin

@@ -51,7 +51,7 @@ class Field(msgspec.Struct, frozen=True):
         ]
         for field in fields:
             if field.value is None:
-                raise field.error("does not fit", "leave it out")
+                raise field.error("is not valid", "leave it out")
         return fields
 
     def text(self, default: str = "") -> str:
@@ -66,11 +66,11 @@ class Field(msgspec.Struct, frozen=True):
         """A number of the type that the default has, within bounds."""
         if self.value is None:
             return default
-        kind = type(default)
+        kind = type(default)  # bool is excluded below, since it is a kind of int in Python
         fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
         if not fits or not least <= self.value <= most:
             expected = {int: "an integer", float: "a number"}[kind]
-            raise self.error("does not fit", f"write {expected} from {least} to {most}")
+            raise self.error("is not valid", f"write {expected} from {least} to {most}")
         return kind(self.value)
 
     def one_of(self, allowed: Mapping[str, V], default: str) -> V:
@@ -85,7 +85,7 @@ class Field(msgspec.Struct, frozen=True):
         if self.value is None:
             return default
         if not isinstance(self.value, type):
-            raise self.error("does not fit", f"write {expected}")
+            raise self.error("is not valid", f"write {expected}")
         return self.value
 
 

@@ -51,6 +51,7 @@ def node(obj: Json) -> ClusterNode:
     """A node."""
     meta, spec, status = submap(obj, "metadata"), submap(obj, "spec"), submap(obj, "status")
     networks = spec.get("podCIDRs") or (text_at(spec, "podCIDR"),)
+    # Reversed, so that of several addresses of a type the first one stays.
     addresses = reversed(submaps(status, "addresses"))
     return ClusterNode(
         name=text_at(meta, "name"),

@@ -104,7 +104,7 @@ def rosproxy(obj: Json) -> RosProxy:
     address = service.host if service else text_at(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME:
         fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
-        raise Field("metadata.name", id.name).error("does not fit", fix)
+        raise Field("metadata.name", id.name).error("is not valid", fix)
     return RosProxy(
         id=id,
         uid=text_at(meta, "uid"),
@@ -207,11 +207,12 @@ def _glob(field: Field, ros_name: bool) -> str:
 
 
 def _window(field: Field, ports: int) -> PortRange:
+    # From above roscore's port (11311) and rosserial's (11411) up to below the NodePorts (30000).
     window = PortRange(field["first"].number(11412, *_HIGH), field["last"].number(29999, *_HIGH))
     if window.last - window.first + 1 < ports:
         raise InvalidField(
-            f"{field.path}: {window} has not the {ports} ports that spec.ports asks for: make the "
-            "window larger, or spec.ports smaller"
+            f"{field.path}: {window} has fewer than the {ports} ports that spec.ports asks for: "
+            "make the window larger, or spec.ports smaller"
         )
     return window
 
@@ -332,7 +333,7 @@ def _service(field: Field, of: Name) -> Name:
     if not is_label(service.name):
         raise name.error("is not a Service's name", "write it as kubectl get service shows it")
     if not is_label(service.namespace):
-        raise namespace.error("is not a namespace's name", "leave it out or mend it")
+        raise namespace.error("is not a namespace's name", "leave it out or correct it")
     if service == service_id(of):
         raise name.error(_OWN_SERVICE, "name that of the real master")
     return service

@@ -30,7 +30,7 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
     subject = f"rosproxy {metadata['namespace']}/{metadata['name']}"
     conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}
     if int_at(status, "observedGeneration") < metadata.get("generation", 0):
-        text = "the operator has not seen it as it is now"
+        text = "the operator has not looked at its last change yet"
         fix = (
             "does the operator run? kubectl get pods -A -l app.kubernetes.io/name=rosproxy-operator"
         )

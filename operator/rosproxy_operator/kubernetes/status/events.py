@@ -106,6 +106,7 @@ def event_body(event: Emit, now: float) -> Json:
     about = event.about
     identity = "\n".join([about.uid, event.type, event.reason, event.message])
     digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
+    # Before the dot a name must not end in a dot or a hyphen (RFC 1123, as Kubernetes wants names).
     name = f"{about.id.name[:_LONGEST_NAME].rstrip('.-')}.{digest}"
     return {
         "apiVersion": "v1",
@@ -161,4 +162,5 @@ def _warning(finding: ClusterFinding) -> Emit:
 def _bounded(text: str) -> str:
     if len(text.encode()) <= LONGEST:
         return text
+    # The ellipsis has three bytes; a character that is cut through is left out.
     return text.encode()[: LONGEST - 3].decode(errors="ignore") + "…"

@@ -138,6 +138,7 @@ def _answered(
         text = f"it does not reach the master ({answer.error}): {_master_remedy(rosproxy)}"
         yield _finding(rosproxy, subject, text, NO_MASTER)
     for problem in answer.problems:
+        # While the master is away, the proxy's own problem about it says the same as NO_MASTER.
         if answer.master_up or not problem.startswith("master: "):
             yield ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
 
@@ -146,7 +147,7 @@ def _master_remedy(rosproxy: RosProxy) -> str:
     master = rosproxy.spec.master
     if master.service is not None:
         return f"start roscore behind Service {master.service}, port {master.service_port}"
-    return f"start roscore there, let pods connect to {master.uri}, or mend spec.master"
+    return f"start roscore there, let pods connect to {master.uri}, or correct spec.master"
 
 
 def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
@@ -169,7 +170,7 @@ def _remedy(message: str, rosproxy: RosProxy) -> str:
     if "exceeded quota" in low or "must specify" in low:
         return "raise the namespace's ResourceQuota, or set spec.resources"
     if "is invalid" in low:
-        return "mend the field that is named in the RosProxy's spec"
+        return "correct the field that is named, in the RosProxy's spec"
     if "cannot" in low and "user" in low:
         return "the operator lacks a right: install its chart or manifests anew"
     if "not the operator's" in low:

@@ -37,9 +37,11 @@ MOST_NODES = 200
 MOST_NAMES = 50
 """Names of ROS nodes that are told of each."""
 MOST_NAMES_OF_ALL = 4000
+"""The same of all nodes: with `_NAME` characters each they take less than half of that object."""
 _NAME = 100
 _MESSAGE = 300
 _PORTS = 400
+# As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
 
@@ -300,13 +302,15 @@ def _reached(
     answers = [s.answer for s in proxies if s.answer is not None and s.answer.answered]
     if not all(answer.master_up for answer in answers):
         lines = [_one_line(p) for p in problems if p.reason == NO_MASTER]
-        return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
+        return Condition(
+            MASTER, "False", NO_MASTER, "; ".join(lines) or "not every proxy reaches it"
+        )
     if not proxies:
         return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
     if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
     previous = (c for c in submaps(former, "conditions") if c.get("type") == MASTER)
-    unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
+    unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has answered yet")
     return next(map(_read, previous), unknown)
 
 

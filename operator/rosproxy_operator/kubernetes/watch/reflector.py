@@ -93,7 +93,7 @@ class Reflector:
     def relist(self) -> None:
         """List everything anew soon: the watched state is wrong."""
         if time.monotonic() - self._listed_at > DOUBTED:
-            self._listed_at = -CHECKED
+            self._listed_at = -CHECKED  # too long ago, however little the clock has counted
             if self._watch is not None:
                 self._watch.stop()
 
@@ -119,7 +119,7 @@ class Reflector:
                 if not isinstance(error, ApiLost) or failures > 1:
                     self._pause(failures)
             except Exception as error:  # a mistake of ours must not blind the operator
-                log.exception("watching %s failed; going on", self._kind)
+                log.exception("watching %s failed; trying again", self._kind)
                 self._version, failures = "", failures + 1
                 self._complain(ApiUnavailable(f"watching {self._kind} failed: {error!r}"))
                 self._pause(failures)
@@ -161,7 +161,7 @@ class Reflector:
         self._watch = watch = self._api.watch(self._kind, self._place, self._version)
         self._tell(self._listener.changed, {})  # it works again, if it did not
         if self._ending.is_set():
-            watch.stop()
+            watch.stop()  # `stop` may have come before there was a watch to end
         for events in watch:
             if self._ending.is_set():
                 break

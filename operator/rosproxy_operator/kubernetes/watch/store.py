@@ -98,7 +98,11 @@ class ClusterStore:
         for key, record in {**gone, **records}.items():
             self._put(collection, key, record)
         if collection in self._listed and (gone or differ):
-            log.info("a list of the %s corrects %d", kind, len(gone) + len(differ))
+            log.info(
+                "a new list of the %s corrected %d objects that a watch had missed",
+                kind,
+                len(gone) + len(differ),
+            )
             self._corrected(len(gone) + len(differ))
         self._listed.add(collection)
 
@@ -125,6 +129,7 @@ class ClusterStore:
         NetworkPolicies may be missing, where the operator has no right to them.
         """
         await self._all_heard.wait()
+        # That of the RosProxies first: it says what to do where their definition is missing.
         for (kind, _), error in sorted(self._errors.items(), key=lambda pair: pair[0][0] != PLURAL):
             if kind != POLICIES or isinstance(error, ApiUnavailable):
                 raise error
@@ -212,6 +217,8 @@ class ClusterStore:
             del table[key]
         else:
             table[key] = record
+        # A change concerns whom the former record mattered to, and whom the new one does: a pod
+        # whose label changes leaves one RosProxy for another.
         self._index(former, key, add=False)
         self._touch(former, record)
         self._index(record, key, add=True)

@@ -107,7 +107,7 @@ def read(data: Mapping[str, str]) -> KeyPair:
     except KeyError as error:
         raise InvalidCertificate(f"it has no {error.args[0]}") from None
     except ValueError:
-        raise InvalidCertificate("it is no base64") from None
+        raise InvalidCertificate("it is not valid base64") from None
     return checked(KeyPair(*decoded))
 
 

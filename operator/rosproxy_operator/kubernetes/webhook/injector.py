@@ -1,6 +1,6 @@
 """Wires a pod, as the API server is about to create it, to the proxy of its node.
 
-A pod with the label rosproxy.io/inject comes here from kopf (`watch`). The RosProxies of its
+A pod with the label rosproxy.io/inject comes here from kopf (`serving`). The RosProxies of its
 namespace and their Service are read as they are at this moment; the planner says which RosProxy
 takes the pod and what it needs. Nothing is written: the Service is the operator's alone to make,
 which knows its address, its owner and what to do when it is refused. Where it is not there yet,
@@ -135,6 +135,7 @@ class Injector:
             raise self._missing(rosproxy)
         if dry_run:
             return service.cluster_ip, 0.0
+        # Bounded, since the clocks of the API server and of this machine may differ.
         created_at = datetime.fromisoformat(manifest["metadata"]["creationTimestamp"]).timestamp()
         return service.cluster_ip, min(max(created_at + YOUNG - time.time(), 0.0), YOUNG)
 
@@ -144,11 +145,11 @@ class Injector:
         Pods wait for the latter alone (NoService).
         """
         if refused := bounds_violation(rosproxy, self._consents(rosproxy), self._settings):
-            return NotWired(f"RosProxy {rosproxy.id.name}: {refused}; create the pod anew then")
+            return NotWired(f"RosProxy {rosproxy.id.name}: {refused}; then create the pod anew")
         id = service_id(rosproxy.id)
         return NoService(
             f"the Service {id} has no cluster IP yet: kubectl -n {id.namespace} describe rosproxy "
-            f"{rosproxy.id.name} says why; create the pod anew then"
+            f"{rosproxy.id.name} says why; once it has one, create the pod anew"
         )
 
     def _consents(self, rosproxy: RosProxy) -> Consents:

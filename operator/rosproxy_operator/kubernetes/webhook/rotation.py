@@ -98,6 +98,8 @@ class SelfSigned:
         self.problems = []
         now, self._pair = self._now(), self._kept_pair()
         trusted = self._trust(self._pair.ca)
+        # There is nothing to wait for without a valid certificate to go on with, or without a
+        # configuration from which API servers have to learn of the CA first.
         if self._serving is None or self._serving.expires <= now or not self._configuration:
             self._serving = self._pair
         elif self._pair != self._serving and trusted:
@@ -117,7 +119,7 @@ class SelfSigned:
             manifest = self._api.get("secrets", self._secret) if self._secret else None
         except ApiError as error:
             if self._pair is None and isinstance(error, ApiUnavailable):
-                raise
+                raise  # the Secret may hold a good pair: no other one is made before it was read
             if not isinstance(error, ApiUnavailable):  # which the operator's looks report
                 self._complain(error)
         kept = self._pair if manifest is None else self._read(manifest)
@@ -155,7 +157,7 @@ class SelfSigned:
             self._api.fill_secret(secret, manifest, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
             self._unsaved = None
-            raise ApiUnavailable(f"somebody else writes {secret}: {error}") from None
+            raise ApiUnavailable(f"somebody else writes Secret {secret}: {error}") from None
         except NotLeading:
             raise
         except ApiError as error:
@@ -175,7 +177,11 @@ class SelfSigned:
         try:
             return certificates.read(data)
         except InvalidCertificate as error:
-            log.warning("webhook: Secret %s: %s; making another one", self._secret, error)
+            log.warning(
+                "webhook: Secret %s holds no usable certificate: %s; making another one",
+                self._secret,
+                error,
+            )
             return None
 
     def _trust(self, authorities: bytes) -> bool:
@@ -208,6 +214,7 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
         if submap(webhook, "clientConfig").get("caBundle") != bundle:
             path = f"/webhooks/{index}"
             operations += [
+                # A JSON patch finds a webhook by its index alone, and others may be added.
                 {"op": "test", "path": f"{path}/name", "value": webhook.get("name")},
                 {"op": "add", "path": f"{path}/clientConfig/caBundle", "value": bundle},
             ]
@@ -243,7 +250,7 @@ class CertificateRotation:
         except (ApiError, InvalidCertificate) as error:
             problems = [Problem(_SUBJECT, f"no certificate: {error}")]
         except Exception as error:  # a mistake of ours must not end the certificate
-            log.exception("checking the webhook's certificate failed; going on")
+            log.exception("checking the webhook's certificate failed; trying again")
             problems = [Problem(_SUBJECT, f"the operator failed: {error!r}")]
         else:
             problems = [*self._source.problems]

@@ -69,6 +69,7 @@ class WebhookServer:
             await web.TCPSite(runner, bind.host, bind.port, ssl_context=context).start()
             log.info("wiring pods at https://%s", bind)
             self._serving = True
+            # For kopf's own webhook configuration, of which there is none (`admission.managed`).
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
             await self._exchange(context, pair)
         finally:
@@ -88,8 +89,8 @@ class WebhookServer:
                 try:
                     certificates.load(context, pair)
                 except ssl.SSLError:
-                    log.exception("a certificate can't be served; the one before stays")
-                served = pair
+                    log.exception("the new certificate can't be served; the one before stays")
+                served = pair  # also if it can't be: it would fail, and be logged, at each look
 
 
 def _application(fn: kopf.WebhookFn) -> web.Application:

@@ -16,6 +16,7 @@ from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
 TWO_PROXIES = "two proxies"
 CLEANUP = "rosnode cleanup (answer y)"
+# The host name of a container that was given none (moby daemon/container.go).
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
 
 
@@ -36,7 +37,7 @@ def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
     if not first:
         return findings
     rest = [f for f in findings if f.check != TWO_PROXIES]
-    wait = "part the two proxies first, then ask again"
+    wait = "separate the two proxies first, then run the doctor again"
     return first + [replace(f, fix=wait) if CLEANUP in f.fix else f for f in rest]
 
 
@@ -116,12 +117,12 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     lease = facts.lease(node.slave)
     if lease is None and _is_of_another_proxy(facts, node):
         text = (
-            f"lives, registered as {node.uri}, and this proxy knows no such node: another rosproxy "
-            "advertises the same host and ports, and nodes get now the one's, now the other's"
+            f"is alive as {node.uri}, and this proxy knows no such node: another rosproxy "
+            "advertises the same host and ports, and outside reaches now the one, now the other"
         )
         fix = (
             "end one of the two proxies, or give it another --port-range (ROSPROXY_PORT_RANGE), "
-            "published as well. No rosnode cleanup: it takes away nodes that live"
+            "published as well. No rosnode cleanup: it would unregister nodes that are alive"
         )
         yield error(TWO_PROXIES, node.name, text, fix)
     elif lease is None:
@@ -147,6 +148,7 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     elif node.attempt.failed and node.inside:
         text = f"registered through a rosproxy as {node.uri}: {reach.value}"
         yield error(OUTSIDE, node.name, text, _fix_proxied(facts, node, slave))
+    # With the master on loopback, too, all of ROS is on this machine, where that is right.
     elif is_loopback(slave.host) and not (local_master(facts) and not node.attempt.failed):
         text = f"registered as {node.uri}: to every other machine that is the machine itself"
         fix = (
@@ -167,7 +169,7 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     elif _past_the_proxy(facts, node):
         text = (
             f"registered as {node.uri}, in an inside network: if it is meant to be behind the "
-            "proxy, it has registered past it, and outside can't reach it"
+            "proxy, it has registered around it, and outside can't reach it"
         )
         yield warning(OUTSIDE, node.name, text, _start_inside(facts))
 
@@ -175,7 +177,7 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
 def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> DoctorFinding:
     text = f"registered as {node.uri}; the host name {slave.host} can't be resolved here"
     if _CONTAINER_ID.fullmatch(slave.host):
-        text += ". It looks like a container that uses the real master, past the proxy"
+        text += ". It looks like a container that uses the real master instead of the proxy"
         return error(OUTSIDE, node.name, text, _start_inside(facts))
     fix = (
         f"where it runs: ROS_IP=ADDRESS, then restart it; or make {slave.host} known to proxy and "
@@ -204,6 +206,7 @@ def _past_the_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
     if facts.master is None:
         return False
     networks = [ip_network(text) for text in facts.proxy.settings.inside_networks]
+    # Where the master is in an inside network, nodes there may well be meant to be outside.
     apart = [n for n in networks if not any(is_inside(a, [n]) for a in facts.master.addresses)]
     return any(is_inside(address, apart) for address in node.addresses)
 
@@ -219,6 +222,7 @@ def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         provider = parse_service_uri(uri)
         if facts.is_ours(provider) and not facts.lease(provider):
             subject = next(iter(facts.system.services.get(service, ())), service)
+            # `_leased` tells of the other proxy already.
             if subject in facts.nodes and _is_of_another_proxy(facts, facts.nodes[subject]):
                 continue
             text = f"its service {service} is registered as {uri}, a port that no node holds"

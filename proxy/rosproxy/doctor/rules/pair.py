@@ -36,10 +36,11 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     graph = facts.system
     names = sorted(graph.names() | graph.topics | {*graph.services})
     alike = get_close_matches(name, names, 3, 0.7)
+    # /scan was asked for, and there is /robot/scan: a namespace was left out.
     alike += [n for n in names if n.endswith(name) and n not in alike][:3]
     hint = f"; there is {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
-    fix = "rosnode list; rostopic list; look for a namespace or a remapping too many"
+    fix = "compare with rosnode list and rostopic list; check namespaces and remappings"
     return error(PAIR, name, text, fix)
 
 
@@ -93,7 +94,9 @@ def _why(
     """Why a pair is not connected, the most certain reason first, and what mends it."""
     for node in (publisher, subscriber):
         if _unreachable(facts, node):
-            return f"{node.name} can't be reached from here", "see what is said of it"
+            return f"{node.name} can't be reached from here", f"see the finding about {node.name}"
+    # A node that could not be asked is taken to fit. A subscriber to any type has * as its
+    # type (rospy.AnyMsg).
     offered = publisher.report.publishes.get(topic) if publisher.report else ANY
     wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY
     if offered is None:
@@ -135,7 +138,7 @@ def _why_no_transport(
         slave = publisher.slave
         return (
             f"{publisher.name} is behind the proxy and fine; "
-            f"{subscriber.name} has not come to {slave}",
+            f"{subscriber.name} has not connected to {slave}",
             f"on the machine of {subscriber.name}: "
             f"nc -vz {slave.host} {slave.port}; then {restart}",
         )
@@ -148,8 +151,8 @@ def _why_no_transport(
 def _why_not_from_inside(
     facts: DoctorFacts, address: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
-    """Why a subscriber behind the proxy has not come to a publisher that is well."""
-    text = f"{publisher.name} is fine; {subscriber.name}, behind the proxy, has not come to"
+    """Why a subscriber behind the proxy has not connected to a publisher that is well."""
+    text = f"{publisher.name} is fine; {subscriber.name}, behind the proxy, has not connected to"
     differ = "or their message definitions differ (md5sum)"
     log = f"look into the log of {subscriber.name}"
     if facts.proxy.settings.direction == "both":

@@ -39,7 +39,7 @@ def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         up = duration(facts.status.uptime)
         yield ok("admin", "proxy", f"rosproxy {facts.status.version} at {facts.admin}, up {up}")
     elif facts.admin_error:
-        text = f"{facts.admin_error}. What else is said here was found without it"
+        text = f"{facts.admin_error}. All other findings were made without it"
         fix = "docker ps; docker logs CONTAINER; docker exec CONTAINER rosproxy doctor"
         yield error("admin", "proxy", text, fix)
 
@@ -107,6 +107,8 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     probes = facts.probe.probes if facts.probe else ()
     if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
         return  # others find this host by it, whatever it means here
+    # A loopback address is right where the master is on this machine, which is not known yet
+    # while there is no master to look at.
     if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
         all_here = facts.is_all_local or local_master(facts)
         yield from advertised_host(host, facts.advertised_addresses, all_here)

@@ -49,7 +49,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
 def _domain(domain: DomainStatus) -> Iterator[DoctorFinding]:
     subject = f"domain {domain.domain}"
     if not domain.peers and not domain.ear:
-        text = "nobody outside is told of participants inside"
+        text = "participants inside are announced to nobody outside"
         yield error(
             "announcing", subject, text, "give --ros2-peer, or run rosproxy ear (--ros2-ear)"
         )
@@ -127,7 +127,7 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
         (subscribers, publishers, "publishes"),
     ):
         if own_side and not other_side:
-            yield note("topic", name, f"nobody {lacks} it", "see the name, and that it runs")
+            yield note("topic", name, f"nobody {lacks} it", "check the name, and that it runs")
     pairs = [(p, s) for p in publishers for s in subscribers]
     if pairs and all(p[1] is s[1] for p, s in pairs):
         text = "all that have it are on one side, so that it does not pass the proxy"

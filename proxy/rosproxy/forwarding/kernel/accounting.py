@@ -104,6 +104,7 @@ class KernelAccounts:
         self.unanswered = self._silence.look(by_port, now)
         for port, (from_node, to_node, packets) in by_port.items():
             endpoint = self.owners.get(port)
+            # Where the node is outside, what it sends is what inside receives.
             outwards = endpoint is not None and not endpoint.inside
             delta = Counts(*((to_node, from_node) if outwards else (from_node, to_node)), packets)
             if endpoint is not None:

@@ -62,6 +62,7 @@ def find_stray_datagrams(text: str, forwards: Forwards, marks: Marks) -> StrayDa
             continue
         if port is not None and forwards.get(port) != entry.reply_source:
             stray.misdirected.add(port)
+        # Answered by the address that it was sent to: no rule has led it elsewhere.
         elif port is None and entry.target.port in forwards and entry.reply_source == entry.target:
             stray.unforwarded.add(entry.target)
     return stray
@@ -108,6 +109,7 @@ def _entry(fields: list[str]) -> _Entry | None:
     for key, equals, value in (field.partition("=") for field in fields):
         if equals:
             values[key].append(value)
+    # Not a mark such as [ASSURED] or [UNREPLIED], which lines of UDP have as well.
     state = next((field for field in fields[1:] if field.isupper() and field[0].isalpha()), "")
     try:
         mark = int(values["mark"][0])

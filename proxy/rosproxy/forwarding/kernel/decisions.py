@@ -22,7 +22,7 @@ longest time, it doubles from one to the other."""
 
 
 class HostForwarding(msgspec.Struct, frozen=True):
-    """What the kernel can do here: forward IPv4, forward IPv6; ``own`` tells own addresses."""
+    """What the kernel can do here: forward IPv4, forward IPv6; ``own_addresses`` are its own."""
 
     ipv4: bool = True
     ipv6: bool = True
@@ -42,6 +42,8 @@ def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
         return "nobody has asked for a topic of it yet"
     if len(ports) > 1:
         return "its topics are on several TCPROS ports"
+    # What is led to an own address passes no forward hook, so that the table's chain there would
+    # neither count it nor reset it.
     if is_loopback(address) or address in host.own_addresses:
         return "the node runs in the network namespace of the proxy itself"
     if not (host.ipv6 if ":" in address else host.ipv4):

@@ -57,6 +57,8 @@ Counters = Mapping[int, Counts]
 _MAPS = ("marks", "hosts4", "hosts6", "ports")
 _SETS = ("sent", "received")
 _NOTHING = 0, 0
+# The first line makes sure that there is a table to delete: nft fails otherwise. Chains of type nat
+# see only the first packet of a connection (nft(8)), so its port is kept in the connection's mark.
 _TABLE_DOCUMENT = Template("""\
 add table inet $name
 delete table inet $name

@@ -140,6 +140,7 @@ class KernelPlane:
         """The plane of one endpoint's topics, as JSON; bytes of IP packets."""
         account = self._accounts.account(endpoint)
         reason, port = self.syncer.reason(endpoint), endpoint.fast_port
+        # Ports of nodes outside are for inside alone: they are not published, and have no offset.
         return {
             "plane": self.user_plane if reason else "kernel",
             "port": self._settings.ports.advertised(port) if endpoint.inside and port else port,

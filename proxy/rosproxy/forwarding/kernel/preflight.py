@@ -42,7 +42,7 @@ async def find_obstacle(mode: DataPlane, tools: Tools) -> str | None:
 
 def _reasons(mode: DataPlane) -> Iterator[str]:
     if sys.platform != "linux":
-        yield "only Linux has it"
+        yield "forwarding in the kernel needs Linux"
         return
     if mode == "auto" and (hardware := _hardware()):
         yield (
@@ -55,6 +55,7 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
             "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it (sysctls: "
             "net.ipv4.ip_forward: 1; for nodes with IPv6 addresses net.ipv6.conf.all.forwarding: 1)"
         )
+    # nft lists nothing of iptables-legacy, so that `dropping_chains` can't see its policy.
     if "filter" in _read(_LEGACY_TABLES).split():
         yield (
             "iptables-legacy has a filter table here, which may drop what is forwarded: use "

@@ -72,6 +72,7 @@ class ForwardSyncer:
         self._all_changed = True
         self._host, self._pauses = HostForwarding(), decisions.Pauses()
         self._own: dict[str, bool] = {}
+        # inf: what was not possible at the start is not tried again, only a table that was lost.
         self._own_until, self._retry_at = 0.0, float("inf")
         self._logged: dict[LeaseHolder, str] = {}
         has_connections = table.table.has_connections
@@ -138,7 +139,7 @@ class ForwardSyncer:
         if endpoint.fast_port is None:
             return fast_ports.why_no_fast_port(self._endpoints.pool, endpoint)
         is_forwarded = self._table.forwards.get(endpoint.fast_port) == target
-        return "" if is_forwarded else "about to be forwarded"
+        return "" if is_forwarded else "the kernel's table is being updated"
 
     def log_reason(self, endpoint: LeaseHolder) -> None:
         """Log why an endpoint's topics are not forwarded, if that has not been said yet."""
@@ -186,11 +187,13 @@ class ForwardSyncer:
         if ports:
             self._all_changed = True
             await self._sync()
+            # Connections that the node has answered go on through the kernel.
             families = itertools.product(ports, (False, True))
             await self._table.forget(families, "SYN_SENT")
 
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
         """End the connections through ports, each of IPv6 or not."""
+        # First: a forward that is not wanted any more would take those who connect again.
         await self._sync()
         await self._table.cut(ports)
 
@@ -221,6 +224,7 @@ class ForwardSyncer:
             self._pauses.keep(self._accounts.owners)
             if self.usable:
                 await self._change()
+            # Each round has an event of its own, which wakes all who wait for it once.
             synced, self._synced = self._synced, asyncio.Event()
             synced.set()
 

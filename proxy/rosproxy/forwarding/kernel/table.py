@@ -42,6 +42,7 @@ class KernelTable:
             log.debug("no table of a former process: %s", error)
             former = TableState()
         self.counted = set(former.counters)
+        # Only to see, before anything is forwarded, whether conntrack can be run.
         await self._list_flows(False, "--mark", self.table.marks.table_selector)
         await self.make(former.forwards)
 
@@ -120,6 +121,8 @@ class KernelTable:
         text = await self._list_flows(ipv6)
         unled, misled = conntrack.find_stray_datagrams(text, self.forwards, self.table.marks)
         for dst in unled:
+            # Only what was sent to this machine itself, and what no rule has led elsewhere: of that
+            # the port that answers is the one that was asked.
             if address_towards(dst.host) == dst.host:
                 port = str(dst.port)
                 args = "--orig-dst", dst.host, "--orig-port-dst", port, "--reply-port-src", port

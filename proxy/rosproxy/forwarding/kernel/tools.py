@@ -51,6 +51,8 @@ class Tools:
         try:
             await self._run("conntrack", "-D", *_selection(transport, ipv6), *options)
         except ToolError as error:
+            # conntrack fails if there was nothing to delete; kube-proxy looks for the same text
+            # (pkg/proxy/conntrack, noConnectionToDelete).
             if "0 flow entries" not in str(error):
                 raise
 
@@ -59,6 +61,7 @@ class Tools:
         run = loop.run_in_executor(None, _run, [_find(name), *arguments], document)
         self._running.add(run)
         run.add_done_callback(self._ended)
+        # Not `await run`, which would cancel it together with its task.
         await asyncio.wait({run})
         return run.result()
 
@@ -92,7 +95,7 @@ def _run(command: list[str], document: str) -> str:
             errors="replace",
             timeout=TIMEOUT,
             check=False,
-            env={"LC_ALL": "C"},
+            env={"LC_ALL": "C"},  # messages are looked into here, in English
         )
     except subprocess.TimeoutExpired:
         raise ToolError(f"{command[0]} did not end in {TIMEOUT:g} s") from None

@@ -67,9 +67,11 @@ class MasterApi:
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
+        # getUri is answered with the address by which the node itself calls the proxy.
         caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics, upstream = self._context.metrics, self._context.upstream
         judges_params = self._access.judges_parameters(call.source)
+        # roslaunch sets all its parameters by one multicall (launch.py, _load_parameters).
         if not judges_params and await _is_long_and_passes(call.body):
             return await count_reply(
                 metrics, "master", MULTICALL, upstream.pass_to_master(call.body)
@@ -83,6 +85,8 @@ class MasterApi:
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
+        # A call for one parameter is judged by its head (`pass_on`). A multicall holds many, and of
+        # getParamNames the reply has to be filtered.
         if method in (MULTICALL, "getParamNames") and self._access.judges_parameters(None):
             return None
         return _watch(method, size, self._context.master_call)
@@ -108,6 +112,8 @@ class MasterApi:
     async def _answer(self, request: Request, call: IncomingCall) -> bytes | LongReply:
         """The reply to a request that was read; what needs no change passes untouched."""
         if not request.plain:
+            # A node that a former process of the proxy knew would get another port before that, and
+            # rosmaster would shut it down for its new URI (registrations.py, _register_node_api).
             await self._recovery.ensure()
             await self._services.find_for(request)
         replies = await self._access.judge_request(request)
@@ -125,14 +131,16 @@ class MasterApi:
             self._note(exported.registry_changes(), request.caller.address)
             if exported.body is None:
                 return exported.local_reply()
+            # Before the master knows the node: were the proxy killed in between, the next process
+            # would find a registration with this lease, and not know where its node is.
             await self._memory.write()
             limits = request.reply_limits
             answer = await self._context.upstream.post_to_master(exported.body, limits)
             reply = master_calls.read_reply(exported, answer)
             self._note(reply.registry_changes(self._context.now()), request.caller.address)
-            await self._memory.write()
+            await self._memory.write()  # the registry learns a service's port only now
             await self._stand_ins.listen_for(reply.uris(), request.caller)
-            if self._context.policy.version != version:
+            if self._context.policy.version != version:  # what was judged may be denied by now
                 self._enforcer.look_again()
             return master_api.import_reply(reply, addressing, self._access.reply_changes(reply))
 
@@ -152,7 +160,7 @@ class MasterApi:
             # One after the other: they may register the same new node.
             for call, reply in zip(request.calls, replies, strict=True):
                 if incoming.gone:
-                    raise Unreachable("the caller has gone")
+                    raise Unreachable("the caller has closed the connection")
                 outcome: CallOutcome = reply
                 if call and reply is None:
                     outcome = await self._outcome(call, request, pending)
@@ -170,6 +178,7 @@ class MasterApi:
             return self._access.judge_unregistration(call, endpoint, caller) or endpoint
         admission = await self._admit(call, request)
         if isinstance(admission, Endpoint):
+            # Held before anything is awaited: nothing else keeps the lease from ending meanwhile.
             admission.hold()
             pending.append(admission)
             await self._adopter.take_over(admission, caller_id_of(call))
@@ -202,7 +211,7 @@ class MasterApi:
             registration = fact.registration
             if fact.endpoint is None:
                 registry.unregister(registration.kind, registration.name, registration.caller_id)
-            elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
+            elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:  # not forgotten since
                 own = source == fact.endpoint.location.address
                 registration = self._keep_shown(fact.endpoint, registration)
                 registry.register(
@@ -261,7 +270,7 @@ def _passes(method: str) -> bool:
 
 
 def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:
-    if method == MULTICALL:
+    if method == MULTICALL:  # a shorter one may hold calls with addresses, so it is read
         return passing.MulticallWatch(_passes) if size > limits.size else None
     return passing.CallWatch() if _passes(method) else None
 

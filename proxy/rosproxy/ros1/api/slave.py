@@ -33,7 +33,7 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 log = logging.getLogger(__name__)
 
 _Answer = TypeVar("_Answer")
-NO_CALLER_ID = "there is a policy, and the call's caller_id can't be told"
+NO_CALLER_ID = "a policy is set, and the call's caller_id can't be read"
 NOT_THE_MASTER = "only the master may call this"
 
 
@@ -80,7 +80,7 @@ class SlaveApi:
         results = []
         for inner in multicall.inner_calls(parsed):
             if call.gone:
-                raise Unreachable("the caller has gone")
+                raise Unreachable("the caller has closed the connection")
             results.append(await self._multicall_result(endpoint, inner, call))
             call.charge(len(results[-1]))
         return multicall.results_reply(results)
@@ -126,7 +126,8 @@ class SlaveApi:
     ) -> bytes:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""
         if inner is None:
-            return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
+            return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a method call")
+        # Several client libraries lack system.multicall (docs/architecture.md, Client libraries).
         body = multicall.single_call(inner)
         reply = await self._reply_to_call(
             endpoint, xmlrpc.parse_call(body, self._context.lease_call), body, call
@@ -187,6 +188,8 @@ class SlaveApi:
         else:
             body = self._stand_ins.with_address(body, parsed)
         reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
+        # The node's own answer is all that tells where its topics are. Whoever connects next, and
+        # the kernel plane, are led to the port that is noted here.
         port, topic_port = endpoint.port, slave_api.topic_port(parsed, reply)
         if topic_port is not None:
             endpoint.note_topic_port(parsed.string(1) or "", topic_port)
@@ -231,7 +234,7 @@ class SlaveApi:
         try:
             reply = await answer
         except Unreachable as error:
-            if error.probe is ProbeResult.ANSWERED:
+            if error.probe is ProbeResult.ANSWERED:  # an HTTP status: it lives
                 health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
                 # Refused twice, the node has ended: its port refuses as well at once.

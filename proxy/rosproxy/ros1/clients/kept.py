@@ -65,7 +65,7 @@ class KeptConnections(Generic[_K]):
 
     def __init__(self, nodes: NodeClient, within: float) -> None:
         self._nodes, self._within = nodes, within
-        self.most = 0
+        self.most = 0  # until it is known how many files may be open (`Ros1.reserve_range`)
         self._connections: dict[_K, _Connection] = {}
         self._waiting: dict[_K, _Connection] = {}
         self._key_by_fd: dict[int, _K] = {}
@@ -102,6 +102,7 @@ class KeptConnections(Generic[_K]):
         connection, or sent something else.
         """
         results = dict(self._answers(now))
+        # In this order: an end counts even if the node has answered before it.
         results.update({self._key_by_fd[fd]: None for fd, _ in self._epoll.poll(0)})
         for key, result in results.items():
             if result is ProbeResult.ANSWERED:
@@ -129,6 +130,8 @@ class KeptConnections(Generic[_K]):
         """Give up a connection on which an answer is due."""
         conn = self._connections.pop(key)
         del self._waiting[key], self._key_by_fd[conn.sock.fileno()]
+        # The socket stays open until its answer has come, so it does not leave epoll by itself, as
+        # those do that are closed (epoll(7)).
         self._epoll.unregister(conn.sock)
         self._nodes.close_after_answer(conn.sock)
 
@@ -143,6 +146,7 @@ class KeptConnections(Generic[_K]):
         if len(self._connections) >= self.most:
             return None
         sock = self._nodes.connect(slave)
+        # A refused connection is told as well: EPOLLHUP and EPOLLERR always are (epoll_ctl(2)).
         self._epoll.register(sock, select.EPOLLRDHUP)
         self._key_by_fd[sock.fileno()] = key
         self._connections[key] = conn = _Connection(sock, slave, pid)

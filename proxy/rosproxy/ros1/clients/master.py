@@ -100,6 +100,8 @@ class MasterClient:
         uri = urlsplit(master_uri)
         self._master_path, self._netloc = uri.path or "/", uri.netloc
         self._master_host_port = HostPort(uri.hostname or "", uri.port or 80)
+        # By these two a call that comes back to the proxy tells which address has led it here:
+        # --master-uri, or that of a node (`MasterApi`).
         master_headers, node_headers = {LOOP_HEADER: instance}, {LOOP_HEADER: f"{instance} node"}
         self._master = HttpClient(master_headers, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
         self._nodes = HttpClient(node_headers, NODE_KEEPALIVE, NODE_CONNECTIONS, longest, NODES)
@@ -167,7 +169,7 @@ class MasterClient:
             call = xmlrpc.dump_call("system.multicall", body)
             results = parse_value(await self.post_to_master(call, OWN_REPLY))
             if not isinstance(results, list) or len(results) != len(batch):
-                raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
+                raise Unreachable(f"master {self.master_uri}: unusable reply to system.multicall")
             values += [_result_of(result) for result in results]
         return values
 
@@ -282,7 +284,7 @@ def read_value(method: str, reply: bytes, limits: Limits = REPLY) -> Any:
             return value
         case [_, str(message), _] | {"faultString": str(message)}:
             raise MasterError(f"{method}: {brief(message, LONGEST_TEXT)}")
-    raise MasterError(f"{method}: not a ROS status triple")
+    raise MasterError(f"{method}: the reply is no ROS status triple")
 
 
 def _read_state(state: Any, types: Any) -> dict[str, list[Registration]]:

@@ -144,6 +144,8 @@ class NodeClient:
 
     async def _server_name(self, server: HostPort, fields: dict[str, str]) -> str | None:
         """The name in the header with which a TCPROS server answers; None if it gives none."""
+        # "*" is the md5sum of any type. A service of rospy that is probed closes the connection
+        # after its header, and waits for no request (tcpros_service.py, handle).
         header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **fields})
         loop = asyncio.get_running_loop()
         try:
@@ -189,5 +191,5 @@ class NodeClient:
         try:
             return await self.topic_port(slave, topic)
         except (Unreachable, MasterError) as error:
-            log.debug("%s gives no TCPROS port for %s: %s", slave, topic, error)
+            log.debug("%s names no TCPROS port for topic %s: %s", slave, topic, error)
             return None

@@ -66,7 +66,7 @@ _GRAPH = {"getPublishedTopics", "getSystemState", "getTopicTypes", "system.multi
 _NODES = {"getBusInfo", "getBusStats", "getMasterUri", "getName", "getPid", "shutdown"}
 _TOPICS = {"getPublications", "getSubscriptions", "publisherUpdate", "requestTopic", "paramUpdate"}
 KNOWN_METHODS = frozenset(MASTER_METHODS).union(_PARAMETERS, _GRAPH, _NODES, _TOPICS)
-"""The methods of both APIs, those of slaves as well."""
+"""The methods of both APIs; metrics count calls of any other name together."""
 
 
 def method_spec(method: str) -> MethodSpec:
@@ -82,6 +82,7 @@ def resolve_name(name: str, caller_id: str) -> str:
         resolved = f"{caller_id}/{name[1:]}"
     else:
         resolved = f"{caller_id.rpartition('/')[0]}/{name}"
+    # As rosgraph does it (rosgraph/names.py, canonicalize_name).
     return "/" + "/".join(segment for segment in resolved.split("/") if segment)
 
 

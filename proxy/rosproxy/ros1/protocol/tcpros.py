@@ -68,4 +68,5 @@ def header_length(first: bytes) -> int:
 
 def speaks_http(first: bytes) -> bool:
     """Whether a connection's first four bytes are the start of an HTTP request."""
+    # A method of three letters has a blank behind it ("GET ").
     return len(first) == 4 and first.isascii() and first.replace(b" ", b"A").isalpha()

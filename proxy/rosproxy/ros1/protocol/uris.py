@@ -15,11 +15,12 @@ import msgspec
 from rosproxy.net.addresses import HostPort, cached, is_address, parse_authority, parse_host_port
 
 LONGEST_URI = 2048
-"""Characters of a URI at most: a host's name has 253 at most, and it stands twice in an advertised
-URI. What is longer is no URI to the proxy: it is neither rewritten nor remembered."""
+"""Characters of a URI at most. A host's name has 253 at most, and stands twice in a URI that a
+former version advertised. What is longer is no URI to the proxy: it is neither rewritten nor
+remembered."""
 
 LONGEST_PATH = 512
-"""Characters of a node's own path that an advertised URI carries at most."""
+"""Characters of a node's own path at most that is remembered with its lease."""
 _NO_HOST = re.compile(r"((?:http|rosrpc)://):(\d{1,5})(/?)")
 _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 

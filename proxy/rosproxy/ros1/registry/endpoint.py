@@ -154,6 +154,7 @@ class Endpoint:
     def note_verified(self, pid: int | None, topic_ports: Mapping[str, int]) -> None:
         """Note that the node itself has borne out what the master says of it."""
         self.topic_ports, self.trusted = dict(topic_ports), True
+        # A known one stays: by it the prober finds out that this is another process.
         if self.health.pid is None:
             self.health.pid = pid
 

@@ -109,6 +109,7 @@ class Health:
     def end(self, now: float) -> None:
         """Note that the node has ended, whatever it is that its address answers."""
         self.failures = max(self.failures, FAILURES_TO_CLOSE)
+        # Failing since ever, so that `clean_up` waits for nothing.
         self.checked_at, self.failing_since, self.has_ended = now, float("-inf"), True
 
     def due(self, now: float, interval: float) -> bool:

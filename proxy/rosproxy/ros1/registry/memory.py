@@ -72,6 +72,7 @@ def _read(value: object) -> Iterator[tuple[int, RememberedLease]]:
     """The advertised ports in a value, with what it tells of each."""
     for line in value.splitlines() if isinstance(value, str) else ():
         match = _LINE.fullmatch(line)
+        # Only the path counts; any host and port make a URI of it.
         node = parse_inside_path(f"http://h:1{match[2]}") if match else None
         if match and node:
             services = [int(text) for text in match[3].split()][:MOST_SERVICE_PORTS]

@@ -130,6 +130,7 @@ class Registry:
         """
         moved = self._movable(locations)
         self.lease_changes += 1
+        # All leave before the first one arrives: two containers may have swapped their addresses.
         for endpoint in moved:
             del self.by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
@@ -288,6 +289,7 @@ class Registry:
         return endpoint
 
     def _admit(self, endpoint: Endpoint, node: HostPort, source: str) -> None:
+        # It may have been another endpoint's before, and counts as this one's newest from now on.
         previous = self._admitted.get((node, source), endpoint)
         previous.admissions.pop((node, source), None)
         self._admitted[node, source] = endpoint
@@ -302,6 +304,8 @@ class Registry:
         if former is not None:
             self._forget_node(former)
         former = former or endpoint
+        # Only the last holder of a port gets it again. Otherwise `_last_port` would grow with each
+        # node that comes and goes.
         if self._last_port.get(former.slave) == endpoint.port:
             del self._last_port[former.slave]
         self._last_port[endpoint.slave] = endpoint.port

@@ -102,7 +102,8 @@ class StandIn:
     def fast_candidate(self) -> HostPort | None:
         """Where its fast port is to listen; None for a service, and where URIs are kept.
 
-        The kernel tells ports apart and no addresses: one of each of the proxy's addresses.
+        The kernel's rules tell ports apart, but not the proxy's addresses: so a URI has another one
+        at each of them.
         """
         if self.is_uri_kept or parse_service_uri(self.uri):
             return None
@@ -170,7 +171,8 @@ class StandIns:
     def address(self, proxy: str) -> str:
         """Where stand-ins listen for a node inside that sees the proxy at an address.
 
-        At that address alone; but at all where the URIs are kept, since a name may lead to any.
+        At that address alone. Where the URIs are kept, at all addresses (``--bind``): the name in
+        them may lead to any.
         """
         return proxy if self.is_bidirectional else self._settings.bind
 
@@ -189,6 +191,7 @@ class StandIns:
         """
         if stand_in.fast_port is not None or stand_in.fast_candidate is None:
             return None
+        # `port` and `fast_candidate` follow from the attribute that is counted up here.
         for stand_in.fast_attempts in range(TRIES):
             if stand_in.port not in self.by_port:
                 return stand_in.fast_candidate
@@ -275,7 +278,7 @@ def obstacle(port: int, settings: Settings) -> str | None:
         settings.publish_master: "--publish-master",
         settings.admin.port: "--admin-bind",
     }
-    return f"is that of {option_by_port[port]}" if port in option_by_port else None
+    return f"is taken by {option_by_port[port]}" if port in option_by_port else None
 
 
 def _number(text: str) -> int:

@@ -145,11 +145,14 @@ class Addressing:
         return self.stand_ins.import_uri(uri, caller.proxy) if self.stand_in_target(uri) else uri
 
     def _import(self, endpoint: Endpoint, caller: Caller) -> str:
+        # Several nodes may call themselves the same: sent back, the URI has to mean this one.
         if self._is_direct(endpoint, caller) and self._meant_by(endpoint.node, caller) is endpoint:
             return endpoint.uri
         return slave_uri(HostPort(caller.proxy, endpoint.port))
 
     def _is_direct(self, endpoint: Endpoint, caller: Caller) -> bool:
+        # Its own URI as it gave it: roscpp compares the text, so as not to connect to itself
+        # (subscription.cpp, pubUpdate).
         if endpoint is caller.endpoint:
             return True
         if caller.address == endpoint.location.address:

@@ -269,6 +269,7 @@ def _results(exported: ExportedRequest, value: Value) -> Iterator[CallResult]:
         triples = [item.items[0] if item.items else None for item in value.items]
     pairs = zip(exported.request.calls, exported.outcomes, strict=True)
     sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalReply)]
+    # A reply may hold fewer results than there were calls; what has none is passed on as it is.
     for (call, endpoint), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):
             yield CallResult(call, triple.items[0].integer(), triple, endpoint)

@@ -81,6 +81,7 @@ def hidden_registration(
 
 def hidden_unregistration(registration: Registration) -> LocalAnswer:
     """The answer to a call that ends a registration of which the master knows nothing."""
+    # rosmaster says "provider" of topics as well (registrations.py, unregister).
     text = f"Unregistered [{registration.caller_id}] as provider of [{registration.name}]"
     return LocalAnswer(1, text, 1, RegistryChange(registration, None))
 

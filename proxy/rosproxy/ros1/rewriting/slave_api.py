@@ -74,6 +74,7 @@ def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
     edits, listed = [], set()
     for item in _publishers(call):
         uri = view.rewrite_in_call(item.text)
+        # roscpp would connect twice to one that is listed twice (subscription.cpp, pubUpdate).
         edits.append(item.removed() if uri in listed else item.with_text(uri))
         listed.add(uri)
     return xmlrpc.apply(body, edits)
@@ -179,11 +180,13 @@ def send_to(triple: Value, target: HostPort) -> list[Edit]:
     """Edits by which a reply to ``requestTopic`` sends the subscriber elsewhere."""
     _, host, port = triple.items[2].items
     edits = [host.with_text(target.host), port.with_text(str(target.port))]
+    # rospy's message is "ready on HOST:PORT" (tcpros_pubsub.py, init_publisher).
     return edits + _in_message(triple, f"{host.text}:{port.text}", str(target))
 
 
 def replace_value(triple: Value, text: str) -> list[Edit]:
     """Edits by which a reply gives another text, also where its status message quotes it."""
+    # As in rosmaster's lookupService (master_api.py) and rospy's getMasterUri (masterslave.py).
     value = triple.items[2]
     return [value.with_text(text), *_in_message(triple, value.text, text)]
 

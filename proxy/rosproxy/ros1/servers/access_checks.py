@@ -256,6 +256,8 @@ class AccessChecks:
         if use is None:
             return None
         verdict = self._judge_use(use, caller_id, caller.address)
+        # A subscriber of a namespace is also sent what is set below it later (rosmaster's
+        # paramserver.py, compute_param_updates), so the names that exist now don't settle it.
         if not verdict.allowed and use.below and call.method != "subscribeParam":
             verdict = await self._judge_names(use, call, caller.address, params)
         subject = f"{use.names[0]} of {caller_id}"
@@ -264,6 +266,8 @@ class AccessChecks:
     def _judge_lookup(self, call: Call, caller: Caller, caller_id: str) -> LocalReply | None:
         name = second_parameter_name(call)
         provider = self._registry.services.get(name)
+        # Rules for `call` are about services of outside (docs/reference/policy.md). Once a node's
+        # registrations are taken back, the master may have the service of another.
         if provider and not provider[0].health.cleaned:
             return policing.hidden_service(call, caller, self._addressing)
         verdict = self._policy.ask(RuleKind.CALL, name, [caller_id], caller.address)

@@ -2,7 +2,7 @@
 
 A node says where it is by its slave URI, and that may name a host which only its own container
 knows. So the address that the registration came from counts where it must: see `NodeAdmission`'s
-``_place``. Another address than that one is taken only if the node there says itself that it has
+``_locate``. Another address than that one is taken only if the node there says itself that it has
 the name that is being registered: else anybody could have any node published.
 
 Ports are for nodes that live. Those that have never answered get a part of the range, by the
@@ -88,6 +88,7 @@ class NodeAdmission:
         uri = with_caller_address(uri, caller.address)
         node = parse_slave_uri(uri)
         endpoint = self._context.registry.admitted(node, caller.address)
+        # One that has never answered where it was believed to be is located anew.
         if endpoint is not None and not endpoint.never_found:
             return await self._admit_again(endpoint, uri, call, caller)
         if node is None:
@@ -111,7 +112,8 @@ class NodeAdmission:
             if name != caller_id:
                 return Refusal(
                     f"rosproxy: {endpoint.uri[:200]} is not the address of {caller_id[:200]}: the "
-                    f"node there says that it is {(name or 'none')[:200]}"
+                    f"node there gives its name as {(name or 'none')[:200]}. Set ROS_IP where "
+                    f"{caller_id[:200]} runs"
                 )
         if location.address == caller.address:
             endpoint.note_uri(uri)
@@ -154,6 +156,8 @@ class NodeAdmission:
                 endpoint = registry.admit(uri, node, location, source)
             except RangeExhausted as error:
                 answers = answers or await self._answers(slave)
+                # One after the other: whoever has waited may find a port that was freed meanwhile,
+                # and then displaces nobody.
                 async with self._making_room:
                     room = registry.pool.free or await self._make_room(answers)
                 if room:
@@ -162,11 +166,13 @@ class NodeAdmission:
             if answers:
                 endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
             leases.open(endpoint)
+            # What the master has of a node leads to this port: such a node keeps it even if another
+            # program has taken it.
             if leases.is_open(endpoint) or endpoint.registrations:
                 return endpoint
             registry.remove(endpoint)
             registry.pool.block(endpoint.port)
-            problems.solved_at(endpoint.port)
+            problems.solved_at(endpoint.port)  # `open` has reported it as this node's
             problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
 
     async def _make_room(self, answers: bool) -> bool:
@@ -174,6 +180,8 @@ class NodeAdmission:
 
         Only one that ``answers`` displaces others. Raises Unreachable.
         """
+        # What is missed least goes first: a fast port, without which topics only take the lease; a
+        # dead node's port; a lease that nobody uses, which its node would get again.
         if self._leases.give_up_spare():
             return True
         if answers and await self._give_up_dead():
@@ -195,7 +203,7 @@ class NodeAdmission:
         if endpoint is None:
             return False
         label, port, fields = endpoint.label, endpoint.port, endpoint.log_fields
-        text = "%s: %s does not answer: port %d is for another"
+        text = "%s: %s does not answer: its port %d goes to another node"
         await self._cleanup.give_up(endpoint)
         if registry.by_port.get(port) is endpoint and endpoint.expendable:
             self._leases.end(endpoint)
@@ -244,7 +252,7 @@ class NodeAdmission:
         if not endpoint.location.confirmed and endpoint.location.address == caller.address:
             endpoint.confirm()
             self._context.problems.solved_at(endpoint.port)
-        if endpoint.trusted:
+        if endpoint.trusted:  # if not, its node has yet to bear out what the master has of it
             self._leases.open(endpoint)
         names = endpoint.caller_ids
         if endpoint.health.down or (names and caller.caller_id not in names):
@@ -275,7 +283,7 @@ class NodeAdmission:
             if bears_out and client_kind is ClientKind.ADMITTED:
                 return NodeLocation(address, named=True, confirmed=False)
             if bears_out:
-                log.info("%s at %s is outside; its URI passes as it is", caller_id, slave)
+                log.info("%s at %s is outside: its URI is not rewritten", caller_id, slave)
                 return None
         text = (
             f"gives its address as {node}, but registers from {source}: no node answers there at "
@@ -292,7 +300,7 @@ class NodeAdmission:
         endpoint.health.note(answer.probe, self._context.now())
         endpoint.health.pid = answer.pid
         uri = self._context.addressing.advertised_uri(endpoint)
-        log.info("%s at %s is %s", caller_id[:200], endpoint.uri[:200], uri[:200])
+        log.info("%s at %s is advertised as %s", caller_id[:200], endpoint.uri[:200], uri[:200])
         if answer.probe is ProbeResult.ANSWERED and not _on_loopback(endpoint):
             return
         text = _unreachable_text(endpoint, answer.reason)
@@ -312,8 +320,8 @@ def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
 def _crowd_text(source: str, slave: HostPort, most: int) -> str:
     return (
         f"rosproxy: {slave} does not answer, nor has any of the {most} nodes that {source} has "
-        "registered before: that many ports of the range are for such. Check ROS_IP where they "
-        "run, and that no firewall or network policy is in between"
+        "registered before: no more ports of the range are kept for nodes that never answered. "
+        "Check ROS_IP where they run, and that no firewall or network policy is in between"
     )
 
 

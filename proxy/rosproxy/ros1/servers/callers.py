@@ -58,6 +58,7 @@ class Callers:
         self._context.selected = frozenset(addresses)
         self._begun.set()
         self._context.problems.solved(SUBJECT)
+        # Whoever waits now is woken; whoever comes to wait later waits for the next news.
         news, self._news = self._news, asyncio.Event()
         news.set()
 
@@ -70,7 +71,7 @@ class Callers:
             async with asyncio.timeout(NEWS_TIMEOUT):
                 await self._begun.wait()
         except TimeoutError:
-            log.info("no operator has told whom it selects: all of the inside networks are let in")
+            log.info("no operator has selected any address yet: the inside networks are let in")
             self._begun.set()
 
     async def wait_until_begun(self) -> None:

@@ -31,16 +31,18 @@ class LongCall:
 
         Raises XmlRpcError if it must not pass, Unreachable if the caller does not send it.
         """
-        for piece in cut(self._head):
+        for piece in cut(self._head):  # others are served between two pieces
             self._watch.see(piece)
             await asyncio.sleep(0)
+        # Always one piece behind: rosmaster and nodes read a body to its end before they look into
+        # it, so without the last piece none of them acts on a call that is refused.
         previous = self._head
         while not self._rest.at_eof():
             try:
                 async with asyncio.timeout(PIECE_TIMEOUT):
                     piece = await self._rest.readany()
             except (OSError, web.RequestPayloadError) as error:  # a time-out is one of the former
-                raise Unreachable(f"the caller did not send all of it: {error}") from error
+                raise Unreachable(f"the caller did not send the whole body: {error}") from error
             self._watch.see(piece)
             yield previous
             previous = piece

@@ -19,11 +19,12 @@ class DocumentReply(web.StreamResponse):
 
     @property
     def keep_alive(self) -> bool:
-        """Whether the connection serves another request."""
+        """Whether the connection serves another request; aiohttp asks once the reply is sent."""
         return self._lasts
 
     async def prepare(self, request: web.BaseRequest) -> None:
         """Send it all, the first time. Raises ConnectionError."""
+        # aiohttp prepares what a handler returns once more (web_protocol.py, finish_response).
         if self._sent:
             return
         self._sent, self._lasts = True, request.keep_alive
@@ -49,7 +50,7 @@ def refuse(request: web.BaseRequest) -> web.StreamResponse:
     if transport is not None:
         reset_on_close(transport.get_extra_info("socket"))
         transport.abort()
-    return web.Response(status=503)
+    return web.Response(status=503)  # aiohttp needs a response; this one is never sent
 
 
 def _head(version: HttpVersion, lasts: bool, size: int) -> bytes:
@@ -57,4 +58,5 @@ def _head(version: HttpVersion, lasts: bool, size: int) -> bytes:
     lines = f"HTTP/{version.major}.{version.minor} 200 OK\r\nContent-Type: text/xml\r\n"
     if lasts != (version >= HttpVersion11):
         lines += f"Connection: {'keep-alive' if lasts else 'close'}\r\n"
+    # roscpp finds the length only with a blank after the colon (XmlRpcClient.cpp, readHeader).
     return f"{lines}Content-Length: {size}\r\n\r\n".encode()

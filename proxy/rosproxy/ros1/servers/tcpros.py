@@ -124,6 +124,8 @@ class TcprosServer:
         if node is None or not await hand_on(header, node):
             self._fail(target, conn, name)
             return
+        # While the node was asked and connected to, the policy may have changed. After a reset the
+        # client comes again, and is then told why it is refused.
         changed = self._context.policy.version != version
         if changed and target.denial_reason(kind, name, peer, caller_id):
             node.close()
@@ -135,7 +137,7 @@ class TcprosServer:
             splice=self._may_splice, inside_asks=not target.inside, client_listens=kind == "topic",
         )  # fmt: skip
         target.note_connection()
-        self._context.gate.enter(peer, target.port)
+        self._context.gate.enter(peer, target.port)  # the acceptor counts it until `serve` ends
         self.relays.start(relay, lambda ended: self._finished(target, ended))
 
     def cut(self, port: int) -> None:
@@ -188,7 +190,7 @@ class InsideNodes:
             task = self._context.tasks.spawn(ask(endpoint, name), f"TCPROS port of {name}")
             self._port_tasks[key] = task
             task.add_done_callback(lambda _: self._port_tasks.pop(key))
-        return await asyncio.shield(task)
+        return await asyncio.shield(task)  # the others wait on if one of the callers goes away
 
     async def _ask_topic_port(self, endpoint: Endpoint, topic: str) -> int | None:
         """The port that the node names for a topic, or NO_PORT; None if it can't be asked."""
@@ -199,7 +201,7 @@ class InsideNodes:
             log.debug("%s does not publish %s: %s", endpoint.label, topic, error)
             port = NO_PORT
         except Unreachable as error:
-            log.debug("%s gives no TCPROS port for %s: %s", endpoint.label, topic, error)
+            log.debug("%s names no TCPROS port for topic %s: %s", endpoint.label, topic, error)
         endpoint.note_topic_port(topic, port or None)
         return port
 
@@ -218,6 +220,7 @@ class InsideNodes:
             if await self._context.nodes.provider(server, service) in endpoint.callers:
                 self._context.registry.note_service_port(endpoint, service, port)
                 return port
+        # A registered service may answer next time: its client is reset, and comes again.
         return None if service in endpoint.names(Kind.SERVICE) else NO_PORT
 
 
@@ -239,6 +242,8 @@ class InsideNode:
     def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why somebody outside may not have a topic or service; None if he may."""
         rule_kind = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
+        # Without the caller_id: publishers take the topic of a header as it stands (rospy's
+        # tcpros_pubsub.py, topic_connection_handler; roscpp's transport_subscriber_link.cpp).
         return self._access.outside_may_not(rule_kind, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
@@ -293,6 +298,8 @@ def _requested(fields: Mapping[str, str]) -> tuple[str, str, str]:
     """Kind and name of what a header asks for, and who asks. Raises HeaderError."""
     if too_long := too_long_to_connect(fields):
         raise HeaderError(too_long)
+    # rospy and roscpp would serve the topic (tcpros_base.py, _tcp_server_callback;
+    # connection_manager.cpp, onConnectionHeaderReceived), and the policy be asked for the service.
     if "service" in fields and "topic" in fields:
         raise HeaderError("connection header for a topic and for a service")
     kind = "service" if "service" in fields else "topic"
@@ -334,6 +341,6 @@ async def hand_on(header: bytes, inside: socket.socket) -> bool:
         inside.close()
         if not isinstance(error, OSError):  # a time-out is one, too
             raise
-        log.debug("handing a header on: %s", error)
+        log.debug("the TCPROS header could not be sent to the node: %s", error)
         return False
     return True

@@ -196,7 +196,7 @@ class XmlRpcServer(web.Server):
         super().connection_made(handler, transport)
         port, source = _address(handler.sockname).port, _address(handler.peername).host
         self._by_port[port].add(handler)
-        self._context.gate.enter(source, port)
+        self._context.gate.enter(source, port)  # the acceptor counts until `dispatch` has ended
         self._mute[handler] = self._context.gate.wait(source, handler.force_close)
         asyncio.get_running_loop().call_later(HEADER_TIMEOUT, self._close_mute, handler)
 
@@ -225,7 +225,7 @@ class XmlRpcServer(web.Server):
             self._busy.discard(request.protocol)
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
-        if request.method in ("GET", "HEAD"):
+        if request.method in ("GET", "HEAD"):  # never forwarded: roscpp's server hangs on a GET
             return web.Response(text=self._greeting)
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})

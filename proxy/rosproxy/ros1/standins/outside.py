@@ -56,6 +56,7 @@ class Outside:
         """Forward a slave API call to a node outside; its answer. Raises Unreachable."""
         path = path if stand_in.is_uri_kept else path_of(stand_in.uri)
         try:
+            # Only to refuse what leads back; the call goes by the host's name, for its Host field.
             await self.reach(stand_in.target)
             return await self._context.upstream.post_to_node(stand_in.target, body, path=path)
         except OSError as error:
@@ -73,7 +74,7 @@ class Outside:
             slave = await self.reach(stand_in.target)
             port = await self._context.nodes.topic_port(slave, topic)
         except (OSError, Unreachable, MasterError) as error:
-            log.debug("%s gives no TCPROS port for %s: %s", stand_in.uri, topic, error)
+            log.debug("%s names no TCPROS port for topic %s: %s", stand_in.uri, topic, error)
             return None
         if port is not None:
             stand_in.note_topic_port(topic, port)
@@ -88,6 +89,7 @@ class Outside:
             return await self._dial(target, CONNECT_TIMEOUT)
         except OSError as error:  # a time-out is one, too
             log.debug("%s: %s", target, error)
+            # Only at the port of its URI: a node that has closed a TCPROS port may live on.
             if isinstance(error, ConnectionRefusedError) and target == stand_in.target:
                 self._note_refused(stand_in)
             return None

@@ -249,10 +249,11 @@ class StandInPorts:
         if len(self._stand_ins.by_local) < stand_ins.MOST_STAND_INS:
             return None
         counts = self._connections()
+        # `by_local` begins with the one that was unused for longest.
         unused = (s for s in self._stand_ins.by_local.values() if not counts[s.local.port])
         stand_in = next(unused, None)
         if stand_in is None:
-            return f"is one too many: {stand_ins.MOST_STAND_INS} stand in for nodes and are in use"
+            return f"is not opened: all {stand_ins.MOST_STAND_INS} stand-in ports are in use"
         self._close(stand_in)
         return None
 
@@ -262,7 +263,7 @@ class StandInPorts:
         if why := stand_ins.obstacle(local.port, self._context.settings):
             return why
         if local in self._stand_ins.by_local:
-            return "stands in for another node"
+            return "already stands in for another node"
         try:
             sock = sockets.listen(local.host, local.port)
         except OSError as error:
@@ -325,7 +326,7 @@ class StandInPorts:
 
     def _note_refused(self, stand_in: StandIn) -> None:
         """Close the port of a node that refuses, since it has ended, until it is found again."""
-        log.debug("%s refuses; so does %s", stand_in.uri, stand_in.local)
+        log.debug("%s refuses connections: its stand-in %s closes", stand_in.uri, stand_in.local)
         self._close(stand_in)
         self._refused[stand_in.uri] = None
         if len(self._refused) > stand_ins.MOST_STAND_INS:

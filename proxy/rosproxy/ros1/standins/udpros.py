@@ -146,6 +146,8 @@ class UdprosRelays:
         condition = _RelayCondition(is_registered, is_allowed)
 
         async def redirect(offered: HostPort) -> HostPort | None:
+            # To the address that asks, whatever host the offer names: nobody has datagrams sent to
+            # another machine inside.
             target, port = HostPort(source, offered.port), stand_in.local.port
             subscription = UdprosSubscription(port, topic, caller_id, source, target, True)
             publisher = self._context.upstream.reach(stand_in.target).host
@@ -184,7 +186,7 @@ class UdprosRelays:
         try:
             return await self._outside.reach(offered)
         except OSError as error:
-            log.debug("no datagrams to %s: %s", offered, error)
+            log.debug("UDPROS: the subscriber at %s can't be reached: %s", offered, error)
             return None
 
     def _relay_port(
@@ -209,11 +211,11 @@ class UdprosRelays:
                     sock, sources, subscription.target, lambda: self._end(subscription)
                 )
             except OSError as error:
-                log.debug("no datagrams for %s at port %d: %s", subscription.topic, port, error)
+                log.debug("UDPROS: no relay of %s at port %d: %s", subscription.topic, port, error)
                 continue
             self._open[subscription] = relay, condition
             log.debug(
-                "datagrams of %s at port %d go to %s",
+                "UDPROS: datagrams of %s that come to port %d go to %s",
                 subscription.topic,
                 relay.port,
                 subscription.target,

@@ -31,7 +31,10 @@ log = logging.getLogger(__name__)
 
 SHUTDOWN_TIMEOUT = 2.0
 """Seconds in which the master must say where a node is that is to be shut down."""
-NO_PORT = "registered around the proxy and can't be adopted: no port of the range is left"
+NO_PORT = (
+    "registered around the proxy and can't be adopted: no port of the range is left; give the "
+    "proxy a larger --port-range"
+)
 
 
 @dataclass(slots=True, eq=False)
@@ -57,7 +60,7 @@ class Adopter:
             if is_inside(address, context.addressing.networks):
                 inside.append((address, names))
             else:
-                problem = "is in none of the inside networks: its nodes are not looked at"
+                problem = "is in none of the inside networks: its nodes are not adopted"
                 context.problems.add(address, problem)
         if not inside:
             return 0
@@ -76,6 +79,7 @@ class Adopter:
 
         The master would else call shutdown at the node's own URI. Raises Unreachable.
         """
+        # It is known here and keeps to the proxy: the master is not asked at each registration.
         if caller_id in endpoint.caller_ids and not endpoint.has_registered_directly:
             return
         uri = await self._look_up(caller_id)
@@ -85,7 +89,7 @@ class Adopter:
             try:
                 async with self._lock:
                     await self._registrar.reclaim({caller_id: (endpoint, uri)})
-            except MasterError as error:
+            except MasterError as error:  # the caller is answered as if the master were away
                 raise Unreachable(str(error)) from error
 
     async def absorb_shutdown(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
@@ -103,11 +107,11 @@ class Adopter:
             async with asyncio.timeout(SHUTDOWN_TIMEOUT):
                 uri = await self._look_up(name)
         except (TimeoutError, Unreachable):
-            return False
+            return False  # it is not known whether it is needless, so it is passed on
         advertised = self._context.addressing.advertised_uri(endpoint)
         if not decisions.has_name_still(endpoint, uri, advertised):
             return False
-        log.info("%s registered around the proxy; not shut down", name)
+        log.info("%s registered around the proxy; the master's shutdown is not passed on", name)
         former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
         self._context.tasks.spawn(self._reclaim(endpoint, former), f"taking over {endpoint.uri}")
         return True
@@ -119,7 +123,7 @@ class Adopter:
                 await self._registrar.reclaim(former)
                 await self._registrar.reconcile(endpoint)
         except (Unreachable, MasterError) as error:
-            log.warning("%s; what is lost is registered later", error)
+            log.warning("%s; missing registrations are made later", error)
 
     async def _inspect(self, slaves: set[HostPort]) -> dict[HostPort, NodeInfo]:
         """What the nodes at slave addresses say of themselves, where one answers."""
@@ -188,6 +192,7 @@ class Adopter:
         await self._leases.cleared(endpoint)
         now, known_pid = self._context.now(), endpoint.health.pid
         endpoint.mark_alive(info.pid, info.topic_ports, now)
+        # The endpoint was that of another process: the prober takes back what that one left.
         if known_pid not in (None, info.pid):
             endpoint.health.suspect()
         self._leases.open(endpoint)

@@ -63,6 +63,7 @@ class ContainerEvents:
         ``moved``: old address to new address. All of it may safely be sent again. Raises
         Unreachable, MasterError, once all has been tried.
         """
+        # In this order: a node that has moved is not at an address any more that is gone as well.
         steps = {
             "moved": partial(self._move, moved),
             "unregistered": partial(self._remove, gone),
@@ -87,7 +88,7 @@ class ContainerEvents:
 
         Raises Unreachable, MasterError.
         """
-        self.context.retired = True
+        self.context.retired = True  # before the wait: nobody registers meanwhile
         async with self._lock:
             await self.recovery.ensure()
             end, registry = self.context.now() + RETIRE_TIMEOUT, self.context.registry

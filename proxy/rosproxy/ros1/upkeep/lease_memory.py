@@ -15,8 +15,8 @@ from rosproxy.ros1.registry import memory
 from rosproxy.ros1.registry.memory import RememberedLease
 
 REFUSED = (
-    "the master does not keep this parameter ({}): nodes have to be restarted after a restart of "
-    "the proxy. Allow its setting, if another proxy with a policy is in between"
+    "the master does not keep this parameter ({}), so that nodes have to be restarted after a "
+    "restart of the proxy. If another proxy with a policy is in between, allow the parameter there"
 )
 
 
@@ -40,7 +40,7 @@ class LeaseMemory:
         """Have the master keep what is known of all leases, unless it does. Raises Unreachable."""
         registry = self._context.registry
         while self._written_changes != registry.lease_changes:
-            async with self._lock:
+            async with self._lock:  # whoever has waited here finds the write done, as a rule
                 changes = registry.lease_changes
                 if self._written_changes != changes:
                     await self._write(memory.leases_text(registry, self._context.settings.ports))
@@ -76,4 +76,4 @@ class LeaseMemory:
         except MasterError as error:
             if text:  # nothing else depends on it; to delete what is not there is refused as well
                 problems.add(self.parameter, REFUSED.format(error))
-        self._stored = text
+        self._stored = text  # if it was refused, `look` finds the difference and tries again

@@ -57,11 +57,12 @@ class PolicyEnforcer:
             try:
                 await self.enforce()
             except (Unreachable, MasterError) as error:
-                log.debug("the policy is enforced later: %s", error)
+                log.debug("the policy could not be enforced yet: %s", error)
 
     async def enforce(self) -> EnforcementCounts:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._lock:
+            # Before anything is awaited: what changes meanwhile is left for the next look.
             version, self._must_enforce = self._context.policy.version, False
             cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
             try:
@@ -100,6 +101,7 @@ class PolicyEnforcer:
     def _take_fast_ports(self) -> int:
         """Take fast ports from nodes of which something may be denied; how many connections."""
         count = 0 if self._access.inside_may_bypass() else self._stand_ins.close_fast_ports()
+        # These are connections of nodes inside, who may have to be told of their publishers again.
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:

@@ -100,8 +100,8 @@ class Prober:
         try:
             async with self._limit:
                 await self._look_after(endpoint, answer)
-        except (Unreachable, MasterError) as error:
-            log.debug("upkeep of %s has to wait: %s", endpoint.label, error)
+        except (Unreachable, MasterError) as error:  # the same is due at the next probe
+            log.debug("probe of %s could not be acted on yet: %s", endpoint.label, error)
         finally:
             self._probing.discard(endpoint)
 
@@ -135,6 +135,7 @@ class Prober:
             await self._registrar.unregister_left_over(endpoint)
         elif due is AfterAnswer.RECONCILE:
             await self._registrar.reconcile(endpoint)
+        # Only now: had a call to the master failed, the next probe would find the same due.
         endpoint.health.pid = pid
         if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label, extra=endpoint.log_fields)

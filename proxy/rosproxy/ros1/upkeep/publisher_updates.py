@@ -88,7 +88,7 @@ class PublisherUpdates:
                 try:
                     await self._hand_out(inside)
                 except Unreachable as error:
-                    log.debug("publishers of %s: %s", topic, error)
+                    log.debug("publishers of %s could not be handed out yet: %s", topic, error)
                     self._changed_topics[topic] = True
                     await asyncio.sleep(RETRY)
         finally:
@@ -111,12 +111,13 @@ class PublisherUpdates:
         await self.update_inside(endpoint, topic, publishers)
 
     async def _update(self, slave: HostPort, topic: str, publishers: Sequence[str]) -> bool:
+        # In the name that rosmaster gives (master_api.py, publisher_update_task).
         body = xmlrpc.dump_call("publisherUpdate", "/master", topic, list(publishers))
         async with self._limit:
             try:
                 timeout = self._context.settings.probe_timeout
                 await self._context.upstream.post_to_node(slave, body, timeout)
             except Unreachable as error:
-                log.debug("publisherUpdate of %s: %s", topic, error)
+                log.debug("publisherUpdate of %s was not answered: %s", topic, error)
                 return False
         return True

@@ -97,7 +97,7 @@ class Recovery:
             if self._recovered.is_set():
                 return
             if self._failures != failures_before:
-                raise Unreachable("the master has not told its state")
+                raise Unreachable("the master's state could not be read")
             try:
                 await self._context.policy.wait_for_operator(self._context.settings.await_policy)
                 await self._recover()
@@ -152,6 +152,7 @@ class Recovery:
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served_ids = {id(claim) for claim, endpoint in restored if endpoint is not None}
         unserved = [claim for claim in claims if id(claim) not in served_ids]
+        # Before calls that register go on: their nodes could get these fast ports as leases.
         self._plane.recovered([e for e in endpoints if self._access.may_bypass(e)])
         if (unserved or forgotten) and self._context.settings.cleanup_after:
             sweep = self._sweep(unserved, forgotten)
@@ -165,7 +166,12 @@ class Recovery:
         """One claim per port: where several are made, the nodes themselves are asked first."""
 
         async def ask(claim: Claim) -> None:
-            log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
+            log.warning(
+                "port %d of %s: another URI at the master claims the port or the node",
+                claim.port,
+                claim.uri,
+            )
+            # Anybody can write to the master: nobody outside is called on its word.
             if is_inside(claim.slave.host, self._context.addressing.networks):
                 claim.node_info = await self._context.nodes.inspect(claim.slave)
 
@@ -176,14 +182,16 @@ class Recovery:
         """The endpoint of a claim, not trusted yet; None if it is outside, or its port is taken."""
         address = claim.slave.host
         if self._context.client_kind(address) is ClientKind.OUTSIDE:
-            text = "port %d: the master has %s for it, which is not in an inside network; refused"
+            text = "port %d: not recovered: the node's address %s is in no inside network"
             log.warning(text, claim.port, address)
             return None
         location = NodeLocation(address, named=claim.node.host == address, confirmed=False)
         registry = self._context.registry
         endpoint = registry.restore(claim.uri, claim.node, location, claim.port)
         if endpoint is None:
-            log.warning("port %d of %s is not free; not recovered", claim.port, claim.uri)
+            log.warning(
+                "port %d: not recovered: it is taken, or %s has another port", claim.port, claim.uri
+            )
             return None
         for registration in claim.registrations:
             registry.register(endpoint, registration)
@@ -213,7 +221,7 @@ class Recovery:
         await asyncio.sleep(self._context.settings.cleanup_after)
         self._context.refresh_networks()
         for uri, registrations in forgotten.items():
-            with contextlib.suppress(Unreachable):
+            with contextlib.suppress(Unreachable):  # the next start finds it again
                 await self._registrar.take_back(uri, registrations)
         for claim in unserved:
             try:
@@ -224,7 +232,7 @@ class Recovery:
                     await self.serve(endpoint)
                     await self._registrar.apply_policy()
             except (Unreachable, MasterError) as error:
-                log.warning("%s stays at the master as it is: %s", claim.advertised, error)
+                log.warning("%s is left registered at the master: %s", claim.advertised, error)
 
     async def _is_borne_out(self, claim: Claim) -> bool | None:
         """Whether the node of a claim is inside and is the one that the master has.
@@ -255,7 +263,7 @@ class Recovery:
             self._note_doubt(endpoint)
             return
         if not borne_out:
-            log.warning("%s: the node there has none of its topics; not served", endpoint.label)
+            log.warning("%s: not served: the node there has none of its topics", endpoint.label)
             await self._registrar.clean_up(endpoint)
             self._leases.end(endpoint)
             return
@@ -272,6 +280,7 @@ class Recovery:
         await self._registrar.disown(
             endpoint, decisions.unconfirmed_registrations(registrations, info)
         )
+        # The master has it by a former version's URI: it is registered by that of this one.
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
             current = list(endpoint.registrations.values())
             await self._registrar.register([(endpoint, r) for r in current])

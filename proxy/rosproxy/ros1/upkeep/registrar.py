@@ -63,7 +63,11 @@ class Registrar:
             elif decisions.is_known_as(endpoint, uri):
                 former[registration.caller_id] = endpoint, uri
             else:
-                log.info("%s is registered as %s by now; left to it", registration.caller_id, uri)
+                log.info(
+                    "%s is another node's name now, at %s; not registered again",
+                    registration.caller_id,
+                    uri,
+                )
                 self._context.registry.drop_caller(endpoint, registration.caller_id)
         await self._register(to_register + await self._free(former))
 
@@ -114,9 +118,9 @@ class Registrar:
         endpoints = {r: e for e in alive for r in e.registrations.values()}
         missing = decisions.lost_registrations(list(endpoints), state, started)
         if missing:
-            log.warning("the master has lost %d registrations; making them again", len(missing))
+            log.warning("the master has lost %d registrations; they are made again", len(missing))
             await self.register([(endpoints[r], r) for r in missing])
-        elif our_state[0] == registry.changes:
+        elif our_state[0] == registry.changes:  # nothing was registered while it was asked
             self._complete_state = digest, *our_state
 
     async def clean_up(self, endpoint: Endpoint) -> None:
@@ -244,6 +248,8 @@ class Registrar:
         try:
             await self._take_back([*shown, *params])
         except Unreachable:
+            # The master may have them still. Shown again, they are hidden by the next try
+            # (`apply_policy`).
             for endpoint, registration in concealed:
                 if endpoint.registrations.get(registration.key) is registration:
                     registry.register(endpoint, replace(registration, hidden=False))
@@ -252,6 +258,7 @@ class Registrar:
             registry.unregister(registration.kind, registration.name, registration.caller_id)
         subscribers = [(e, r) for e, r in registrations if r.kind is Kind.SUBSCRIBER]
         update = self._publisher_updates.update_inside
+        # To the empty list the publishers inside are added (`policing.publishers_for`).
         await asyncio.gather(*(update(e, r.name, []) for e, r in subscribers))
         self._publisher_updates.update_subscribers(
             {r.name for _, r in registrations if r.kind is Kind.PUBLISHER}
@@ -259,6 +266,7 @@ class Registrar:
 
     async def _take_back(self, registrations: Iterable[EndpointRegistration]) -> None:
         addressing = self._context.addressing
+        # rosmaster passes over a URI that it does not have (registrations.py, unregister).
         calls = [
             decisions.unregister_call(r, uri, addressing.advertised_service(e))
             for e, r in registrations
@@ -368,7 +376,7 @@ class Registrar:
         self._context.registry.drop_caller(endpoint, name)
         problem = (
             f"registered as {uri} around the proxy and can't be taken over: it is subscribed to a "
-            "parameter, which the master does not tell of. Restart its container"
+            "parameter, and the master lists no such subscriptions. Restart its container"
         )
         log.warning("%s: %s", name, problem)
         self._context.problems.add(name, problem)

@@ -105,11 +105,14 @@ class Resubscriber:
         try:
             topics = await self._withdraw(endpoints) if endpoints else set()
             if topics:
-                log.info("subscribers of %d topics had no connection; told anew", len(topics))
+                log.info(
+                    "subscribers of %d topics had no connection; sent them publisherUpdate again",
+                    len(topics),
+                )
                 pairs = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
                 await self._registrar.register([pair for pair in pairs if pair[1].name in topics])
-        except (Unreachable, MasterError) as error:
-            log.debug("looking for subscribers without a connection: %s", error)
+        except (Unreachable, MasterError) as error:  # there are further looks (LOOK_DELAYS)
+            log.debug("subscribers without a connection could not be looked for: %s", error)
 
     def _due(self) -> list[Endpoint]:
         """The endpoints that it is time to look at; each is named once per look."""
@@ -138,11 +141,13 @@ class Resubscriber:
         outside_publishers = self._outside_publishers(graph, endpoints)
         for endpoint, _, uris in outside_publishers:
             await self._stand_ins.listen_for(uris, self._context.caller_at(endpoint))
+        # The kernel's connections are read every few seconds: those of now are wanted.
         if self._context.stand_ins.by_port or any(
             s.endpoint.fast_port or s.endpoint.fast_peers for s in unrelayed
         ):
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, unrelayed)
+        # Once more: some have connected while others were asked.
         unrelayed = decisions.without_relay(unrelayed, self._tcpros.topic_connections())
         missed = [
             (s.topic, s.caller_id, self._context.addressing.advertised_uri(s.endpoint))
@@ -254,7 +259,7 @@ class Resubscriber:
         topics = set()
         for (topic, node), answered in zip(missed_uris, await asyncio.gather(*calls), strict=True):
             if answered:
-                log.debug("%s has no connection for %s; it is told anew", node, topic)
+                log.debug("%s has no connection for %s; sent it publisherUpdate", node, topic)
                 topics.add(topic)
         return topics
 

@@ -72,6 +72,7 @@ def note_endpoints(
             announcement.parameters.text(datagram, Pid.TYPE_NAME) or "",
         )
         qos = read_qos(datagram, announcement.parameters, kind is EndpointKind.WRITER)
+        # For the status alone, which needs no more: a topic of ROS 2 has 255 bytes at most.
         endpoint = DdsEndpoint(kind, topic[:256], type_name[:256], qos)
         notes.note(participant, entity, None if announcement.ended else endpoint)
 
@@ -100,6 +101,7 @@ def _locator_fault(spdp: Announcement, datagram: bytes, address: str) -> Locator
             return LocatorFault.LOOPBACK if all_loopback else LocatorFault.ELSEWHERE
         if any(loc.kind in (LocatorKind.TCP_V4, LocatorKind.TCP_V6) for loc in locators if loc):
             return LocatorFault.TCP
+        # There need be no default locators: a reader may have its own (DDSI-RTPS 2.5, 8.5.3.2).
         if locators or pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
             return LocatorFault.MISSING
     return LocatorFault.NO

@@ -89,7 +89,7 @@ class DataLeases:
             port: ForwardedLease(port, target, "a participant of before the start")
             for port, target in forwards.items()
         }
-        self._cached_changes = -1
+        self._cached_changes = -1  # none: all is looked at anew
 
     def _leases(self) -> Iterator[ForwardedLease]:
         """The leases that are lent, each the same object for as long as it leads to the same."""
@@ -99,6 +99,7 @@ class DataLeases:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
                 cached = self._cached.get(port)
+                # The kernel plane takes another object for another lease (`ForwardSyncer`).
                 if cached is not None and (cached.target, cached.label) == (lease.target, label):
                     yield cached
                 else:

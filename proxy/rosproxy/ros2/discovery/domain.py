@@ -16,7 +16,7 @@ Every datagram may be forged. So
   lease: no announcement makes the proxy a way to another host;
 - the prefix of a participant that is there can't be taken at another address or on the other side;
 - a participant outside is one whose address is a peer's, or that the ear has heard from there, and
-  only its locators at the address that it sent from are used;
+  the proxy itself sends to its locators at that very address alone;
 - until one outside has shown that it gets what it is sent (it names the prefix that it answers), it
   is sent no more bytes than came from it: nobody can make the proxy flood somebody else;
 - each source may make only so much discovery in a second, what it leads to included.
@@ -88,11 +88,8 @@ class Domain:
     def starting(
         cls, settings: DomainSettings, pool: PortPool, own: bytes, now: float, when: float = 0.0
     ) -> "Domain":
-        """A domain without participants; its discovery port is taken off the pool.
-
-        ``own`` is a random prefix, ``when`` Unix time.
-        """
-        pool.claim(settings.discovery_port)
+        """A domain without participants; ``own`` is a random prefix, ``when`` Unix time."""
+        pool.claim(settings.discovery_port)  # where outside announces itself: nobody gets it
         ports, refused = LocatorPorts(pool, now), Refused(settings.note)
         keeper = Keeper.of(settings.host, settings.ports.listen, settings.number, when)
         inside = InsideParticipants(settings, ports, refused)
@@ -132,6 +129,7 @@ class Domain:
         heard_by_ear = self.settings.ear is not None and source == self.settings.ear.host
         sent = list[Outgoing]()
         try:
+            # Participants on the ear's host have its address, too; what they send has no envelope.
             if is_wrapped := heard_by_ear and not datagram.startswith(MAGIC):
                 source, datagram = unwrapped(datagram)
                 self.partings.ear_heard = True
@@ -152,7 +150,7 @@ class Domain:
         """What outside sends to a port of the range."""
         leased = self.inside.leases.get(port)
         try:
-            if leased is None:
+            if leased is None:  # outside may mean a participant of before the start
                 if self.ports.may_have_returning(now) and not self._is_too_much(
                     datagram, source, now
                 ):
@@ -244,19 +242,19 @@ class Domain:
     ) -> list[Outgoing]:
         prefix, spdp = message.prefix, message.of_participant
         if prefix in self.inside.by_prefix or prefix == self.own.observer.prefix:
-            return []
+            return []  # the ear hears what it has sent to the LAN itself
         if spdp is None:
             return self.own.told_outside(message, source)
         if not heard_by_ear and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
-            return self._drop("not_a_peer", source, "an announcement from no peer's address")
+            return self._drop("not_a_peer", source, "an announcement; the address is no peer's")
         outsider = self.outside.meet(message, source, now)
         if outsider is None:
             return []
         outsider.credit += len(message.datagram)
         sent = self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
-        if spdp.ended:
+        if spdp.ended:  # those inside are told of that, too
             self._forget_outside(outsider)
         return sent
 
@@ -272,6 +270,7 @@ class Domain:
         lease_count = len(insider.leases)
         exported = self.inside.exported(insider, message, now, self.returning.former_ports(prefix))
         sent = self.inside.introduced(insider, message)
+        # It knew the proxy elsewhere: it forgets the keeper there, and meets all outside anew.
         if is_new and prefix in self.returning.former:
             sent += self.own.keeper_farewell(insider)
             insider.parting_from = now
@@ -350,7 +349,7 @@ class Domain:
         outsider = self.outside.find(prefix, source)
         if spdp is not None:
             if outsider is None and not self.settings.is_peer(source):
-                text = "a participant that is neither a peer's nor was heard"
+                text = "a participant that was not heard before, at an address that is no peer's"
                 self._drop("not_a_peer", source, text)
                 return [], []
             outsider = self.outside.meet(message, source, now)
@@ -368,7 +367,7 @@ class Domain:
         self, target: OutsideParticipant, lease: Lease, datagram: bytes
     ) -> list[Outgoing]:
         if not target.may_be_sent(len(datagram)):
-            text = f"{target.guid_prefix} at {target.address} has not shown that it gets anything"
+            text = f"{target.guid_prefix} has not shown yet that it receives what is sent to it"
             return self._drop("unproven", target.address, text)
         return [self._passed(lease, datagram, False)]
 
@@ -382,7 +381,7 @@ class Domain:
         """Whether a source makes more discovery than it may; what is not is charged to it."""
         if self.rates.take(source, len(datagram), now):
             return False
-        self.refused("rate", source, "more discovery than one source may make")
+        self.refused("rate", source, "more discovery than one source may send in a second")
         return True
 
     def _drop(self, reason: str, source: str, text: str) -> list[Outgoing]:

@@ -109,9 +109,11 @@ class FragmentStores:
         store = self.by_prefix.setdefault(message.prefix, FragmentStore())
         before = store.size
         try:
+            # Before the message is taken in: then all its fragments would be known ones.
             missing = store.missing(port, message)
             released = store.rewritten(port, message, rewrite)
         finally:
+            # Also of a malformed message some fragments may have been kept.
             self.size += store.size - before
             while self.size > MOST_OF_ALL:
                 self.forget(max(self.by_prefix, key=lambda prefix: self.by_prefix[prefix].size))
@@ -168,10 +170,11 @@ class FragmentStore:
         """As `FragmentStores.rewritten`, for a message with fragments."""
         if len(message.fragments) > MOST_FRAGMENTS:
             raise RtpsError(f"more than {MOST_FRAGMENTS} fragments in a datagram")
+        # Whole announcements beside the fragments are rewritten now, fragments in `_filled`.
         arrived = _WaitingDatagram(port, message.fragments, rewrite(message))
         completed = [self._gather(port, message, *pair, rewrite) for pair in message.fragments]
         if not any(completed):
-            if self._is_whole(arrived):
+            if self._is_whole(arrived):  # fragments of what was whole before, sent again
                 return [self._filled(arrived)]
             self._hold(arrived)
             return []
@@ -209,6 +212,7 @@ class FragmentStore:
             return False
         payload = b"".join(gathered.fragments[number] for number in sorted(gathered.fragments))
         edited = rewrite(read_discovery(_as_data(message.datagram, sample, payload)))
+        # What is hidden has become a GAP (`withheld`).
         hidden = edited[HEADER] == SubmessageId.GAP
         gathered.whole = b"" if hidden else edited[_PAYLOAD_AT:]
         gathered.fragments.clear()

@@ -70,7 +70,10 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
                 self.count_by_address[source] >= MOST_PER_ADDRESS
                 or len(self.by_prefix) >= MOST_INSIDE
             ):
-                text = f"more than {MOST_PER_ADDRESS} participants there, or {MOST_INSIDE} in all"
+                text = (
+                    f"more than {MOST_PER_ADDRESS} participants at one address, "
+                    f"or {MOST_INSIDE} inside"
+                )
                 self.refused("participants", source, text)
                 return None
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
@@ -111,6 +114,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         """Note what one inside tells the proxy itself: what it has, and where. RtpsError."""
         note_endpoints(self.notes, participant, message.datagram, message.announcements)
         lead = partial(self._lead_out, participant, now, kept)
+        # The observer alone gets this: it is rewritten to lend the ports. Nothing is hidden,
+        # since the observer would ask for that again and again.
         return rewritten(message, lead, lambda _: False)
 
     def note_in_group(self, datagram: bytes, source: str) -> None:
@@ -160,6 +165,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         kind = LeaseKind.METATRAFFIC if is_metatraffic else LeaseKind.DATA
         lease = participant.leases.get(locator)
         if lease is None:
+            # Ports are kept in the order in which they were lent (`ports` of a participant).
             index = len(participant.leases)
             former_port = kept[index] if index < len(kept) else None
             lease = self._lend(participant, locator, kind, former_port, now)

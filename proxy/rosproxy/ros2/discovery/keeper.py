@@ -54,6 +54,7 @@ class Keeper:
         """
         identity = f"{host} {ports.first} {_width(ports)} {domain}"
         digest = blake2b(identity.encode(), digest_size=PREFIX - 2).digest()
+        # A GUID prefix begins with the vendor's id (DDSI 2.2; so in Cyclone DDS, ddsi_init.c).
         return cls(NO_VENDOR + digest, ports, _first_count=int(started * COUNTS_EACH_SECOND))
 
     def questions(self, prefix: bytes, reached_at: HostPort) -> list[bytes]:
@@ -93,6 +94,7 @@ class Keeper:
         number, width = 0, _width(self.ports)
         for index, port in enumerate(ports):
             if (index + 1) * width <= _BITS:
+                # The first port is 1: zero means that no port follows (`_ports`).
                 number |= (port - self.ports.first + 1) << index * width
         return number + 1
 
@@ -108,6 +110,7 @@ class Keeper:
 
     def _heartbeat(self, prefix: bytes, first: int) -> bytes:
         count = self._counts[prefix] = self._counts.get(prefix, self._first_count) + 1
+        # A count is a signed number of 32 bits.
         return heartbeat(self.prefix, prefix, BuiltinWriter.PUBLICATIONS, first, count & 0x7FFFFFFF)
 
 

@@ -72,6 +72,7 @@ class Observer:
         received = self._received[prefix, heartbeat.writer]
         first = max(heartbeat.first, 1)
         base = next((n for n in range(first, heartbeat.last + 1) if n not in received), None)
+        # Confirm all: it has them, or can't remember more and would ask for them without end.
         if base is None or len(received) >= MOST_SAMPLES:
             return self._ask(prefix, heartbeat.writer, max(heartbeat.last, 0) + 1, ())
         last = min(heartbeat.last, base + MOST_ASKED - 1)

@@ -68,17 +68,20 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         participant = self.find(prefix, source)
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
             if participant is not None:
+                # Its end: `introduced` tells inside of it as of any announcement.
                 participant.announcement = for_all(datagram)
             return participant
         metatraffic = first_metatraffic(spdp, datagram, source)
         if metatraffic is None:
             fault = traits(spdp, datagram, source).locator_fault
-            text = f"it names no locator of metatraffic at {source} ({fault})"
+            text = f"it announces no locator for discovery at {source} ({fault})"
             self.refused("no_locator", source, text)
             return None
         participant = participant or self._add(prefix, datagram, source, now)
         if participant is not None:
             participant.until = now + lease_duration(spdp, datagram)
+            # Cyclone DDS answers the observer with an announcement that is for the observer alone
+            # (ddsi_discovery_spdp.c, respond_to_spdp).
             participant.metatraffic, participant.announcement = metatraffic, for_all(datagram)
             participant.traits = traits(spdp, datagram, source)
         return participant
@@ -93,6 +96,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def observed(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> bytes:
         """Note what one outside tells the proxy itself: what it has, and where. RtpsError."""
         note_endpoints(self.notes, outsider, message.datagram, message.announcements)
+        # The observer alone gets this: it is rewritten to open the stand-ins. Nothing is hidden,
+        # since the observer would ask for that again and again.
         return rewritten(message, self._leading_in(outsider, outsider.address), lambda _: False)
 
     def introduced(
@@ -130,7 +135,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Whether nobody is known at an address, so that nothing from there is read."""
         if source in self.count_by_address or self.settings.is_peer(source):
             return False
-        self.refused("not_a_peer", source, "it is no peer's address, and nobody was heard there")
+        self.refused("not_a_peer", source, "the address is no peer's, and nobody was heard there")
         return True
 
     def may_announce(self, message: DiscoveryMessage, source: str, observer: bytes) -> bool:
@@ -169,10 +174,13 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         self, prefix: bytes, datagram: bytes, source: str, now: float
     ) -> OutsideParticipant | None:
         if self.count_by_address[source] >= MOST_PER_HOST or len(self.by_prefix) >= MOST_OUTSIDE:
-            text = f"more than {MOST_PER_HOST} participants there, or {MOST_OUTSIDE} outside in all"
+            text = (
+                f"more than {MOST_PER_HOST} participants at one address, or {MOST_OUTSIDE} outside"
+            )
             self.refused("participants", source, text)
             return None
         outsider = OutsideParticipant(prefix, source, source_vendor(datagram), now)
+        # The user himself has named a peer: it may be sent anything.
         outsider.proven = self.settings.is_peer(source)
         self.add(outsider)
         return outsider
@@ -198,10 +206,12 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     ) -> HostPort | None:
         """Where inside reaches a locator of a participant outside; None if it does not."""
         if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
+            # Whichever locator it is, discovery goes to the one at the address that it sends from.
             lease = outsider.metatraffic and self._lease(
                 outsider, outsider.metatraffic, LeaseKind.METATRAFFIC
             )
         elif not self.settings.both_ways:
+            # These addresses mean the reader's own machine or link, unless all is on one machine.
             is_same_host = is_loopback(near) and is_loopback(outsider.address)
             is_local = is_loopback(locator.host) or is_of_link(locator.host)
             return locator if is_same_host or not is_local else None
@@ -225,7 +235,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
                 self.stand_ins.setdefault(port, []).append((outsider, lease))
                 self.changes += 1
         if lease is None:
-            text = f"no port can stand in for {locator} of {outsider.guid_prefix}"
+            text = f"no stand-in port is left for locator {locator} of {outsider.guid_prefix}"
             self.refused("stand_ins", outsider.address, text)
         elif kind is LeaseKind.METATRAFFIC:
             lease.kind = kind

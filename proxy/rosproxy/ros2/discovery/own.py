@@ -61,6 +61,7 @@ class OwnParticipants:
         """Take in what a participant inside tells the keeper, or the observer. Raises RtpsError."""
         prefix = message.prefix
         insider = self.inside.find(prefix, source)
+        # One that waits to be let in is in no table yet, and its answer is what it waits for.
         is_waiting = self.returning.is_waiting(prefix, source)
         if (is_waiting or insider) and self.keeper.take(prefix, message.datagram):
             return []

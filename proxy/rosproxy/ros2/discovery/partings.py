@@ -43,7 +43,7 @@ class Partings:
         insider.parting_from, insider.apart_until, insider.farewell_times = (
             None,
             now + APART_TIME,
-            {},
+            {},  # it was not told to forget anybody yet
         )
         datagram = farewell(insider.prefix, insider.vendor, next_number(insider.announcement))
         outsiders = self.outside.by_prefix.values()

@@ -26,6 +26,7 @@ def is_hidden(
 
     ``inside`` is the participant that makes it, if it ``is_own``, else the one that is to get it.
     """
+    # An end names the key of a reader or writer, and no topic to judge it by.
     if announcement.kind is None or announcement.ended:
         return False
     rule = rule_about(announcement.kind, announcement.topic(datagram), is_own)
@@ -33,6 +34,7 @@ def is_hidden(
         return False
     if rule not in inside.verdicts and len(inside.verdicts) < MOST_VERDICTS:
         inside.verdicts[rule] = judge(*rule, inside.address)
+    # Those that are not remembered are judged each time.
     verdict = inside.verdicts.get(rule)
     return not (judge(*rule, inside.address) if verdict is None else verdict)
 

@@ -52,7 +52,7 @@ class ReturningParticipants:
         if message.prefix in self.waiting:
             return []
         if len(self.waiting) >= MOST_INSIDE or self._counts[source] >= MOST_PER_ADDRESS:
-            return []
+            return []  # it announces itself again, when there may be room
         self.waiting[message.prefix] = source, message, now
         self._counts[source] += 1
         return self._questions(message, source)

@@ -35,6 +35,8 @@ def announcement(
             (Pid.PROTOCOL_VERSION, VERSION + bytes(2)),
             (Pid.VENDOR_ID, NO_VENDOR + bytes(2)),
             (Pid.PARTICIPANT_GUID, prefix + _PARTICIPANT),
+            # Without a default locator as well, Cyclone DDS does not take the participant
+            # (ddsi_discovery_spdp.c, get_locators).
             *((Pid.METATRAFFIC_UNICAST_LOCATOR, locator) for locator in locators),
             *((Pid.DEFAULT_UNICAST_LOCATOR, locator) for locator in locators),
             (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
@@ -50,6 +52,7 @@ def farewell(prefix: bytes, vendor: bytes = NO_VENDOR, sequence: int = 2) -> byt
     Fast DDS takes no sample older than the last of the same writer (StatelessReader.cpp).
     """
     guid = prefix + _PARTICIPANT
+    # Disposed and unregistered (9.6.3.9).
     status = _parameters([(Pid.KEY_HASH, guid), (Pid.STATUS_INFO, bytes([0, 0, 0, 3]))])
     flags = 0x0B  # little-endian, inline QoS, a key
     return _message(prefix, flags, status, [(Pid.PARTICIPANT_GUID, guid)], vendor, sequence)
@@ -65,7 +68,7 @@ def _message(
 ) -> bytes:
     body = struct.pack("<HH", 0, 16) + struct.pack(">II", _SPDP_READER, _SPDP_WRITER)
     body += struct.pack("<iI", sequence >> 32, sequence & 0xFFFFFFFF) + inline_qos
-    body += bytes([0, 3, 0, 0]) + _parameters(parameters)
+    body += bytes([0, 3, 0, 0]) + _parameters(parameters)  # PL_CDR_LE
     data = struct.pack("<BBH", SubmessageId.DATA, flags, len(body)) + body
     return message_header(prefix, vendor) + data
 

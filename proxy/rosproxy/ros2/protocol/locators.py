@@ -72,4 +72,5 @@ def pack_locator(host_port: HostPort, order: str) -> bytes:
 def _packed(host: str) -> tuple[LocatorKind, bytes]:
     if ":" in host:
         return LocatorKind.UDP_V6, IPv6Address(host).packed
+    # Cyclone DDS rejects a locator whose first 12 bytes are not zero (ddsi_plist.c, do_locator).
     return LocatorKind.UDP_V4, bytes(12) + IPv4Address(host).packed

@@ -74,7 +74,7 @@ def read_qos(datagram: bytes, parameters: ParameterList, is_writer: bool) -> End
 
     def seconds(pid: Pid, leading: str = "") -> float:
         numbers = _unpacked(datagram, parameters, by_pid.get(pid), f"{leading}iI")
-        if not numbers or numbers[-2] == 0x7FFFFFFF:
+        if not numbers or numbers[-2] == 0x7FFFFFFF:  # DURATION_INFINITE
             return float("inf")
         return numbers[-2] + numbers[-1] / 2**32
 

@@ -92,6 +92,7 @@ def acknack(
     It has all before ``base``. ``missing`` are at most MOST_ASKED from there on. Unless it is
     ``final`` the writer answers with a heartbeat.
     """
+    # Cyclone DDS ignores one without a reader (ddsi_receive.c, validate_AckNack).
     body = struct.pack(">II", writer + _TO_READER, writer)
     body += struct.pack("<iI", base >> 32, base & 0xFFFFFFFF)
     body += _bits([number - base for number in missing]) + struct.pack("<i", count)
@@ -122,6 +123,7 @@ def withheld(sample: Sample) -> Overwrite:
     size, next_sequence = sample.body.end - sample.body.start, sample.sequence + 1
     if size < _GAP_SIZE + 4:
         raise RtpsError(f"a sample of discovery in {size} bytes")
+    # It may be 0: the length 0 of a PAD means none, not up to the end (9.4.5.1.3).
     pad = size - _GAP_SIZE - 4
     gap = struct.pack(order + "BBH", SubmessageId.GAP, flag, _GAP_SIZE)
     gap += struct.pack(">II", sample.reader, sample.writer)

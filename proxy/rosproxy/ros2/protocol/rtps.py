@@ -167,6 +167,7 @@ def destination(datagram: bytes) -> bytes | None:
 def for_all(datagram: bytes) -> bytes:
     """The message without its destinations, so that everybody takes it. Raises RtpsError."""
     destinations = [body for kind, _, body in submessages(datagram) if kind == _INFO_DST]
+    # GUIDPREFIX_UNKNOWN, which is all zero, means everybody.
     return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in destinations])
 
 
@@ -295,9 +296,11 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
         *_, (_, _, end) = walk_parameters(datagram, Span(offset, body.end), little)
         qos, offset = Span(offset, end), end
     key = bool(flags & (_FRAGMENT_KEY if is_fragment else _KEY))
+    # DATA_FRAG has no flag for it: it always carries some (9.4.5.4).
     has_payload = is_fragment or bool(flags & (_DATA | _KEY))
     return Sample(
         prefix=prefix,
+        # Entity ids are octets: their order does not depend on the flag.
         reader=int.from_bytes(datagram[start + 4 : start + 8], "big"),
         writer=int.from_bytes(datagram[start + 8 : start + 12], "big"),
         sequence=sequence,

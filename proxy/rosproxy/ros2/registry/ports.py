@@ -81,9 +81,11 @@ class LocatorPorts:
             self._former_users.clear()
             self._forwarded.clear()
         if not self.pool.free:
-            return None
+            return None  # sorting takes long, and one datagram may name a thousand locators
         user = prefix, kind
 
+        # 0: its own, as outside or the kernel tells; 1: its own, as it says itself (anybody may);
+        # 2: nobody's; 3: that of another, who may still come back.
         def rank(port: int) -> int:
             if (former_locator := self._forwarded.get(port)) is not None:
                 return 0 if former_locator == locator and kind is LeaseKind.DATA else 3

@@ -175,7 +175,8 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
         raise RtpsError("an announcement that is no parameter list")
     parameters = parameters or ParameterList(sample.little, ())
     topics = parameters.all(Pid.TOPIC_NAME)
-    if len(topics) > 1:  # who reads which of them?
+    # The policy is asked of the first alone, and a receiver may take another one.
+    if len(topics) > 1:
         raise RtpsError("an announcement that names more than one topic")
     if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC:
         raise RtpsError(f"a topic with a name of more than {LONGEST_TOPIC} bytes")
@@ -186,6 +187,7 @@ def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:
     """Whether the status in the inline QoS says that what a sample is about has ended (9.6.3.9)."""
     for param in inline_qos.all(Pid.STATUS_INFO) if inline_qos else ():
         if param.value.end - param.value.start >= 4:
+            # Four octets, of which the last has the flags, in either byte order.
             status = int.from_bytes(datagram[param.value.start : param.value.start + 4], "big")
             return bool(status & _DISPOSED_OR_UNREGISTERED)
     return False

@@ -61,6 +61,8 @@ class DomainServer:
         self._bind, self._now, self._is_inside = bind, now, is_inside
         self._changed, self._told_changes = changed, 0
         pool = PortPool(settings.ports.listen)
+        # A new prefix for each process: only to an observer that they don't know yet participants
+        # announce themselves at once, and send what they had told the former one.
         self.domain = Domain.starting(settings, pool, os.urandom(PREFIX), now(), time.time())
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
@@ -87,7 +89,7 @@ class DomainServer:
             try:
                 sock = datagrams.bind(self._bind, port)
             except OSError as error:
-                log.debug("port %d: %s", port, error)
+                log.debug("port %d of the range can't be bound: %s", port, error)
                 self.domain.ports.pool.block(port)
                 taken_ports.append(port)
                 continue
@@ -162,6 +164,7 @@ class DomainServer:
 
     def close(self) -> None:
         """Close all sockets."""
+        # The observer's alone: participants are not to forget the keeper, by which they keep ports.
         farewell = self.domain.own.observer.farewell()
         for address in self._groups.joined:
             self._multicast(address, farewell)
@@ -187,6 +190,8 @@ class DomainServer:
         for address in addresses:
             announcement = self.domain.own.announced_inside(settings.proxy_address_for(address))
             count = counts.get(address, 0)
+            # Participants of a machine take these ports one after the other (9.6.2.3): those that
+            # have not been heard yet are at the next ones.
             targets = settings.well_known(address, count + 2 if count else PARTICIPANTS_TRIED)
             self._send(Outgoing(target, announcement) for target in targets)
 
@@ -196,9 +201,10 @@ class DomainServer:
     def _multicast(self, near: str, datagram: bytes) -> None:
         """Send to the group on the network where the proxy has an address, if it still has it."""
         try:
+            # The interface is a setting of the socket, and one socket sends to all networks.
             send_through(self._out[family_of(near)], near, loop=False)
         except OSError as error:
-            log.debug("the network of %s has gone: %s", near, error)
+            log.debug("can't send multicast from %s, its network may have gone: %s", near, error)
             return
         port = self.domain.settings.multicast_port
         self._send(Outgoing(HostPort(group, port), datagram) for group in groups_of(near))
@@ -231,6 +237,7 @@ class DomainServer:
 
     def _heard_in_group(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         sent = self.domain.heard_inside(datagram, source, now)
+        # Only now: a participant that is new was not in the table before.
         self.domain.inside.note_in_group(datagram, source)
         return sent
 
@@ -261,6 +268,7 @@ class DomainServer:
                     continue
                 byte_count += len(datagram)
                 outgoing = take(datagram, plain_address(sender[0]), self._now())
+                # What is sent names ports: these have to be open before.
                 self._sync_stand_ins()
                 self._tell_changes()
                 self._send(outgoing)
@@ -273,7 +281,7 @@ class DomainServer:
                 )
             except OSError as error:
                 self.lost += 1
-                log.debug("a datagram to %s: %s", out.target, error)
+                log.debug("can't send a datagram to %s: %s", out.target, error)
 
     def _tell_changes(self) -> None:
         """Tell that leases have changed, if they have."""
@@ -294,7 +302,7 @@ class DomainServer:
             try:
                 sock = datagrams.bind(self._bind, port)
             except OSError as error:
-                log.debug("port %d can't stand in for somebody outside: %s", port, error)
+                log.debug("port %d can't be opened as a stand-in: %s", port, error)
                 outside.block(port, error.errno == errno.EADDRINUSE)
                 continue
             self._stand_ins[port] = sock

@@ -69,7 +69,7 @@ class Ear:
         send_through(self._lan, settings.lan, loop=True)  # for participants on this very host, too
         self._groups.open([family_of(settings.lan)])
         if not self._groups.join([settings.lan]):
-            text = f"the group can't be heard where this host has {settings.lan}"
+            text = f"can't join the multicast group on the network of the address {settings.lan}"
             raise OSError(errno.EADDRNOTAVAIL, text)
         self._loop.add_reader(self._own, self._tell)
 
@@ -92,8 +92,10 @@ class Ear:
             for _ in range(DATAGRAMS_PER_TURN):
                 datagram, sender = lan.recvfrom(LARGEST_DATAGRAM)
                 source = plain_address(sender[0])
+                # What `_tell` has sent comes back here, by loop: the proxy leaves that out.
                 for announcement in self._announcements(datagram, source):
                     self.from_lan += 1
+                    # By the address of this socket the proxy knows that it is the ear.
                     self._send(self._own, wrapped(source, announcement), self._settings.proxy)
 
     def _tell(self) -> None:
@@ -105,6 +107,7 @@ class Ear:
                 except ConnectionRefusedError:  # the proxy is away
                     continue
                 source = plain_address(sender[0])
+                # Nobody else is to have participants of his own announced to the LAN.
                 if source != self._settings.proxy.host:
                     self.dropped += 1
                     continue
@@ -130,4 +133,4 @@ class Ear:
         try:
             sock.sendto(data, (target.host, target.port))
         except OSError as error:
-            log.debug("an announcement to %s: %s", target, error)
+            log.debug("can't send an announcement to %s: %s", target, error)

@@ -80,6 +80,7 @@ class GroupEars:
             for sock in self._shared[family] + link_sockets:
                 join(sock, address)
         except OSError:
+            # Networks come and go: as it is not in `joined`, the next call tries it again.
             for sock in link_sockets:
                 self._end(sock)
             return False
@@ -101,6 +102,7 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
     try:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # A group of link scope is another one on each link: the scope id tells which (ipv6(7)).
         link = (0, interface_index(link_of)) if link_of else ()
         sock.bind((group.host, group.port, *link))
     except OSError:

@@ -97,7 +97,7 @@ def test_a_master_that_is_not_allowed() -> None:
         assert (problem.subject, problem.fatal) == ("container talker", True)
         source = "its variable ROS_MASTER_URI" if env else "label rosproxy.master-uri"
         assert problem.text == (
-            f"{source}='http://api.example.com:8080' is none of the operator's --allow-master "
+            f"{source}='http://api.example.com:8080' matches none of the operator's --allow-master "
             "(robot:*, arm*:11311): if it is one, start the operator with --allow-master "
             "api.example.com:8080"
         )

@@ -164,7 +164,7 @@ async def test_an_inspection_that_cannot_be_read_harms_no_other_container(
         assert [container.name for container in look.state.containers] == ["talker"]
         assert not look.state.busy
     (told,) = caplog.messages
-    assert told.startswith(f"what the engine tells of {'c' * 12} can't be read: ")
+    assert told.startswith(f"container {'c' * 12}: its inspection can't be read: ")
     engine.knows[f"/containers/{'c' * 64}/json"] = captured.inspected()
     assert len((await looking.look(5.0)).state.containers) == 2
 

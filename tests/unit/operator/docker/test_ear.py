@@ -264,7 +264,7 @@ def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
     making["HostConfig"][field] = value
     own = OwnLabels("ear", KEY, RANGE, "")
     found = forgery_reason(own, MADE.name, read_making(making), IMAGE)
-    assert found == f"its HostConfig.{field} is none that it gives"
+    assert found == f"its HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(

@@ -184,5 +184,5 @@ async def test_anything_else_is_an_error(engine: FakeEngine, action: Action) -> 
 async def test_a_name_that_a_stranger_has(engine: FakeEngine, found: dict[str, Any]) -> None:
     engine.refuses["POST /containers/create"] = (409, "in use")
     engine.knows[f"/containers/{BOX.name}/json"] = found
-    with pytest.raises(EngineError, match=f"not this operator's is called {BOX.name}; rename it"):
+    with pytest.raises(EngineError, match=f"{BOX.name} that this operator did not make; rename it"):
         await carry_out(ACTIONS[1])

@@ -225,8 +225,8 @@ def test_no_master() -> None:
 
 
 ASTRAY = {
-    "http://rosproxy:11312": "the proxy stands at its master's port 11311: set ROS_MASTER_URI=",
-    "http://robot:11312": "the proxy stands at its master's port 11311: set ROS_MASTER_URI=",
+    "http://rosproxy:11312": "has another port than its proxy, 11311: set ROS_MASTER_URI=",
+    "http://robot:11312": "has another port than its proxy, 11311: set ROS_MASTER_URI=",
     "http://other:11311": "is not its master http://robot:11311, so its nodes go elsewhere: set ",
     "http://localhost:11311": "is the container itself: set ROS_MASTER_URI=",
     "http://rosproxy-arm-0a1b2c:11311": "names another master's proxy, its own is rosproxy-robot-",

@@ -278,7 +278,7 @@ def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
     own = read_own(own_labels(MADE))
     assert own is not None
     found = forgery_reason(own, MADE.name, read_making(making), IMAGE)
-    assert found == f"its HostConfig.{field} is none that it gives"
+    assert found == f"its HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,7 @@ def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
 )
 def test_participants_that_keep_to_themselves_are_told(variables: Mapping[str, str]) -> None:
     (text,) = read(one(TWO, variables))[1]
-    assert text.endswith("keeps its participants to themselves: take it off")
+    assert text.endswith("keeps its participants from being found: unset it")
 
 
 def test_on_an_internal_network_it_reaches_outside_through_the_proxy() -> None:

@@ -408,7 +408,7 @@ class Controller:
             }  # fmt: skip
             there = kinds.get(type(action), state.policies).get(name)
             if str(error) == "AlreadyExists" and there is not None:
-                text = "a Pod of this name that is not the operator's is there"
+                text = "there is already a Pod of this name that is not the operator's"
                 return {} if is_own(there) else {name: text}
             return {name: str(error)}
         return {}

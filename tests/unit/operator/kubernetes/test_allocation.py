@@ -117,7 +117,7 @@ def test_when_there_are_none_it_is_told_who_holds_them_and_what_to_do() -> None:
     assert text == (
         "node one: no 4 free ports in a row between 11400 and 11406: 6 of 7 are free, "
         "3 at most in a row; others are held by ros/web: enlarge spec.portWindow (11400-11406), "
-        "lower spec.ports (4), or let one of those pods go"
+        "lower spec.ports (4), or delete one of those pods"
     )
     assert "ports" not in status(found)["perNode"][0]
 

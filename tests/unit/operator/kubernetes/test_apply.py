@@ -133,7 +133,7 @@ async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carrie
     await carry.out(create_pod())
     ((id, text),) = carry.applier.failures[OF].items()
     assert id == Name(NAMESPACE, "proxy")
-    assert "not the operator's is there: rename it" in text
+    assert "that is not the operator's: rename it" in text
     assert (carry.applier.busy, carry.applier.failed) == (0, 1)
     assert server.get("pods", "proxy", NAMESPACE)["metadata"].get("labels") is None
 

@@ -307,7 +307,7 @@ async def test_who_writes_the_secret_first_has_the_right_one(server: ApiServer, 
     put(server)
     server.refuse("PATCH", "secrets", 409, "the object has been modified")
     one = source(api, Clock())
-    with pytest.raises(ApiError, match="somebody else writes ns/wh"):
+    with pytest.raises(ApiError, match="somebody else writes Secret ns/wh"):
         await in_thread(one.refresh)
     theirs = certificates.make(NAMES, NOW)
     put(server, theirs.secret())

@@ -167,7 +167,7 @@ def test_a_problem_without_a_reason():
             'pods is forbidden: User "system:serviceaccount:a:b" cannot create resource "pods"',
             "install its chart or manifests anew",
         ),
-        ("a Pod of this name that is not the operator's is there: x", "rename"),
+        ("there is already a Pod of this name that is not the operator's: x", "rename"),
         ("internal error", "tried again"),
     ],
 )

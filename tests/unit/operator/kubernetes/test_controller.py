@@ -196,7 +196,7 @@ async def test_an_api_server_that_is_away(
     assert caplog.text.count("HTTP 503") == 1
     server.refusals.clear()
     await until(lambda: running.controller.unready() is None)
-    assert "looking works again" in caplog.text
+    assert "looks succeed again" in caplog.text
 
 
 async def test_a_crd_that_comes_late(server: ApiServer, running: Running) -> None:

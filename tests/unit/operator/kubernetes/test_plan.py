@@ -124,7 +124,11 @@ def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
     assert (done(second), second.next_look_in) == ([], 10.0)
     (gone,) = done(look(alone, second.state, 130.0))
     assert gone == DeleteProxy(
-        ROBOT, PROXY, "uid-proxy-robot-one", "no pod on node one wants it since 30 s", retire=True
+        ROBOT,
+        PROXY,
+        "uid-proxy-robot-one",
+        "no pod on node one has needed it for 30 s",
+        retire=True,
     )
 
 

@@ -106,7 +106,7 @@ def test_directions():
         read(podEgress="Proxy")
     with pytest.raises(InvalidField, match=r"spec\.udp.*direction: Both"):
         read(udp=True)
-    with pytest.raises(InvalidField, match=r"spec\.udp: 'yes' does not fit: write true or false"):
+    with pytest.raises(InvalidField, match=r"spec\.udp: 'yes' is not valid: write true or false"):
         read(udp="yes")
 
 
@@ -216,18 +216,18 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
 @pytest.mark.parametrize(
     ("spec", "text"),
     [
-        ({"ports": 501}, "spec.ports: 501 does not fit: write an integer from 1 to 500"),
-        ({"ports": "32"}, "spec.ports: '32' does not fit: write an integer"),
-        ({"image": 7}, "spec.image: 7 does not fit: write a text, in quotes"),
+        ({"ports": 501}, "spec.ports: 501 is not valid: write an integer from 1 to 500"),
+        ({"ports": "32"}, "spec.ports: '32' is not valid: write an integer"),
+        ({"image": 7}, "spec.image: 7 is not valid: write a text, in quotes"),
         (
             {"nodeSelector": {"a": 1}},
-            "spec.nodeSelector.a: 1 does not fit: write a text, in quotes",
+            "spec.nodeSelector.a: 1 is not valid: write a text, in quotes",
         ),
-        ({"portWindow": [1]}, "spec.portWindow: [1] does not fit: write a map of fields"),
+        ({"portWindow": [1]}, "spec.portWindow: [1] is not valid: write a map of fields"),
         ({"dataPlane": "kernel"}, "spec.dataPlane: 'kernel' is unknown: write one of Auto, Copy, "),
         (
             {"graceSeconds": -1},
-            "spec.graceSeconds: -1 does not fit: write a number from 0 to 86400",
+            "spec.graceSeconds: -1 is not valid: write a number from 0 to 86400",
         ),
     ],
 )

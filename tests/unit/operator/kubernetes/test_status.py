@@ -164,7 +164,7 @@ def test_the_address_of_a_service_that_is_gone_is_kept():
 
 def test_one_that_can_not_be_read_keeps_what_it_has():
     first = status(state())
-    text = "spec.ports: 0 does not fit: write an integer from 1 to 500"
+    text = "spec.ports: 0 is not valid: write an integer from 1 to 500"
     bad = InvalidRosProxy(rosproxy().id, "uid-arm", 4, text, first)
 
     found = status_of_invalid(bad, LATER)

@@ -35,7 +35,7 @@ def refused_master(uri: str, settings: PlanSettings) -> str:
         return ""
     names = ", ".join(settings.allow_master)
     usual = f"names a port below {LEAST_PORT}, where no ROS master is"
-    reason = f"is none of the operator's --allow-master ({names})" if names else usual
+    reason = f"matches none of the operator's --allow-master ({names})" if names else usual
     return f"{reason}: if it is one, start the operator with --allow-master {master}"
 
 
@@ -96,6 +96,7 @@ def _is_allowed_peer(peer: str, settings: PlanSettings) -> bool:
 def _matches(target: HostPort, patterns: tuple[str, ...]) -> bool:
     pairs = (pattern.rpartition(":")[::2] for pattern in patterns)
     return any(
+        # Brackets around an IPv6 address would be a set of characters to fnmatch.
         fnmatchcase(target.host.lower(), host.strip("[]")) and fnmatchcase(str(target.port), port)
         for host, port in pairs
     )

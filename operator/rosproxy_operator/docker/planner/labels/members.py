@@ -20,9 +20,10 @@ from rosproxy_operator.docker.planner.specs import MANAGED, master, unresolved_m
 from rosproxy_operator.docker.settings import PlanSettings
 
 _PREFIX = "rosproxy"
+# One that has exited may come back: for the grace its proxy stays on its networks (see `desire`).
 _COUNTED = ALIVE | {"exited"}
 _LONGEST = 2 * max(map(len, LABELS))
-"""Characters of a name that may be a misspelt label; a longer one is like none by two thirds."""
+"""Characters of a name that may be a misspelt label; the ratio of a longer one is below 0.67."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +104,8 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
         text += "; the operator's --no-redirect keeps it from being led to the proxy"
     elif request.redirect is False:
         text += f"; without {readers.named(REDIRECT, container.labels)} it is led to the proxy"
+    # Without a route to the master's address connect(2) fails before the rule could take effect:
+    # the kernel looks for a route before there is a packet (net/ipv4/tcp_ipv4.c, tcp_v4_connect).
     elif (joined := readers.network_owner(container, observed).networks) and joined <= internal:
         text += "; it is not led to the proxy, since its networks have no way outwards"
     else:
@@ -194,6 +197,8 @@ def _own(container: Container) -> list[str]:
     return sorted(
         name
         for name in container.labels
+        # Without the prefix only a name that is very near counts, as it may be another program's.
+        # io.rosproxy.domain, the operator's own, is 0.91 near to rosproxy.domain.
         if name.lower().startswith(f"{_PREFIX}.")
         or (_near(name, 0.9) and not name.startswith(f"io.{_PREFIX}."))
     )

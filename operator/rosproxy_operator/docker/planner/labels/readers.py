@@ -281,7 +281,7 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
     if not is_address(host) and host in (ALIAS, real.host, proxy_name(key)):
         if target.port == real.port:
             return host, ""
-        return host, f"{variable}: the proxy stands at its master's port {real.port}: {fix}"
+        return host, f"{variable} has another port than its proxy, {real.port}: {fix}"
     return "", f"{variable} {_wrong_master(host, key, fix)}"
 
 

@@ -77,7 +77,7 @@ def refuse_unserved(container: Container, host: str) -> None:
     """Raise UnusableLabel for what a proxy for ROS 2 can't do. ``host``: the advertised one."""
     rmw = container.variables.get("RMW_IMPLEMENTATION", "")
     if not is_dds(rmw):
-        text = f"its variable RMW_IMPLEMENTATION={quoted(rmw)} is no DDS, which alone is proxied"
+        text = f"its variable RMW_IMPLEMENTATION={quoted(rmw)} is no DDS, and only DDS is proxied"
         raise UnusableLabel(f"{text}: use rmw_fastrtps_cpp or rmw_cyclonedds_cpp")
     if ":" in host:
         text = f"{host} can't be advertised for ROS 2, which is proxied by IPv4 alone"
@@ -99,5 +99,5 @@ def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[st
             )
     for name, values in ALONE.items() if "2" in ros_versions else ():
         if variables.get(name, "").upper() in values:
-            text = f"its variable {name}={variables[name]} keeps its participants to themselves"
-            yield f"{text}: take it off"
+            text = f"its variable {name}={variables[name]} keeps its participants from being found"
+            yield f"{text}: unset it"

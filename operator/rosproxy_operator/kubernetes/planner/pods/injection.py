@@ -73,7 +73,7 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
     names a domain. An address that this webhook has set before, as in a copy of a wired pod, is set
     anew. Wiring a wired pod changes nothing.
 
-    A pod in its node's own network must not be passed here: see `selection.chosen`.
+    A pod in its node's own network must not be passed here: see `selection.select_rosproxy`.
     """
     annotations = texts_at(pod, "metadata", "annotations")
     if MIRROR in annotations:

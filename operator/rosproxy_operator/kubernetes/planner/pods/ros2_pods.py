@@ -83,10 +83,14 @@ def _problems(
         yield "TooOld", f"{text}: use Iron or a later one"
     reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     if reach.upper() in _RANGES_WITHOUT_PEERS:
-        text = f"sets ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)}, so it heeds no static peers"
-        yield "Alone", f"{text}: take it off"
+        text = f"sets ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)}, so static peers are not used"
+        yield "Alone", f"{text}: remove the variable"
     if get("ROS_LOCALHOST_ONLY") == "1":
-        yield "Alone", "sets ROS_LOCALHOST_ONLY=1, which keeps it to itself: take it off"
+        yield (
+            "Alone",
+            "sets ROS_LOCALHOST_ONLY=1, which keeps its participants from being discovered: "
+            "remove the variable",
+        )
 
 
 def _names_service(peers: str, rosproxy: RosProxy, address: str) -> bool:

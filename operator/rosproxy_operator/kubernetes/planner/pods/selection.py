@@ -54,7 +54,7 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
     if pod.host_network:
         text = (
             "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get "
-            f"none: take hostNetwork off, or the label {INJECT}"
+            f"none: remove hostNetwork, or the label {INJECT}"
         )
         return pod_finding(pod, rosproxy, "HostNetwork", text)
     return rosproxy

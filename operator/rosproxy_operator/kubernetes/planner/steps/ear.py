@@ -94,7 +94,7 @@ def ear_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Cluste
         if isinstance(site, ProxySite) and site.ear is None:
             text = (
                 f"node {place.node} has no IPv4 address of type InternalIP, so its LAN is not "
-                "heard: name who is outside in spec.peers, and take spec.multicast off"
+                "heard: name the hosts outside in spec.peers, and leave spec.multicast out"
             )
             yield finding(rosproxy, "NoLanAddress", text)
 

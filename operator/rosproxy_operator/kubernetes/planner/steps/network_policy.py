@@ -96,10 +96,12 @@ def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
     existing = {name: p for name, p in context.observed.policies.items() if p.of == rosproxy.id}
     for current in existing.values():
         if current.owner != rosproxy.uid:
-            yield from _delete(context, current, "it is that of a RosProxy that is gone")
+            yield from _delete(context, current, "it belongs to a RosProxy that is gone")
         elif current.id not in wanted:
             on = context.settings.network_policy
-            yield from _delete(context, current, "not asked for" if on else "--no-network-policy")
+            yield from _delete(
+                context, current, "spec.podEgress is not Proxy" if on else "--no-network-policy"
+            )
     for name, body in wanted.items():
         yield from _keep(context, rosproxy, body, existing.get(name))
 

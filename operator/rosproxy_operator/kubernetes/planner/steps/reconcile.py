@@ -189,9 +189,11 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
         if context.retries.is_due(Task(rosproxy.id, "create", service_id(rosproxy.id))):
             yield CreateService(rosproxy.id, body)
     elif service.owner != rosproxy.uid:
-        yield from _delete_service(context, service, "it is that of a RosProxy that is gone")
+        yield from _delete_service(context, service, "it belongs to a RosProxy that is gone")
     elif service.fingerprint != manifests.fingerprint_of(body):
-        yield from _delete_service(context, service, "made anew")
+        yield from _delete_service(
+            context, service, "made anew: its RosProxy or the operator has changed"
+        )
 
 
 def _delete_service(context: ClusterContext, service: ProxyService, why: str) -> Iterator[Action]:
@@ -242,7 +244,7 @@ def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> 
     elif node.ready and not node.deleting and context.grace_left(place) <= 0:
         grace = context.view.rosproxies[place.of].spec.grace
         for proxy in proxies:
-            why = f"no pod on node {place.node} wants it since {grace:g} s"
+            why = f"no pod on node {place.node} has needed it for {grace:g} s"
             yield from _delete_pod(context, proxy, why, retire=True)
 
 
@@ -254,7 +256,7 @@ def _ensure(
     misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
     if misplaced:
         for proxy in misplaced:
-            yield from _delete_pod(context, proxy, "a proxy is not called so (any more)")
+            yield from _delete_pod(context, proxy, "its name is not that of this node's proxy")
     elif name in context.view.names:
         _note_creation(context, place)
         if current is not None:  # else its pod is about to go
@@ -272,6 +274,8 @@ def _update(
     if proxy.pod.ended:
         yield from _delete_pod(context, proxy, f"it has ended: {proxy.message or proxy.pod.phase}")
     elif proxy.fingerprint != fingerprint:
+        # If the next proxy can't find these nodes at the master, this one unregisters them. A range
+        # with the same first port has grown or shrunk at its end: what is left of it is the same.
         moved = proxy.range.first != site.ports.first
         lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
         diff = "its RosProxy, its node or the operator's options have changed"

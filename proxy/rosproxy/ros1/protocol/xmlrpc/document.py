@@ -30,6 +30,7 @@ INVALID_PARAMS = -32602
 SYSTEM_ERROR = -32400
 """Fault code: the proxy itself could not do its part."""
 
+# The value of an attribute may hold ``>``.
 _TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _ENCODINGS = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1"})
 _MEANING = frozenset(
@@ -183,8 +184,9 @@ class _Parser:
             raise XmlRpcError(PARSE_ERROR, f"longer than {limits.size} bytes")
         if exceeds_elements(body, limits):  # before any takes memory
             raise XmlRpcError(PARSE_ERROR, f"more than {limits.elements} elements")
+        # expat finds UTF-16 out by itself; here tags and texts are looked for as ASCII.
         if b"\0" in body:
-            raise XmlRpcError(PARSE_ERROR, "neither UTF-8 nor another encoding without NUL bytes")
+            raise XmlRpcError(PARSE_ERROR, "NUL bytes in the document; use UTF-8")
         self._expat = parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
@@ -218,7 +220,7 @@ class _Parser:
         elif name == "fault":
             self.fault = True
         elif self._path[-2:-1] == ["value"]:
-            self._open[-1].kind = "other"
+            self._open[-1].kind = "other"  # an extension type, as ``ex:nil``, which passes as it is
 
     def _check(self, name: str) -> None:
         """Refuse an element that begins, if it is one too many or could be read in two ways."""
@@ -227,7 +229,7 @@ class _Parser:
         if self._count > self._limits.elements:
             raise XmlRpcError(PARSE_ERROR, f"more than {self._limits.elements} elements")
         if ":" in name and name.rpartition(":")[2] in _MEANING:
-            raise XmlRpcError(INVALID_REQUEST, "an element of XML-RPC has no prefix")
+            raise XmlRpcError(INVALID_REQUEST, "an element of XML-RPC must have no prefix")
 
     def _end(self, name: str) -> None:
         self._path.pop()
@@ -259,6 +261,7 @@ class _Parser:
         index = self._expat.CurrentByteIndex
         if value.inner[1] < 0:
             value.inner = (value.inner[0], max(value.inner[0], index))
+        # At the end of ``<value/>`` expat is behind it already, at the start of the next tag.
         if self.body[value.outer[1] - 2 : value.outer[1]] != b"/>":
             value.outer = (value.outer[0], self._tag_end())
         if value.kind == "struct" and len(value.members) != len(value.items):

@@ -19,6 +19,7 @@ _CALL = re.compile(_PROLOG + rb"<methodCall>\s*<methodName>\s*([^<\s]+)\s*</meth
 _CALL_END = re.compile(rb"\s*</params>\s*</methodCall>\s*\Z")
 _RESPONSE = re.compile(_PROLOG + rb"<methodResponse>\s*<params>")
 _RESPONSE_END = re.compile(rb"\s*</params>\s*</methodResponse>\s*\Z")
+# The last group is empty, so that there is always a match: `finditer` would skip what is no token.
 _TOKEN = re.compile(
     rb"""\s*(?:
     (<value>)(?:
@@ -92,6 +93,7 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
     """
     head = _RESPONSE.match(body)
     param = _FIRST_PARAM.match(body, head.end()) if head else None
+    # A parser has to turn "\r" into "\n" (XML 1.0, 2.11); here texts are taken as they are.
     if param is None or b"\r" in body or not _is_plain(body, limits):
         return None
     top = list[Any]()
@@ -102,6 +104,7 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
 
 def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
     """Read one value into ``top``, with at most ``depth`` lists in each other; where it ends."""
+    # `scanner` is not documented: a match of its has to begin where the one before has ended.
     stack, match = [top], _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
     while (token := match()) and len(stack) <= depth:
         group = token.lastindex
@@ -123,7 +126,7 @@ def _is_plain(body: bytes, limits: Limits) -> bool:
     return (
         len(body) <= limits.size
         and not body.translate(None, _PLAIN)
-        and b"]]>" not in body
+        and b"]]>" not in body  # no text may hold it (XML 1.0, 2.4)
         and body.count(b"</") <= limits.elements  # each is closed by a tag of its own
     )
 
@@ -153,7 +156,7 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
         return Value(body, "utf-8", kind, (start, token.end()), token.span(_TYPED), [], [])
     if group == _TEXT and depth:
         return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
-    if depth < 4:
+    if depth < 4:  # an item would be too deep; expat tells whether there is one
         raise _NotPlain
     items, members = list[Value](), list[str]()
     if group == _ARRAY:

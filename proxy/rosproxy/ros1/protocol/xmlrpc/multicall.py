@@ -40,7 +40,9 @@ def inner_calls(call: Call) -> list[Call | None]:
     """
     items = inner_items(call)
     if len(items) > MOST_CALLS:
-        raise XmlRpcError(INVALID_PARAMS, f"{len(items)} calls in one; at most {MOST_CALLS}")
+        raise XmlRpcError(
+            INVALID_PARAMS, f"{len(items)} calls in {MULTICALL}; at most {MOST_CALLS}"
+        )
     return [_inner_call(item) for item in items]
 
 

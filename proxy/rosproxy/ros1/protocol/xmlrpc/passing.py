@@ -28,6 +28,7 @@ SHORT = 64 * 1024
 HEAD = 4096
 """Bytes of a document in which its method is looked for."""
 DEPTH = 64
+"""Elements of a multicall inside of each other, as `Limits` has it for what is read."""
 
 _HEAD = re.compile(
     rb"""(?:<\?xml\s+version=(?:'1\.0'|"1\.0")
@@ -42,10 +43,14 @@ _STATUS = re.compile(
     re.VERBOSE,
 )
 _PARAMS_BEGIN = re.compile(rb"\s*<params>\s*")
+# Without markup, references and bytes beyond ASCII a text is the same in each encoding of _HEAD and
+# to every parser.
 _STRING_PARAM = re.compile(
     rb"\s*<param>\s*<value>(?:\s*<string>([^<&\x80-\xff]*)</string>\s*|([^<&\x80-\xff]*))"
     rb"</value>\s*</param>\s*"
 )
+# With a prefix, too: Python's Unmarshaller drops it (xmlrpc/client.py, end). NUL bytes are those of
+# UTF-16, which expat recognizes by itself, and in which a search for bytes finds no name.
 _FORBIDDEN = re.compile(rb"[<:]methodName[\s/>]|<!DOCTYPE|<!ENTITY|\0")
 _HINTS = (b"methodName", b"<!DOCTYPE", b"<!ENTITY", b"\0")
 """One of them is in all that is forbidden; to look for them first takes a hundredth of the time."""
@@ -114,13 +119,18 @@ class CallWatch:
         match = _FORBIDDEN.search(text) if any(hint in text for hint in _HINTS) else None
         if match:
             token = match[0].decode("latin-1").strip("\0<:/> \t\r\n") or "a NUL byte"
-            raise XmlRpcError(INVALID_REQUEST, f"{token} inside of a long call")
+            raise XmlRpcError(INVALID_REQUEST, f"{token} is not allowed inside a long call")
         for tag in _NESTING.finditer(text):
             if tag.end() <= len(self._tail or b""):  # seen with the piece before
                 continue
+            # Tags count wherever they stand, also in a comment or CDATA. Those that close nothing
+            # must not make room for more.
             self._nested = max(self._nested - 1, 0) if tag[1] else self._nested + 1
             if self._nested > NESTED:
-                raise XmlRpcError(PARSE_ERROR, f"more than {NESTED} arrays in each other")
+                raise XmlRpcError(
+                    PARSE_ERROR, f"more than {NESTED} arrays or structs in each other"
+                )
+        # What is looked for may begin here and end in the next piece.
         self._tail = text[1 - _LONGEST :]
 
     def end(self) -> None:
@@ -163,7 +173,7 @@ class MulticallWatch(CallWatch):
         if self._depth > _CONTENT_DEPTH:
             return
         if name not in _LEVELS[self._depth - 1]:
-            raise XmlRpcError(INVALID_REQUEST, f"<{name[:40]}> in a long {MULTICALL}")
+            raise XmlRpcError(INVALID_REQUEST, f"misplaced <{name[:40]}> in a long {MULTICALL}")
         if self._depth == _CALL_DEPTH:
             self._members = []
         elif self._depth == _MEMBER_DEPTH:
@@ -171,6 +181,7 @@ class MulticallWatch(CallWatch):
         elif self._depth >= _FIELD_DEPTH:
             self._elements.append(name)
             self._text = ""
+            # An array holds the parameters, which may be long: no text of theirs is collected.
             self._parser.CharacterDataHandler = None if name == "array" else self._add_text
 
     def _end(self, name: str) -> None:
@@ -179,7 +190,9 @@ class MulticallWatch(CallWatch):
         elif self._depth == _MEMBER_DEPTH:
             self._end_member()
         elif self._depth == _CALL_DEPTH and sorted(self._members) != ["methodName", "params"]:
-            raise XmlRpcError(INVALID_REQUEST, f"a call of {MULTICALL} needs a method and params")
+            raise XmlRpcError(
+                INVALID_REQUEST, f"a call in {MULTICALL} needs one methodName and params"
+            )
         if self._depth in (_FIELD_DEPTH, _CONTENT_DEPTH):
             self._parser.CharacterDataHandler = None
         self._depth -= 1
@@ -190,9 +203,14 @@ class MulticallWatch(CallWatch):
         elif self._elements in (_METHOD, [*_METHOD, "string"]):
             self._members.append("methodName")
             if self._text == MULTICALL or not self._may_pass(self._text):
-                raise XmlRpcError(INVALID_REQUEST, f"{self._text} in a long {MULTICALL}")
+                raise XmlRpcError(
+                    INVALID_REQUEST, f"{self._text} is not allowed in a long {MULTICALL}"
+                )
         else:
-            raise XmlRpcError(INVALID_REQUEST, f"an odd member of a call in a long {MULTICALL}")
+            raise XmlRpcError(
+                INVALID_REQUEST,
+                f"a call in a long {MULTICALL} has a member other than methodName and params",
+            )
 
     def _add_text(self, text: str) -> None:
         self._text += text

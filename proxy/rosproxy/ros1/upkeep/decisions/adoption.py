@@ -99,7 +99,7 @@ def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool
     The master calls ``shutdown`` at the URI that the name had before. The new URI may be a former
     one of the same node, which registered around the proxy, or the advertised one again by now.
     """
-    if uri is None:
+    if uri is None:  # between being taken back and registered anew, the master does not know it
         return endpoint.has_registered_directly
     return uri == advertised or is_known_as(endpoint, uri)
 
@@ -113,9 +113,9 @@ def _score(node: DirectNode, info: NodeInfo) -> int:
 def _doubt(node: DirectNode, best: list[HostPort], infos: Mapping[HostPort, NodeInfo]) -> str:
     slaves = ", ".join(map(str, node.slaves))
     if best:
-        reason = f"could be at {' and '.join(map(str, best))}; left alone"
+        reason = f"could be at {' or '.join(map(str, best))}; not adopted. Restart its container"
     elif any(slave in infos for slave in node.slaves):
-        reason = f"the node at {slaves} is another"
+        reason = f"the node at {slaves} does not show that it is this one; not adopted"
     else:
-        reason = f"no node answers at {slaves}"
+        reason = f"no node answers at {slaves}; not adopted"
     return f"registered as {node.uri} around the proxy: {reason}"

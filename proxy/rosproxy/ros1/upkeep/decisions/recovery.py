@@ -20,6 +20,7 @@ from rosproxy.ros1.registry.memory import RememberedLease
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
+"""The merit of a node that has not answered: less than that of any that has."""
 MOST_ASKED = 3
 """How many topics, and services, a node is asked for at most."""
 

@@ -103,6 +103,7 @@ def read_release(
     uris: Mapping[str, str], values: Sequence[Any]
 ) -> tuple[list[Registration], dict[str, str]]:
     """The results of `release_calls`: subscriptions that ended; names known still, with URIs."""
+    # First where each name was, then whether its subscription has ended, then where it is now.
     before = zip(uris, values, strict=False)
     after = zip(uris, values[2 * len(uris) :], strict=True)
     known_uris = {name: uri for name, uri in after if uri is not None}
@@ -209,4 +210,5 @@ def _call(method: str, registration: Registration, uri: str, service: str) -> Me
         positions.service_api: service,
         positions.caller_api: uri,
     }
+    # What a method does not have is under None, which is left out.
     return method, [params[position] for position in range(4) if position in params]
