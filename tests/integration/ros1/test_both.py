@@ -11,7 +11,7 @@ from examples.demo.fake_http import value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
-from rosproxy.net.addresses import is_loopback
+from rosproxy.net.addresses import is_address, is_loopback
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -135,6 +135,16 @@ async def test_tools_see_addresses_that_they_can_use(
     seen = (await rpc(at, "getBusInfo", "/tool", source=NODE))[2]
     assert seen[1][1] == node.uri
     assert (await rpc(where(seen[0][1]), "getPid", "/tool", source=NODE))[2] == other.pid
+
+
+async def test_a_node_outside_has_no_port_opened_for_what_the_master_does_not_have(
+    proxy: Proxy, robot: FakeNode
+) -> None:
+    strange = f"http://{OUTSIDE}:40000/"
+    robot.answers["getBusInfo"] = value([1, "", [[1, strange, "i", "TCPROS", "/chatter", True]]])
+    at = where(await look_up(proxy, robot))
+    assert (await rpc(at, "getBusInfo", "/tool", source=NODE))[2][0][1] == strange
+    assert strange not in stand_ins(proxy)
 
 
 async def test_only_inside_is_let_in(proxy: Proxy, robot: FakeNode) -> None:
@@ -347,3 +357,24 @@ async def test_who_is_gone_was_not_cut_by_a_policy(
     answer = await tell(proxy, "/policy", layers=[{**rules, "addresses": None}])
     assert answer["cut"] == 1
     assert not proxy.app.status()["udpros"]
+
+
+async def test_a_name_that_changes_its_address_leads_nowhere_else(
+    proxy: Proxy, master: FakeMaster, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever registers a name may have a name server that answers otherwise the second time."""
+    robot = await make_node("/robot", MASTER, host="robot.example")
+    await robot.publish(where(master.uri))
+    at = where(await look_up(proxy, robot))
+    asked: list[str] = []
+
+    async def resolve(host: str, source: str) -> list[str]:
+        if is_address(host):
+            return [host]
+        asked.append(host)
+        return [MASTER] if len(asked) == 1 else [NODE]
+
+    for module in ("net.resolver", "ros1.standins.outside"):
+        monkeypatch.setattr(f"rosproxy.{module}.resolve", resolve)
+    assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
+    assert asked == ["robot.example"]

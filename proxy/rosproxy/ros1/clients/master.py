@@ -208,12 +208,21 @@ class MasterClient:
         return {name: uri for name, uri in pairs if isinstance(uri, str)}
 
     async def post_to_node(
-        self, slave: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
+        self,
+        slave: HostPort,
+        body: bytes,
+        within: float = NODE_TIMEOUT,
+        path: str = "/",
+        name: str = "",
     ) -> bytes:
-        """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
-        with _failures_of(f"node at {slave}"):
-            target, name = self.reach(slave), str(slave)
-            return await self._nodes.post(target, path, name, body, within, REPLY.size)
+        """A node's reply to a call, which calls it by ``name`` if that is not where it is.
+
+        ``within`` is in seconds. Raises Unreachable.
+        """
+        called = name or str(slave)
+        with _failures_of(f"node at {called}"):
+            target = self.reach(slave)
+            return await self._nodes.post(target, path, called, body, within, REPLY.size)
 
     async def pass_to_node(self, slave: HostPort, body: bytes | LongBody) -> bytes | LongReply:
         """A node's reply to a call, neither of which is read here.

@@ -128,12 +128,15 @@ def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
     )
 
 
-def peer_uris(call: Call, reply: bytes) -> list[str]:
-    """The slave URIs of other nodes in a reply."""
-    triple = ros_triple(xmlrpc.parse_reply(reply))
-    if triple is None or call.method != "getBusInfo":
-        return []
-    return [peer.text for peer in _peers(triple)]
+def named_publishers(call: Call, reply: bytes) -> dict[str, list[str]]:
+    """The slave URIs of other nodes in a reply, by the topic that they are said to publish."""
+    triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "getBusInfo" else None
+    publishers: dict[str, list[str]] = {}
+    for row in triple.items[2].items if triple else ():
+        uri, topic = (row.items[i].string() if len(row.items) > i else None for i in (1, 4))
+        if topic and parse_slave_uri(uri or ""):
+            publishers.setdefault(topic, []).append(uri or "")
+    return publishers
 
 
 def announced_publishers(call: Call) -> list[str]:

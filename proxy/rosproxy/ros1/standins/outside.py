@@ -56,9 +56,10 @@ class Outside:
         """Forward a slave API call to a node outside; its answer. Raises Unreachable."""
         path = path if stand_in.is_uri_kept else path_of(stand_in.uri)
         try:
-            # Only to refuse what leads back; the call goes by the host's name, for its Host field.
-            await self.reach(stand_in.target)
-            return await self._context.upstream.post_to_node(stand_in.target, body, path=path)
+            # To the address that was looked at: a name server may answer otherwise the next time.
+            reached = await self.reach(stand_in.target)
+            name = str(stand_in.target)  # for the Host field
+            return await self._context.upstream.post_to_node(reached, body, path=path, name=name)
         except OSError as error:
             if isinstance(error, ConnectionRefusedError):
                 self._note_refused(stand_in)

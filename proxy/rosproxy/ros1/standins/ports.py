@@ -105,11 +105,12 @@ class StandInPorts:
                 self._listen(uri, target, self._stand_ins.address(caller.proxy))
 
     async def listen_for_announced(self, topic: str, uris: Sequence[str], caller: Caller) -> None:
-        """The same for those URIs in a ``publisherUpdate`` that are publishers at the master.
+        """The same for those URIs that are publishers at the master, where another names them.
 
-        Anybody may call that at a lease, and name any port. Its source proves nothing: every
-        program on the master's host has that address, and NAT gives it to others. So where a
-        port would have to be opened the master is asked whether it has that publisher.
+        Anybody may call ``publisherUpdate`` at a lease, and name any port. Its source proves
+        nothing: every program on the master's host has that address, and NAT gives it to others.
+        And a node outside says in its bus info what it likes. So where a port would have to be
+        opened the master is asked whether it has that publisher.
         """
         targets = self._targets(uris)
         address = self._stand_ins.address(caller.proxy)
@@ -389,5 +390,6 @@ class StandInPorts:
         if tcpros_port is not None:
             stand_in.note_topic_port(parsed.string(1) or "", tcpros_port)
             listener = await self._topic_listener(stand_in, tcpros_port)
-        await self.listen_for(slave_api.peer_uris(parsed, reply), caller)
+        for topic, uris in slave_api.named_publishers(parsed, reply).items():
+            await self.listen_for_announced(topic, uris, caller)
         return slave_api.rewrite_reply(parsed, reply, listener, view)
