@@ -7,6 +7,7 @@ import pytest
 
 from examples.demo.fake_http import End, free_ports, ok, value
 from examples.demo.fake_node import FakeNode
+from rosproxy.ros1.clients.master import CALLER_ID
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import (
     HOST,
@@ -373,3 +374,16 @@ async def test_parallel_registrations_of_one_new_node_share_a_port(proxy, master
     await asyncio.gather(*(node.publish(proxy.master, f"/t{i}") for i in range(20)))
     assert len(proxy.ros1.context.registry) == 1
     assert {master.holds("publishers", f"/t{i}")[0] for i in range(20)} == {proxy.uri(node)}
+
+
+async def test_a_node_gets_a_header_of_a_subscriber_that_has_gone_meanwhile(
+    proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+):
+    """rospy's publishers accept nobody while they complain of one that ends before its header."""
+    await node.publish(proxy.master)
+    has_ended = iter([False, True])  # when its header was read; when the node was connected to
+    monkeypatch.setattr("rosproxy.net.sockets.has_ended", lambda _: next(has_ended))
+    async with connect(proxy.lease(node)) as wire:
+        await wire.send(topic_header(caller="/n"))
+        assert await wire.reader.read() == b""
+    assert [header["callerid"] for header in node.headers] == [CALLER_ID]

@@ -10,8 +10,10 @@ the endpoint is decided in `upkeep`.
 """
 
 import asyncio
+import contextlib
 import logging
 import socket
+from collections.abc import Mapping
 
 import msgspec
 
@@ -144,20 +146,25 @@ class NodeClient:
 
     async def _server_name(self, server: HostPort, fields: dict[str, str]) -> str | None:
         """The name in the header with which a TCPROS server answers; None if it gives none."""
-        # "*" is the md5sum of any type. A service of rospy that is probed closes the connection
-        # after its header, and waits for no request (tcpros_service.py, handle).
-        header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **fields})
-        loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(self._within):
-                conn = await sockets.dial(server)
-                with conn:
-                    await loop.sock_sendall(conn, header)
-                    size = header_length(await sockets.read_exactly(conn, 4))
-                    return decode_header(await sockets.read_exactly(conn, size)).get("callerid")
+                with await sockets.dial(server) as conn:
+                    return (await _greet(conn, fields)).get("callerid")
         except (OSError, EOFError, HeaderError) as error:
             log.debug("%s does not answer a TCPROS header: %s", server, error)
             return None
+
+    async def take_leave(self, conn: socket.socket, topic: str) -> None:
+        """Close a connection to a publisher that has got no header yet, after one of the proxy's.
+
+        rospy's one thread that accepts connections warns of each that ends before its header. Where
+        that is its first warning, it asks its master for a parameter, over a connection that it
+        keeps; if the network to there has just gone, nobody else is accepted for a quarter of an
+        hour (rospy: tcpros_base.py, _tcp_server_callback; rosout.py, _rosout).
+        """
+        with conn, contextlib.suppress(OSError, EOFError, HeaderError):
+            async with asyncio.timeout(self._within):
+                await _greet(conn, {"topic": topic, "type": "*"})
 
     async def _topics(self, slave: HostPort, method: str) -> dict[str, str] | None:
         try:
@@ -193,3 +200,13 @@ class NodeClient:
         except (Unreachable, MasterError) as error:
             log.debug("%s names no TCPROS port for topic %s: %s", slave, topic, error)
             return None
+
+
+async def _greet(conn: socket.socket, fields: Mapping[str, str]) -> dict[str, str]:
+    """Exchange TCPROS headers with a node. Raises OSError, EOFError, HeaderError."""
+    # "*" is the md5sum of any type. A service of rospy that is probed closes the connection after
+    # its header, and waits for no request (tcpros_service.py, handle).
+    header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **fields})
+    await asyncio.get_running_loop().sock_sendall(conn, header)
+    size = header_length(await sockets.read_exactly(conn, 4))
+    return decode_header(await sockets.read_exactly(conn, size))

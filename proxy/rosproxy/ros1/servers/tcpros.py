@@ -110,18 +110,10 @@ class TcprosServer:
         if denial := target.denial_reason(kind, name, peer, caller_id):
             await self._refuse(conn, denial, "denied")
             return
-        try:
-            node = await target.connect(kind, name)
-        except NotOffered as error:  # roscpp tries for ever after a reset, and gives up after this
-            await self._refuse(conn, str(error), "not offered")
+        node = await self._connect(target, kind, name, conn)
+        if node is None:
             return
-        if node is not None and kind == "topic" and sockets.has_ended(conn):
-            # A subscriber that is told of a publisher twice keeps the later connection, and rospy's
-            # publishers the one whose header comes last: were this one handed on, none was left.
-            node.close()
-            conn.close()
-            return
-        if node is None or not await hand_on(header, node):
+        if not await hand_on(header, node):
             self._fail(target, conn, name)
             return
         # While the node was asked and connected to, the policy may have changed. After a reset the
@@ -139,6 +131,28 @@ class TcprosServer:
         target.note_connection()
         self._context.gate.enter(peer, target.port)  # the acceptor counts it until `serve` ends
         self.relays.start(relay, lambda ended: self._finished(target, ended))
+
+    async def _connect(
+        self, target: TcprosTarget, kind: str, name: str, conn: socket.socket
+    ) -> socket.socket | None:
+        """A connection to the target; None if the client gets none, which it has been shown."""
+        # A subscriber that is told of a publisher twice keeps the later connection, and rospy's
+        # publishers the one whose header comes last: were the former one handed on, none was left.
+        if kind == "topic" and sockets.has_ended(conn):
+            conn.close()
+            return None
+        try:
+            node = await target.connect(kind, name)
+        except NotOffered as error:  # roscpp tries for ever after a reset, and gives up after this
+            await self._refuse(conn, str(error), "not offered")
+            return None
+        if node is None:
+            self._fail(target, conn, name)
+        elif kind == "topic" and sockets.has_ended(conn):
+            conn.close()
+            await self._context.nodes.take_leave(node, name)
+            return None
+        return node
 
     def cut(self, port: int) -> None:
         """End the connections through a port."""
