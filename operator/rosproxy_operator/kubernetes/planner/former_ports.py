@@ -24,14 +24,16 @@ class FormerPorts(msgspec.Struct, frozen=True):
 def remember(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[ProxyPlace, FormerPorts]:
     """The ports by place: as its proxy reports them now, or as the former one did last.
 
-    Those of the former proxy count until the new one has participants.
+    Those of the former proxy count until the new one has participants. The last ports count as
+    well where a proxy has none any more: it may have unregistered its participants because it is to
+    be made anew, and the farewells are datagrams, of which some may be lost.
     """
     latest = {place: ports for place, ports in former.items() if place.of in view.rosproxies}
     for place, proxy in view.current.items():
         report = view.observed.reports.get(proxy.pod.uid)
         if report is None or not report.answered:
             continue
-        if report.leases or (place in latest and latest[place].uid == proxy.pod.uid):
+        if report.leases:
             latest[place] = FormerPorts(proxy.pod.uid, report.leases)
     return latest
 

@@ -366,7 +366,7 @@ def test_a_service_of_former_times_is_made_anew() -> None:
     found = look(complete(services={ROBOT: service(fingerprint="other")}))
     (deleted,) = done(found)
     assert isinstance(deleted, DeleteService)
-    assert deleted.why == "made anew"
+    assert deleted.why.startswith("made anew: ")
 
 
 # status

@@ -9,7 +9,12 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.access.bounds import bounds_violation
-from rosproxy_operator.kubernetes.planner.actions import CreateEar, CreateProxy, DeleteEar
+from rosproxy_operator.kubernetes.planner.actions import (
+    CreateEar,
+    CreateProxy,
+    DeleteEar,
+    DeleteProxy,
+)
 from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.steps.ear import ear_pod
@@ -221,6 +226,15 @@ def test_an_ear_stays_while_its_proxy_is_made_anew():
     assert isinstance(action, CreateProxy)
 
 
+def test_an_ear_stays_until_its_proxy_has_left_its_ports():
+    """It carries to the LAN that the proxy's participants have ended."""
+    _, there = hearing()
+    moved = of2(HEARING, ports=5, window=PortRange(13000, 13099))
+    (action,) = done(look(observed(moved, service(moved), pod(), there, ears=(ear(moved),))))
+    assert isinstance(action, DeleteProxy)
+    assert action.retire
+
+
 def test_an_ear_that_does_not_run_is_told():
     of, there = hearing()
     deaf = pod_failure({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
@@ -380,6 +394,9 @@ def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
     seen = observed(of, service(of), pod(), there, reports={there.pod.uid: report})
     known = look(seen).state
     assert look(seen, known).former_ports == {}
+
+    retired = replace(seen, reports={there.pod.uid: replace(report, participants={}, leases={})})
+    known = look(retired, known).state  # it has told outside that they ended, by datagrams
 
     new = replace(there, pod=replace(there.pod, uid="uid-new"))
     starting = observed(of, service(of), pod(), new, reports={"uid-new": ProxyReport(True, True)})

@@ -19,6 +19,7 @@ from rosproxy_operator.kubernetes.planner.manifests import (
     fingerprinted,
     image_of,
     metadata,
+    proxy_fingerprint,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext, site_of
@@ -70,7 +71,8 @@ def ear_pod(site: ProxySite, ear: HostPort, proxy_address: str, settings: Cluste
 def reconcile_ears(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """The next actions for the ears of a RosProxy.
 
-    The ear of a proxy that is just being made anew stays until the proxy has another address.
+    The ear of a proxy that is to be made anew stays until the new proxy has an address: the one
+    that goes tells outside by it that its participants have ended.
     """
     places = {*context.view.places.get(rosproxy.id, ())}
     ears_by_node = group_by_key(
@@ -105,7 +107,9 @@ def _ensure_ear(
     current, wanted = context.view.current.get(place), place in context.view.wanted
     site = site_of(context, place) if wanted else None
     address = current.pod.ip if current is not None and not current.pod.ended else ""
-    if not isinstance(site, ProxySite) or site.ear is None or not address:
+    if current is None or not isinstance(site, ProxySite) or site.ear is None or not address:
+        return
+    if current.fingerprint != proxy_fingerprint(site, context.settings):
         return
     body = ear_pod(site, site.ear, address, context.settings)
     expected, id = fingerprint_of(body), ear_id(place.of, place.node)
