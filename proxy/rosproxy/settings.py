@@ -45,7 +45,7 @@ class Settings:
         Option(
             "The real master, e.g. `http://robot:11311`. It need not be up when the proxy starts.",
             values.MASTER_URI,
-            variables=("ROS_MASTER_URI",),
+            variables=("ROSPROXY_MASTER_URI", "ROS_MASTER_URI"),
             default="required for ROS 1",
         ),
     ] = ""

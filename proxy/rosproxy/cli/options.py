@@ -43,6 +43,7 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
 
     def split_envvar_value(self, rv: str) -> Sequence[str]:
         """The values of a variable, where several may be given."""
+        # click splits at spaces, which the rules of a policy contain.
         return super().split_envvar_value(rv) if self._separable else [rv]
 
 
@@ -90,6 +91,7 @@ def click_option(setting: Setting, prefix: str = "") -> Callable[[Command], Comm
     return click.option(
         f"{name}/--no-{name.removeprefix('--')}" if setting.default is True else name,
         envvar=list(option.variables) or None,
+        allow_from_autoenv=not option.variables,  # click reads that of the name besides
         multiple=option.repeatable,
         required=setting.required,
         help=plain(option.help),
@@ -139,6 +141,8 @@ def variables_of(option: click.Option, prefix: str | None) -> list[str]:
     """The variables that an option is read from, of a command whose own begin with ``prefix``."""
     if option.envvar:
         return [option.envvar] if isinstance(option.envvar, str) else list(option.envvar)
+    # As click does by itself (core.py, Option.resolve_envvar_value); --help and --version, which
+    # expose no value, have none.
     automatic = prefix and option.allow_from_autoenv and option.expose_value
     automatic = automatic or (prefix and option.name == "config")
     return [f"{prefix}_{option.name}".upper().replace("-", "_")] if automatic else []
@@ -187,6 +191,7 @@ def config_option(command: Command) -> Command:
     return click.option(
         "--config",
         metavar="FILE",
+        # Read before the others, which look into context.default_map that it fills.
         is_eager=True,
         expose_value=False,
         callback=_use_config,
@@ -222,6 +227,7 @@ def _variable_names(command: click.Command, prefix: str | None) -> Iterator[str]
             yield from variables_of(param, prefix)
     if isinstance(command, click.Group):
         for name, subcommand in command.commands.items():
+            # As click puts it together (core.py, Context.__init__).
             yield from _variable_names(subcommand, f"{prefix}_{name}".upper() if prefix else None)
 
 

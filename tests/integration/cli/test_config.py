@@ -280,3 +280,16 @@ def test_bash_completes(words: str, expected: set[str]):
         env=clean_environment(PATH=path),
     )
     assert set(ended.stdout.split()) == expected, ended.stderr
+
+
+async def test_both_variables_of_an_option_are_read_and_known():
+    for name in ("ROS_MASTER_URI", "ROSPROXY_MASTER_URI"):
+        told = await check("--advertise-host", "host", **{name: "http://robot:11311"})
+        assert told == (0, "")
+
+
+async def test_a_variable_that_is_not_read_is_called_unknown():
+    """Where an option has others than that of its name, which click would read besides."""
+    code, said = await check(*GOOD, ROSPROXY_INSIDE_NETWORK="no network")
+    assert code == 0
+    assert "ROSPROXY_INSIDE_NETWORK is no variable of rosproxy's" in said
