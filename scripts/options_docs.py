@@ -9,8 +9,8 @@ settings: that of ``rosproxy run`` of `rosproxy.settings.Settings`.
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from rosproxy.setting_kinds import Setting, declared
 from rosproxy.settings import Settings
-from rosproxy.values import Setting, declared
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.kubernetes.settings import (
     Bounds,

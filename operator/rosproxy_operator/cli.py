@@ -25,7 +25,7 @@ from rosproxy.cli.options import (
     unknown_variables,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy_operator.common.options import policy_options, proxy_bound_options
+from rosproxy_operator.common.proxy_options import policy_options, proxy_bound_options
 from rosproxy_operator.common.words import exit_on_error, fail
 from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
@@ -187,7 +187,7 @@ kubernetes.add_command(kubernetes_commands.doctor)
 
 def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     from rosproxy.telemetry import logs
-    from rosproxy_operator.kubernetes.api.client import ApiError
+    from rosproxy_operator.kubernetes.api.api_client import ApiError
     from rosproxy_operator.kubernetes.run import run
     from rosproxy_operator.kubernetes.serving import quiet_library_logs
 
@@ -201,7 +201,7 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
 @main.command()
 def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
-    from rosproxy.admin.client import AdminClient, AdminError, default_url
+    from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
 
     # default_url() alone falls back to the port of a proxy, 11312, and the operator's is 11313.
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"

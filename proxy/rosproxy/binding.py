@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterator, Sequence
 
 from rosproxy.leases.leases import RANGE_OPTION
 from rosproxy.net import signs
+from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
 from rosproxy.telemetry.problems import Problems
-from rosproxy.values import SettingError
 
 log = logging.getLogger(__name__)
 

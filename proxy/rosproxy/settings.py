@@ -8,12 +8,12 @@ and its row in docs/reference/options.md.
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from rosproxy import values
+from rosproxy import setting_kinds as kinds
 from rosproxy.access.layers import PolicyLayer, PolicyMode, check_bounds
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort, Network
-from rosproxy.values import DataPlane, Direction, Option, SettingError, SlaveControl, hash_token
+from rosproxy.setting_kinds import DataPlane, Direction, Option, SettingError, SlaveControl
 
 MEBIBYTE = 1024 * 1024
 LEAST_PER_DOMAIN = 4
@@ -44,7 +44,7 @@ class Settings:
         str,
         Option(
             "The real master, e.g. `http://robot:11311`. It need not be up when the proxy starts.",
-            values.MASTER_URI,
+            kinds.MASTER_URI,
             variables=("ROSPROXY_MASTER_URI", "ROS_MASTER_URI"),
             default="required for ROS 1",
         ),
@@ -55,7 +55,7 @@ class Settings:
             "IP address of the master's host, to connect to instead of resolving its name; the "
             "name may then be [one of the proxy itself](../guide/by-hand.md#keep-the-masters-name)."
             " It can be changed at run time.",
-            values.ADDRESS,
+            kinds.ADDRESS,
             default="where its name leads",
         ),
     ] = None
@@ -64,14 +64,14 @@ class Settings:
         Option(
             "Name or address under which outside nodes and the master reach this host. All of "
             "them must be able to resolve it.",
-            values.HOST,
+            kinds.HOST,
         ),
     ]
     master_port: Annotated[
         int,
         Option(
             "Where inside nodes find their master: `ROS_MASTER_URI=http://<proxy>:11311`.",
-            values.PORT,
+            kinds.PORT,
         ),
     ] = 11311
     port_range: Annotated[
@@ -79,14 +79,14 @@ class Settings:
         Option(
             "Ports that the proxy listens on. [One for each node inside]"
             "(../guide/by-hand.md#how-many-ports); publish exactly these.",
-            values.PORT_RANGE,
+            kinds.PORT_RANGE,
         ),
     ] = DEFAULT_RANGE
     advertise_port_range: Annotated[
         PortRange | None,
         Option(
             "The same ports as outside sees them, if that differs: as many, in the same order.",
-            values.PORT_RANGE,
+            kinds.PORT_RANGE,
             default="as `--port-range`",
         ),
     ] = None
@@ -96,20 +96,20 @@ class Settings:
             "Where the master itself runs inside: offers it to outside on this port (publish it "
             "too). It calls nodes at the advertised address, so it must itself reach the host's "
             "published ports; Docker's own port proxy sees to that, NAT without hairpin does not.",
-            values.PORT,
+            kinds.PORT,
             default="off",
         ),
     ] = None
     bind: Annotated[
         str,
-        Option("Address to listen on; `::` for IPv4 and IPv6.", values.BIND_ADDRESS),
+        Option("Address to listen on; `::` for IPv4 and IPv6.", kinds.BIND_ADDRESS),
     ] = "0.0.0.0"
     admin: Annotated[
         HostPort,
         Option(
             "The admin endpoint ([API](admin-api.md)) and the live page. To let Prometheus scrape, "
             "bind it to an address that only your monitoring reaches.",
-            values.HOST_PORT,
+            kinds.HOST_PORT,
             name="--admin-bind",
         ),
     ] = DEFAULT_ADMIN
@@ -120,7 +120,7 @@ class Settings:
             "endpoint, and give to see the [live page](../guide/live-page.md#who-may-look): 8 to "
             "200 printable ASCII characters without spaces. Better given as a variable: a command "
             "line can be seen by all.",
-            values.TOKEN,
+            kinds.TOKEN,
             default="none",
         ),
     ] = field(default=None, repr=False)
@@ -131,7 +131,7 @@ class Settings:
             "(`printf %s \"$TOKEN\" | sha256sum`). Whoever reads the proxy's environment can't "
             "call it then, as long as the token can't be guessed: make it of `openssl rand -hex "
             "16`.",
-            values.TOKEN_HASH,
+            kinds.TOKEN_HASH,
             default="none",
         ),
     ] = None
@@ -140,7 +140,7 @@ class Settings:
         Option(
             "A network of nodes inside. Only addresses in one, or selected by an operator, may use "
             "the proxy as their master; there nodes reach each other directly. Repeatable.",
-            values.NETWORK,
+            kinds.NETWORK,
             name="--inside-network",
             variables=("ROSPROXY_INSIDE_NETWORKS",),
             repeatable=True,
@@ -152,25 +152,25 @@ class Settings:
         float,
         Option(
             "Time between probes of an idle node. One that ends is noticed at once.",
-            values.time(0.05),
+            kinds.time(0.05),
         ),
     ] = 5.0
-    probe_timeout: Annotated[
-        float, Option("Time that a node has to answer.", values.time(0.05))
-    ] = 3.0
+    probe_timeout: Annotated[float, Option("Time that a node has to answer.", kinds.time(0.05))] = (
+        3.0
+    )
     cleanup_after: Annotated[
         float,
         Option(
             "Time after which a node that is gone is unregistered at the master. 0: never.",
-            values.time(0),
+            kinds.time(0),
         ),
     ] = 30.0
     linger: Annotated[
         float,
-        Option("Time for which a port is kept after its node has ended.", values.time(0)),
+        Option("Time for which a port is kept after its node has ended.", kinds.time(0)),
     ] = 30.0
     master_interval: Annotated[
-        float, Option("Time between looks at the master.", values.time(0.05))
+        float, Option("Time between looks at the master.", kinds.time(0.05))
     ] = 2.0
     slave_control: Annotated[
         SlaveControl,
@@ -184,7 +184,7 @@ class Settings:
         Option(
             "What outside may see and do, and what inside may take from outside: [rules]"
             "(policy.md) such as `deny publish /camera/*`. Repeatable.",
-            values.POLICY_RULES,
+            kinds.POLICY_RULES,
             name="--policy",
             repeatable=True,
             default="none",
@@ -199,7 +199,7 @@ class Settings:
         str | None,
         Option(
             "A file with more such rules, a line each; it is read again when it changes.",
-            values.FILE,
+            kinds.FILE,
             default="none",
         ),
     ] = None
@@ -208,7 +208,7 @@ class Settings:
         Option(
             "For operators: the layers of rules at the start, as [`POST /policy`]"
             "(admin-api.md#policy) takes them.",
-            values.POLICY_LAYERS,
+            kinds.POLICY_LAYERS,
             default="none",
         ),
     ] = ()
@@ -216,7 +216,7 @@ class Settings:
         float,
         Option(
             "For operators: time at the start without registrations before `POST /policy` comes.",
-            values.time(0),
+            kinds.time(0),
         ),
     ] = 0.0
     direction: Annotated[
@@ -241,45 +241,45 @@ class Settings:
         Option(
             "Longest call of outside to a node, with 10,000 XML elements for each MiB. This and "
             "the next five: [bounds](limits.md).",
-            values.MEBIBYTES,
+            kinds.MEBIBYTES,
         ),
     ] = 1
     max_master_call: Annotated[
         int,
         Option(
             "Longest call with addresses of a node to the master; 5,000 elements for each MiB.",
-            values.MEBIBYTES,
+            kinds.MEBIBYTES,
         ),
     ] = 4
     max_body: Annotated[
         int,
         Option(
             "Longest parameter, or other call or reply without addresses, that passes.",
-            values.MEBIBYTES,
+            kinds.MEBIBYTES,
         ),
     ] = 64
     max_buffered: Annotated[
         int,
         Option(
             "Memory for all calls and replies that are read; one source gets half of it.",
-            values.MEBIBYTES,
+            kinds.MEBIBYTES,
         ),
     ] = 32
     max_connections_per_source: Annotated[
         int,
         Option(
             "Connections from one address; behind NAT or Docker's port proxy many share one.",
-            values.CONNECTIONS,
+            kinds.CONNECTIONS,
         ),
     ] = 4096
     max_connections_per_lease: Annotated[
-        int, Option("Connections to one port of the range.", values.CONNECTIONS)
+        int, Option("Connections to one port of the range.", kinds.CONNECTIONS)
     ] = 2048
     ros2_domain: Annotated[
         tuple[int, ...],
         Option(
             "[ROS 2](../guide/ros2.md): a domain. Repeatable; they share out the range equally.",
-            values.DOMAIN,
+            kinds.DOMAIN,
             variables=("ROSPROXY_ROS2_DOMAINS", "ROS_DOMAIN_ID"),
             repeatable=True,
             default="0",
@@ -291,7 +291,7 @@ class Settings:
             "ROS 2: a host outside that is told of participants inside, at the well-known ports of "
             "its first 32 participants; or another proxy, with the first port of its range, where "
             "this one has a single domain. Repeatable.",
-            values.PEER,
+            kinds.PEER,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,
             default="none",
@@ -302,7 +302,7 @@ class Settings:
         HostPort | None,
         Option(
             "ROS 2: where [`rosproxy ear`](../guide/ros2.md#the-lan) listens, for a single domain.",
-            values.HOST_PORT,
+            kinds.HOST_PORT,
             default="none",
         ),
     ] = None
@@ -397,4 +397,4 @@ class Settings:
 
         It is that of the token where that was given: the admin endpoint holds a hash in any case.
         """
-        return hash_token(self.admin_token) if self.admin_token else self.admin_token_hash
+        return kinds.hash_token(self.admin_token) if self.admin_token else self.admin_token_hash

@@ -5,7 +5,7 @@ from contextlib import AsyncExitStack
 from xmlrpc.client import Fault
 
 from examples.demo.fake_http import value
-from rosproxy.ros1.protocol.bounds import LONGEST_NAME
+from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME
 from tests.integration.net import (
     HOST,
     NODE,

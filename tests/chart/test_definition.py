@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
 )
 from rosproxy_operator.kubernetes.resources.model import Name, Pod
 from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, RULE_KINDS, rosproxy
-from rosproxy_operator.kubernetes.status.status import status_of
+from rosproxy_operator.kubernetes.status.rosproxy_status import status_of
 from tests.chart.chart import Json
 
 DEFINITION = custom_resource()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy_operator.common.metrics import ClusterMetrics, CommonMetrics, DockerMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics, CommonMetrics, DockerMetrics
 from tests.chart.monitoring import expressions, metrics
 from tests.docker.controller import Controller, Proxy, proxies
 from tests.docker.engine import docker, wait_until

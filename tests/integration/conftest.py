@@ -66,7 +66,9 @@ def is_left_out(record: logging.LogRecord) -> bool:
 def machines_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """All hosts of a test are on one machine: here none of their addresses is another's."""
     for question in ("is_own", "is_loopback"):
-        monkeypatch.setattr(f"rosproxy.ros1.standins.outside.{question}", lambda address: False)
+        monkeypatch.setattr(
+            f"rosproxy.ros1.standins.outside_nodes.{question}", lambda address: False
+        )
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 
 from examples.demo.fake_http import Where, free_ports, where
 from examples.demo.fake_node import FakeNode
-from rosproxy.app.proxy import App
+from rosproxy.app.process import App
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint

@@ -350,7 +350,7 @@ async def test_a_compressed_reply_is_not_inflated(proxy, master):
 
 
 async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
-    monkeypatch.setattr("rosproxy.admin.server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr("rosproxy.admin.admin_server.MOST_CONNECTIONS", 3)
     where = proxy.settings.admin.host, proxy.settings.admin.port
     ask = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
     async with connect(where) as first, connect(where) as second, connect(where) as third:
@@ -364,7 +364,7 @@ async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
 
 
 async def test_so_are_those_that_come_in_one_moment(proxy, monkeypatch):
-    monkeypatch.setattr("rosproxy.admin.server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr("rosproxy.admin.admin_server.MOST_CONNECTIONS", 3)
     where = proxy.settings.admin.host, proxy.settings.admin.port
     with ExitStack() as stack:  # all before the proxy has its turn
         conns = [stack.enter_context(socket.create_connection(where)) for _ in range(20)]
@@ -382,7 +382,7 @@ async def test_so_are_those_that_come_in_one_moment(proxy, monkeypatch):
 
 
 async def test_a_half_sent_body_at_the_admin_endpoint_is_408(proxy, monkeypatch):
-    monkeypatch.setattr("rosproxy.admin.server.BODY_TIMEOUT", 0.1)
+    monkeypatch.setattr("rosproxy.admin.admin_server.BODY_TIMEOUT", 0.1)
     where = proxy.settings.admin.host, proxy.settings.admin.port
     async with connect(where) as wire:
         await wire.send(post(b"{", "Content-Length: 10", path="/probe"))

@@ -13,7 +13,7 @@ import pytest
 
 from examples.demo.fake_http import Where
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
 from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
 from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, xml

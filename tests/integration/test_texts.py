@@ -7,7 +7,7 @@ from xmlrpc.client import Fault
 
 import pytest
 
-from rosproxy.ros1.protocol.bounds import LONGEST_NAME
+from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME
 from rosproxy.ros1.protocol.tcpros import encode_header
 from rosproxy.ros1.protocol.uris import LONGEST_URI
 from tests.integration.net import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosproxy.doctor.rules.ros2 import SETTLED
+from rosproxy.doctor.rules.participant import SETTLED
 from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab
 

@@ -144,7 +144,7 @@ def reference() -> str:
 
 def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.common.metrics import DockerMetrics
+    from rosproxy_operator.common.operator_metrics import DockerMetrics
     from rosproxy_operator.docker.planner.labels.readers import LABELS
 
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
@@ -156,7 +156,7 @@ def test_reference_names_every_option_label_and_metric_of_docker() -> None:
 
 def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.common.metrics import ClusterMetrics
+    from rosproxy_operator.common.operator_metrics import ClusterMetrics
     from rosproxy_operator.kubernetes.resources import names
 
     options = [opt for option in main.commands["kubernetes"].params for opt in option.opts]
@@ -179,9 +179,9 @@ def test_reference_names_every_metric_of_the_proxy() -> None:
 
 def rules() -> dict[str, set[str]]:
     """What the controller's service account has to be allowed, by resource, as its code says."""
-    from rosproxy_operator.kubernetes.api import client
+    from rosproxy_operator.kubernetes.api import api_client
 
-    lines = re.findall(r"^    ([a-z/]+) {2,}([a-z ]+)$", client.__doc__ or "", re.M)
+    lines = re.findall(r"^    ([a-z/]+) {2,}([a-z ]+)$", api_client.__doc__ or "", re.M)
     return {resource: set(verbs.split()) for resource, verbs in lines}
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosproxy.access.rules import format_rules
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 from tests.run_options import parse_settings, settings_of
 
 GIVEN: dict[str, Any] = {

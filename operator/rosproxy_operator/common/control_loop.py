@@ -16,7 +16,7 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 
-from rosproxy_operator.common.metrics import CommonMetrics
+from rosproxy_operator.common.operator_metrics import CommonMetrics
 
 log = logging.getLogger(__name__)
 

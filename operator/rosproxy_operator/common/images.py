@@ -1,6 +1,6 @@
 """The name of a container image, as options have it."""
 
-from rosproxy.values import Text
+from rosproxy.setting_kinds import Text
 
 
 def read_image(text: str) -> str:

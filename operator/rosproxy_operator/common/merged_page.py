@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.page.document import (
+from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
     HOST,

@@ -12,8 +12,8 @@ from typing import Any
 
 from rosproxy import __version__
 from rosproxy.net.tasks import Tasks
-from rosproxy.page.document import Document
 from rosproxy.page.feed import Feed
+from rosproxy.page.page_document import Document
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy_operator.common.merged_page import merged

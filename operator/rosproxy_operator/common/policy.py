@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json
 from rosproxy.access.rules import MOST_RULES, Rule
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 
 ADMINISTRATOR = "administrator"
 """Name of the layer that the operator's options make, which is for every proxy."""

@@ -5,8 +5,8 @@ from typing import Any
 
 import msgspec
 
+from rosproxy.setting_kinds import declared
 from rosproxy.settings import Settings
-from rosproxy.values import declared
 
 PREFIX = "proxy-"
 """Before the names of the operator's options."""

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rosproxy.admin.findings import DoctorFinding, Severity, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, warning
 from rosproxy.telemetry.text import brief
 
 MOST_FINDINGS = 500

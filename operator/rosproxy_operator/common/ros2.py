@@ -2,8 +2,8 @@
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
+from rosproxy.setting_kinds import read_peer
 from rosproxy.settings import LEAST_PER_DOMAIN
-from rosproxy.values import read_peer
 
 LAST_DOMAIN = 232
 """The last one whose well-known ports are ports (DDSI-RTPS 2.5, 9.6.2.3)."""
@@ -43,7 +43,7 @@ def is_dds(rmw: str) -> bool:
 
 
 def ear_variables(domain: int, lan: str, bind: HostPort, proxy: HostPort) -> dict[str, str]:
-    """What an ear is told; see `rosproxy.ros2.servers.ear.EarSettings`."""
+    """What an ear is told; see `rosproxy.ros2.servers.multicast_ear.EarSettings`."""
     return {
         "ROSPROXY_EAR_DOMAIN": str(domain),
         "ROSPROXY_EAR_LAN": lan,

@@ -33,7 +33,7 @@ def status(settings: PlanSettings, as_json: bool, watch: bool, wait: float) -> N
     if as_json and watch:
         raise click.UsageError("--json or --watch, not both")
     from rosproxy_operator.docker.errors import EngineError
-    from rosproxy_operator.docker.status import show_status, watch_status
+    from rosproxy_operator.docker.host_status import show_status, watch_status
 
     if watch:
         watch_status(settings)
@@ -53,7 +53,7 @@ def plan(settings: PlanSettings, as_json: bool, wait: float) -> None:
     the operator can't mend.
     """
     from rosproxy_operator.docker.errors import EngineError
-    from rosproxy_operator.docker.status import show_plan
+    from rosproxy_operator.docker.host_status import show_plan
 
     with exit_on_error(EngineError):
         sys.exit(show_plan(settings, as_json, wait))

@@ -15,16 +15,16 @@ import time
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
-from rosproxy.page.document import Document
+from rosproxy.page.page_document import Document
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
-from rosproxy_operator.common.health import HealthServer
-from rosproxy_operator.common.metrics import DockerMetrics
+from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.master_resolver import AGAIN_UNRESOLVED, MasterResolver
+from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
 from rosproxy_operator.docker import engine_json
-from rosproxy_operator.docker.client import DockerClient, Json, listen
+from rosproxy_operator.docker.engine_client import DockerClient, Json, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan

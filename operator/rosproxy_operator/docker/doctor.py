@@ -8,15 +8,15 @@ where the proxy is. What mends a proxy is said in labels and options of the oper
 import asyncio
 from collections.abc import Iterator, Sequence
 
-from rosproxy.admin.findings import DoctorFinding, error, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
 from rosproxy.telemetry.text import plural
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.docker.client import DockerClient
+from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.host_status import survey
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.docker.status import survey
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""

@@ -10,9 +10,9 @@ from typing import Any, TypedDict
 
 import msgspec
 
-from rosproxy_operator.docker.client import Json
+from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
-from rosproxy_operator.docker.planner.own import Making
+from rosproxy_operator.docker.planner.own_containers import Making
 from rosproxy_operator.docker.planner.specs import SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.

@@ -18,7 +18,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker import engine_json
-from rosproxy_operator.docker.client import DockerClient, Json
+from rosproxy_operator.docker.engine_client import DockerClient, Json
 from rosproxy_operator.docker.errors import Conflict, EngineError, Gone, PortTaken
 from rosproxy_operator.docker.planner.actions import (
     Action,
@@ -37,7 +37,7 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.model import Key
-from rosproxy_operator.docker.planner.own import forgery_reason
+from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import (

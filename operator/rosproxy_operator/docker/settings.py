@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from rosproxy import values as common_values
+from rosproxy import setting_kinds as kinds
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.values import (
+from rosproxy.setting_kinds import (
     DataPlane,
     Direction,
     Option,
@@ -23,7 +23,7 @@ from rosproxy.values import (
 from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
-from rosproxy_operator.docker import values
+from rosproxy_operator.docker import option_values
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 GIBIBYTE = 1024 * 1024 * 1024
@@ -49,7 +49,7 @@ class PlanSettings:
         str | None,
         Option(
             "The real ROS master of containers that name none.",
-            values.SHARED_MASTER_URI,
+            option_values.SHARED_MASTER_URI,
             variables=("ROSPROXY_MASTER_URI", "ROS_MASTER_URI"),
             default="none",
         ),
@@ -59,20 +59,22 @@ class PlanSettings:
         Option(
             "Name or address under which outside nodes and masters reach this host. Needed unless "
             "the operator is in the host's network.",
-            common_values.HOST,
+            kinds.HOST,
             default="the host's address towards the master",
         ),
     ] = None
-    ports: Annotated[int, Option("Ports of a proxy, one per node behind it.", values.PORTS)] = 32
+    ports: Annotated[
+        int, Option("Ports of a proxy, one per node behind it.", option_values.PORTS)
+    ] = 32
     port_window: Annotated[
-        PortRange, Option("Where ranges of ports are looked for.", common_values.PORT_RANGE)
+        PortRange, Option("Where ranges of ports are looked for.", kinds.PORT_RANGE)
     ] = WINDOW
     publish_address: Annotated[
         tuple[str, ...],
         Option(
             "Address of this host on which ports are published. One of a single interface keeps "
             "them off the others. Repeatable.",
-            common_values.BIND_ADDRESS,
+            kinds.BIND_ADDRESS,
             repeatable=True,
         ),
     ] = ("0.0.0.0",)
@@ -117,7 +119,7 @@ class PlanSettings:
             "A master that containers may name by label or `ROS_MASTER_URI`. `*` and `?` stand for "
             "other characters: `robot*:11311`, `*.lab.example`. Without a port: at any. "
             "`--master-uri` is allowed in any case. Repeatable.",
-            values.HOST_PATTERN,
+            option_values.HOST_PATTERN,
             repeatable=True,
             default="any, from port 1024 on",
             note="separated by spaces",
@@ -135,7 +137,7 @@ class PlanSettings:
         int,
         Option(
             "Most ports that a label may ask for. What `--ports` says they get anyway.",
-            values.PORTS,
+            option_values.PORTS,
         ),
     ] = 100
     allow_data_plane: Annotated[
@@ -153,7 +155,7 @@ class PlanSettings:
             "Most memory of each proxy (`512m`, `1g`, from 64m on; 0: no bound). A thousand "
             "connections at full rate take 0.2 GiB, and where the kernel counts socket buffers in "
             "(cgroup v2) 0.8.",
-            values.MEMORY,
+            option_values.MEMORY,
             default="1g",
         ),
     ] = GIBIBYTE
@@ -162,7 +164,7 @@ class PlanSettings:
         Option(
             "Most threads and processes of each proxy, from 256 on; 0: no bound. A connection "
             "takes one or two: that is for 4,000 that talk both ways.",
-            values.PIDS,
+            option_values.PIDS,
         ),
     ] = 8192
     proxy_bounds: ProxyBounds = OWN_BOUNDS
@@ -173,7 +175,7 @@ class PlanSettings:
             "A file with the secret that the proxies' tokens are made of: at least 32 characters "
             "(`openssl rand -hex 32`). If it changes, proxies are made anew on their ports; nodes "
             "go on.",
-            values.SECRET,
+            option_values.SECRET,
             name="--secret-file",
             default="a random secret, kept as a label of the uplink network",
         ),
@@ -184,7 +186,7 @@ class PlanSettings:
             "ROS 2: a host that the label `rosproxy.peers` may name, written as `--allow-master`. "
             "Without a port: at any, and at the well-known ones. `--ros2-peer` is allowed in any "
             "case. Repeatable.",
-            values.HOST_PATTERN,
+            option_values.HOST_PATTERN,
             repeatable=True,
             default="any",
         ),
@@ -194,7 +196,7 @@ class PlanSettings:
         Option(
             "ROS 2: a host outside that every proxy tells of its participants, or another proxy, "
             "with the first port of its range. Repeatable.",
-            values.PEER_NAME,
+            option_values.PEER_NAME,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,
             default="none",
@@ -206,7 +208,7 @@ class PlanSettings:
         Option(
             "ROS 2: this host's IPv4 address on the LAN whose multicast the [ears]"
             "(../guide/docker.md#ros-2) hear; `none`: no ears.",
-            values.LAN,
+            option_values.LAN,
             default="the advertised address, else that towards hosts far away",
         ),
     ] = ""
@@ -224,7 +226,7 @@ class PlanSettings:
         str,
         Option(
             "Network that is created for the proxies; it has to sort before all others.",
-            values.NETWORK,
+            option_values.NETWORK,
         ),
     ] = "0-rosproxy"
 

@@ -16,10 +16,10 @@ from typing import Any
 import msgspec
 
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.resolver import THIS_HOST, MasterResolver
+from rosproxy_operator.common.master_resolver import THIS_HOST, MasterResolver
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker import engine_json, host
-from rosproxy_operator.docker.client import DockerClient, Json
+from rosproxy_operator.docker.engine_client import DockerClient, Json
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
@@ -33,7 +33,7 @@ from rosproxy_operator.docker.planner.model import (
     RedirectContainer,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.own import forgery_reason, has_own_name
+from rosproxy_operator.docker.planner.own_containers import forgery_reason, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     FORMER_TOKEN,
     ROLE_EAR,

@@ -14,7 +14,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import (
+from rosproxy_operator.kubernetes.api.api_client import (
     POLICIES,
     Api,
     ApiConflict,

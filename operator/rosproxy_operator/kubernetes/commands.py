@@ -20,7 +20,7 @@ def doctor(namespaces: tuple[str, ...], names: tuple[str, ...], as_json: bool) -
     nothing is wrong, with 1 if something is.
     """
     from rosproxy.cli.questions import print_findings
-    from rosproxy_operator.kubernetes.api.client import ApiError
+    from rosproxy_operator.kubernetes.api.api_client import ApiError
     from rosproxy_operator.kubernetes.doctor import examine
 
     with exit_on_error(ApiError):

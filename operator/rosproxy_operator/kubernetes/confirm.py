@@ -9,7 +9,7 @@ gone nothing else matters: the garbage collector deletes its pods already, so th
 
 from collections.abc import Iterable
 
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.planner.actions import (
     DeleteEar,
     DeletePolicy,

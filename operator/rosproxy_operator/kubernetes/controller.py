@@ -19,13 +19,13 @@ from collections.abc import Callable, Iterable
 from msgspec.structs import replace
 
 from rosproxy.net.tasks import Tasks
-from rosproxy.page.document import Document
+from rosproxy.page.page_document import Document
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api, ApiError, ApiUnavailable
+from rosproxy_operator.kubernetes.api.api_client import Api, ApiError, ApiUnavailable
 from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.due import PlanSchedule
 from rosproxy_operator.kubernetes.planner.parts import (
@@ -44,7 +44,7 @@ from rosproxy_operator.kubernetes.resources.model import ClusterFinding
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.status.events import stamp
-from rosproxy_operator.kubernetes.status.status import participants
+from rosproxy_operator.kubernetes.status.rosproxy_status import participants
 from rosproxy_operator.kubernetes.watch.reflector import Reflector, watched_collections
 from rosproxy_operator.kubernetes.watch.store import ClusterStore
 

@@ -13,9 +13,9 @@ from kubernetes.client.exceptions import ApiException
 from kubernetes.stream import stream
 from websocket import WebSocketException
 
-from rosproxy.admin.findings import DoctorFinding, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, warning
 from rosproxy_operator.common.proxy_doctor import command, read_findings
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import ADVERTISE_HOST

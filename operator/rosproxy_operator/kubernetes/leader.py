@@ -15,9 +15,9 @@ import uuid
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import (
+from rosproxy_operator.kubernetes.api.api_client import (
     LEASES,
     SOON,
     Api,

@@ -13,18 +13,18 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from rosproxy import __version__
-from rosproxy_operator.common.health import HealthServer
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.leader import LeaderElection
 from rosproxy_operator.kubernetes.serving import ClusterServing
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, certificate_source
-from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 
 log = logging.getLogger(__name__)
 

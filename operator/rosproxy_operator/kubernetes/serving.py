@@ -20,7 +20,7 @@ from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
-from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 
 log = logging.getLogger(__name__)
 

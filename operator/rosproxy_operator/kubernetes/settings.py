@@ -9,15 +9,22 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from rosproxy import values as common_values
+from rosproxy import setting_kinds as kinds
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.values import DataPlane, Option, SettingError, SlaveControl, make_settings, time
+from rosproxy.setting_kinds import (
+    DataPlane,
+    Option,
+    SettingError,
+    SlaveControl,
+    make_settings,
+    time,
+)
 from rosproxy_operator.common.images import IMAGE
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
-from rosproxy_operator.kubernetes import values
+from rosproxy_operator.kubernetes import option_values
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 
@@ -44,7 +51,7 @@ class Bounds(msgspec.Struct, frozen=True):
         Option(
             "Masters that a RosProxy may name, as `http://192.0.2.*:11311`. [How they are compared]"
             "(permissions.md#what-rosproxies-may-ask-for). Repeatable.",
-            values.GLOB,
+            option_values.GLOB,
             name="--allow-master",
             repeatable=True,
             default="any",
@@ -52,13 +59,15 @@ class Bounds(msgspec.Struct, frozen=True):
     ] = ()
     max_ports: Annotated[
         int,
-        Option("Most ports that a RosProxy may ask for: the highest `spec.ports`.", values.PORTS),
+        Option(
+            "Most ports that a RosProxy may ask for: the highest `spec.ports`.", option_values.PORTS
+        ),
     ] = MOST_PORTS
     window: Annotated[
         PortRange,
         Option(
             "Where a RosProxy may have hostPorts: `spec.portWindow` and `spec.master.publish`.",
-            common_values.PORT_RANGE,
+            kinds.PORT_RANGE,
             name="--allow-port-window",
         ),
     ] = EVERY_PORT
@@ -74,7 +83,7 @@ class Bounds(msgspec.Struct, frozen=True):
         tuple[str, ...],
         Option(
             "Images that `spec.image` may name besides `--proxy-image`. Repeatable.",
-            values.GLOB,
+            option_values.GLOB,
             name="--allow-image",
             repeatable=True,
             default="none",
@@ -92,7 +101,7 @@ class Bounds(msgspec.Struct, frozen=True):
         Option(
             "ROS 2: hosts that `spec.peers` may name, as `192.0.2.*`. A pattern without letters "
             "fits addresses only. Repeatable.",
-            values.GLOB,
+            option_values.GLOB,
             name="--allow-peer",
             repeatable=True,
             default="any",
@@ -127,7 +136,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
         PortRange,
         Option(
             "The API server's `--service-node-port-range`: no proxy gets a port of it.",
-            common_values.PORT_RANGE,
+            kinds.PORT_RANGE,
             name="--node-port-range",
         ),
     ] = NODE_PORTS
@@ -136,7 +145,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
         Option(
             "The nodes' `net.ipv4.ip_local_port_range`, from which their kernels take ports for "
             "connections: no proxy gets a port of it.",
-            common_values.PORT_RANGE,
+            kinds.PORT_RANGE,
             name="--ephemeral-range",
         ),
     ] = EPHEMERAL
@@ -151,7 +160,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
         tuple[Json, ...] | None,
         Option(
             "Whom it lets reach the proxies' admin port: a JSON list of NetworkPolicyPeers.",
-            values.NETWORK_PEERS,
+            option_values.NETWORK_PEERS,
             default="everybody",
         ),
     ] = None
@@ -172,7 +181,7 @@ class WebhookSettings(msgspec.Struct, frozen=True):
         Name | None,
         Option(
             "The webhook's Service, for whose names its certificate is made.",
-            values.NAME,
+            option_values.NAME,
             name="--webhook-service",
             default="none",
         ),
@@ -182,7 +191,7 @@ class WebhookSettings(msgspec.Struct, frozen=True):
         Option(
             "An existing Secret in which the certificate is kept. Without it a new one is made at "
             "each start.",
-            values.NAME,
+            option_values.NAME,
             name="--webhook-secret",
             default="none",
         ),
@@ -191,7 +200,7 @@ class WebhookSettings(msgspec.Struct, frozen=True):
         str,
         Option(
             "The MutatingWebhookConfiguration that is given its authority.",
-            values.OBJECT_NAME,
+            option_values.OBJECT_NAME,
             name="--webhook-configuration",
             default="none",
         ),
@@ -201,7 +210,7 @@ class WebhookSettings(msgspec.Struct, frozen=True):
         Option(
             "`tls.crt` and `tls.key` of somebody else's making, instead of the last three; read "
             "again when they change.",
-            values.DIRECTORY,
+            option_values.DIRECTORY,
             name="--webhook-cert-dir",
             default="none",
         ),
@@ -220,7 +229,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
         tuple[str, ...],
         Option(
             "Namespaces whose RosProxies are looked after. Repeatable.",
-            values.NAMESPACE,
+            option_values.NAMESPACE,
             name="--namespace",
             repeatable=True,
             default="all",
@@ -231,7 +240,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
         Option(
             "An existing Secret in which the key of the proxies' tokens is kept. Without it a new "
             "one is made at each start, and the proxies anew.",
-            values.NAME,
+            option_values.NAME,
             default="none",
         ),
     ] = None
@@ -241,7 +250,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
             "The Lease by which several operators [choose the one that acts]"
             "(../guide/kubernetes.md#two-operators). They share `--key-secret` and "
             "`--webhook-secret`.",
-            values.NAME,
+            option_values.NAME,
             default="there is no other",
         ),
     ] = None
@@ -253,7 +262,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
             "Where `/healthz`, `/readyz`, `/metrics` and the [live page of all proxies]"
             "(../guide/live-page.md#all-proxies-of-a-host-or-a-cluster) are, which is for callers "
             "on loopback (`kubectl port-forward`).",
-            common_values.host_port(DEFAULT_ADMIN),
+            kinds.host_port(DEFAULT_ADMIN),
             name="--admin-bind",
         ),
     ] = DEFAULT_ADMIN
@@ -261,7 +270,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
         HostPort,
         Option(
             "Where `/healthz` is served for the kubelet: it fails when any part hangs.",
-            common_values.host_port(DEFAULT_LIVENESS),
+            kinds.host_port(DEFAULT_LIVENESS),
             name="--liveness-bind",
         ),
     ] = DEFAULT_LIVENESS

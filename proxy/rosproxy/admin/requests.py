@@ -11,8 +11,8 @@ import msgspec
 
 from rosproxy.access.layers import WrittenLayer
 from rosproxy.net.addresses import HostPort, parse_address
+from rosproxy.setting_kinds import read_peer
 from rosproxy.telemetry.text import clean, shorten
-from rosproxy.values import read_peer
 
 Body = TypeVar("Body", bound=msgspec.Struct)
 # Not the narrower rule of DNS: names of containers have underscores as well.

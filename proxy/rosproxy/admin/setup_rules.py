@@ -7,7 +7,7 @@ from it is not reported.
 
 from collections.abc import Iterator, Sequence
 
-from rosproxy.admin.findings import DoctorFinding, error, note, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.status_document import PortsStatus
 from rosproxy.net.addresses import is_loopback

@@ -1,11 +1,11 @@
 """The document at ``/status``: one definition for the proxy and for all who read it.
 
-`rosproxy.admin.status` fills it in; ``rosproxy status``, ``rosproxy doctor`` and the operator read
-it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made of what ROS
-nodes say of themselves and may come from another version of the proxy. So reading is tolerant:
-unknown keys are ignored, what is missing or of another type gets its default, and items of a list
-that are of another type are left out. The proxy bounds texts and lists by what it admits
-(`rosproxy.ros1.protocol.bounds`), but another version may not, and texts may hold control
+`rosproxy.admin.common_status` fills it in; ``rosproxy status``, ``rosproxy doctor`` and the
+operator read it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made
+of what ROS nodes say of themselves and may come from another version of the proxy. So reading is
+tolerant: unknown keys are ignored, what is missing or of another type gets its default, and items
+of a list that are of another type are left out. The proxy bounds texts and lists by what it admits
+(`rosproxy.ros1.protocol.name_lengths`), but another version may not, and texts may hold control
 characters: `rosproxy.telemetry.text` makes them fit to be shown.
 
 Times are in seconds, rates in bytes per second; ``sent`` is what went outside.
@@ -155,7 +155,7 @@ class EndpointStatus(msgspec.Struct, frozen=True):
     """What is registered with one slave URI: one node as a rule, several for nodelets.
 
     ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
-    ``state`` is one of `rosproxy.telemetry.metrics.STATES`. ``left_out``: how many names and
+    ``state`` is one of `rosproxy.ros1.registry.endpoint.STATES`. ``left_out``: how many names and
     connections there are besides those in the lists (`rosproxy.admin.status_bounds`).
     """
 

@@ -16,11 +16,11 @@ from rosproxy.admin.requests import BodyError, PolicyNews, read_body
 from rosproxy.admin.status_document import to_json
 from rosproxy.app.stacks import Stack
 from rosproxy.runtime import Runtime
+from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
-from rosproxy.values import SettingError
 
 OPERATOR_POLICY = "the operator's policy"
 """The subject of the problem that it was refused, which the proxy's status shows."""

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, published_range
 from rosproxy.admin.status_document import PortsStatus, to_json

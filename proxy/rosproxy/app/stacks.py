@@ -6,8 +6,8 @@ This is where one is plugged in: everything else here, and the admin endpoint, k
 from collections.abc import Mapping
 from typing import Protocol
 
+from rosproxy.admin.admin_server import Action
 from rosproxy.admin.requests import EnforcementCounts, PortProbe
-from rosproxy.admin.server import Action
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.ros1.stack import Ros1
 from rosproxy.ros2.stack import Ros2

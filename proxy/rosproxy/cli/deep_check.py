@@ -9,7 +9,7 @@ import asyncio
 
 from msgspec.structs import replace
 
-from rosproxy.admin.findings import DoctorFinding, error
+from rosproxy.admin.doctor_finding import DoctorFinding, error
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.status_document import PortsStatus, ProxyStatus, StatusSettings
 from rosproxy.app.stacks import make_stacks
@@ -21,8 +21,8 @@ from rosproxy.net import sockets
 from rosproxy.net.addresses import is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
+from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
-from rosproxy.values import SettingError
 
 
 def deep_check(settings: Settings) -> list[DoctorFinding]:

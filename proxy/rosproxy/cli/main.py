@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from rosproxy import __version__, values
+from rosproxy import __version__
+from rosproxy import setting_kinds as kinds
 from rosproxy.cli import options, questions
 from rosproxy.settings import Settings
 
@@ -46,13 +47,13 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
     if deep and not check:
         raise click.UsageError("--deep needs --check")
     with options.setting_errors():
-        settings = values.make_settings(Settings, given)
+        settings = kinds.make_settings(Settings, given)
         logs.set_up(log_format, log_level)
         unknown = options.unknown_variables(main)
         if not check:
-            from rosproxy.app import proxy
+            from rosproxy.app import process
 
-            proxy.run(settings, {variable.name: variable.text for variable in unknown})
+            process.run(settings, {variable.name: variable.text for variable in unknown})
         else:
             _check(settings, deep)
 
@@ -71,23 +72,23 @@ def _check(settings: Any, deep: bool) -> None:
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY_EAR", "show_default": True})
 @click.option(
-    "--domain", type=options.click_type(values.DOMAIN), default=0, help="The domain of DDS."
+    "--domain", type=options.click_type(kinds.DOMAIN), default=0, help="The domain of DDS."
 )
 @click.option(
     "--lan",
-    type=options.click_type(values.ADDRESS),
+    type=options.click_type(kinds.ADDRESS),
     required=True,
     help="This host's address on the LAN.",
 )
 @click.option(
     "--bind",
-    type=options.click_type(values.HOST_PORT),
+    type=options.click_type(kinds.HOST_PORT),
     required=True,
     help="Address and port that the proxy reaches, its --ros2-ear.",
 )
 @click.option(
     "--proxy",
-    type=options.click_type(values.HOST_PORT),
+    type=options.click_type(kinds.HOST_PORT),
     required=True,
     help="The proxy's address, as this host reaches it, and the first port of its range.",
 )
@@ -98,8 +99,8 @@ def ear(log_format: str, log_level: str, **given: Any) -> None:
 
     Nothing else: what users send goes through the ports that the host publishes.
     """
-    from rosproxy.app.ear import run_ear
-    from rosproxy.ros2.servers.ear import EarSettings
+    from rosproxy.app.ear_program import run_ear
+    from rosproxy.ros2.servers.multicast_ear import EarSettings
     from rosproxy.telemetry import logs
 
     with options.setting_errors():

@@ -15,11 +15,11 @@ from typing import Any
 
 import click
 
-from rosproxy import values
+from rosproxy import setting_kinds as kinds
 from rosproxy.cli import variables
 from rosproxy.cli.config_file import read_config
 from rosproxy.cli.variables import UnknownVariable
-from rosproxy.values import Setting, SettingError, declared
+from rosproxy.setting_kinds import Setting, SettingError, declared
 
 Command = Callable[..., Any]
 GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -53,21 +53,21 @@ class Seconds(click.FloatRange):
     name = "s"
 
     def __init__(self, least: float) -> None:
-        super().__init__(least, values.DAY)
+        super().__init__(least, kinds.DAY)
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         """The value of a text. Raises click.BadParameter."""
         seconds = float(click.FLOAT.convert(value, param, ctx))
-        if math.isnan(seconds) or not 0 <= (self.min or 0) <= seconds <= values.DAY:
-            self.fail(f"{seconds:g} s is not between {self.min:g} and {values.DAY} s", param, ctx)
+        if math.isnan(seconds) or not 0 <= (self.min or 0) <= seconds <= kinds.DAY:
+            self.fail(f"{seconds:g} s is not between {self.min:g} and {kinds.DAY} s", param, ctx)
         return seconds
 
 
-def click_type(kind: values.Text | values.Number) -> click.ParamType:  # type: ignore[type-arg]
+def click_type(kind: kinds.Text | kinds.Number) -> click.ParamType:  # type: ignore[type-arg]
     """A kind of value, for click."""
-    if isinstance(kind, values.Text):
+    if isinstance(kind, kinds.Text):
         return Parsed(kind.form, kind.read, kind.separable)
     if kind.seconds:
         return Seconds(kind.least)

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import click
 
-from rosproxy import values
+from rosproxy import setting_kinds as kinds
 from rosproxy.cli import options
 
 WAIT_INTERVAL = 0.5
@@ -19,7 +19,7 @@ WAIT_INTERVAL = 0.5
 
 
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
-    from rosproxy.admin.client import AdminClient, default_url
+    from rosproxy.admin.admin_client import AdminClient, default_url
 
     # As for the proxy itself, what is given on the command line or in a variable comes before the
     # file.
@@ -101,7 +101,7 @@ def _open_page(admin: Any) -> None:
 
 def _why_not_ready(admin: Any) -> str:
     """Why nodes can't use the proxy; empty if they can."""
-    from rosproxy.admin.client import AdminError
+    from rosproxy.admin.admin_client import AdminError
 
     try:
         admin.get("/readyz")
@@ -122,19 +122,19 @@ def health(admin: Any) -> None:
 @_admin_option
 @click.option(
     "--master-uri",
-    type=options.click_type(values.MASTER_URI),
+    type=options.click_type(kinds.MASTER_URI),
     envvar="ROS_MASTER_URI",
     help="The master to look at if the proxy can't be asked for its own.",
 )
 @click.option(
     "--advertise-host",
-    type=options.click_type(values.HOST),
+    type=options.click_type(kinds.HOST),
     envvar="ROSPROXY_ADVERTISE_HOST",
     help="The advertised host if the proxy can't be asked for it.",
 )
 @click.option(
     "--master-address",
-    type=options.click_type(values.ADDRESS),
+    type=options.click_type(kinds.ADDRESS),
     envvar="ROSPROXY_MASTER_ADDRESS",
     help="The IP address of the master's host if the proxy can't be asked for it.",
 )
@@ -187,20 +187,20 @@ def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
     """Print findings, and exit with 1 if something is wrong."""
     import json
 
-    from rosproxy.admin.findings import failed
+    from rosproxy.admin.doctor_finding import failed
     from rosproxy.cli import terminal
-    from rosproxy.doctor import findings
+    from rosproxy.doctor import presentation
 
     if as_json:
-        terminal.write(json.dumps(findings.as_json(diagnosis), indent=2))
+        terminal.write(json.dumps(presentation.as_json(diagnosis), indent=2))
     else:
-        terminal.write(findings.render(diagnosis, terminal.size()[0]))
+        terminal.write(presentation.render(diagnosis, terminal.size()[0]))
     sys.exit(1 if failed(diagnosis) else 0)
 
 
 def _or_exit(ask: Callable[[], object]) -> None:
     """Do something that may find the proxy absent, and say so in one line."""
-    from rosproxy.admin.client import AdminError
+    from rosproxy.admin.admin_client import AdminError
 
     try:
         ask()

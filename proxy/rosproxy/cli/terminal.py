@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.highlighter import RegexHighlighter
 from rich.live import Live
 
-from rosproxy.admin.client import AdminClient, AdminError
+from rosproxy.admin.admin_client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
 
 WATCH_INTERVAL = 2.0

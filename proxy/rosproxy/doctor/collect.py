@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from rosproxy.admin.client import AdminClient, AdminError
+from rosproxy.admin.admin_client import AdminClient, AdminError
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.domain_survey import ask_participants
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant, SystemState

@@ -29,7 +29,7 @@ from rosproxy.doctor.facts import (
 from rosproxy.doctor.rules.pair import is_connected
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy.net.resolver import resolve
-from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
 from rosproxy.ros1.registry.memory import NAMESPACE, lease_at

@@ -6,12 +6,12 @@ those of a participant's ports.
 
 from collections.abc import Iterator
 
-from rosproxy.admin.findings import DoctorFinding
+from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus, ProxyStatus
 from rosproxy.doctor.facts import DoctorFacts
-from rosproxy.doctor.rules.ros2 import check
+from rosproxy.doctor.rules.participant import check
 from rosproxy.net.addresses import is_loopback
-from rosproxy.page.document import (
+from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
     HOST,

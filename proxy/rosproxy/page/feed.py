@@ -16,13 +16,13 @@ import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
 from functools import partial
 
-from rosproxy.admin.findings import DoctorFinding
+from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
 from rosproxy.net.tasks import Tasks
-from rosproxy.page.document import Json
-from rosproxy.page.graph import Judged, graph_document, judge, relayed, topics_to_ask_about
+from rosproxy.page.graph_document import Judged, graph_document, judge, relayed, topics_to_ask_about
 from rosproxy.page.measures import Measures
+from rosproxy.page.page_document import Json
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from aiohttp import web
 
 from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy.page.changes import changes
-from rosproxy.page.document import Json
 from rosproxy.page.feed import Ended, Feed, TooManyWatchers
+from rosproxy.page.page_document import Json
 from rosproxy.page.visitors import SESSION, Visitors, cookie_name
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]

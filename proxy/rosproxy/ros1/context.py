@@ -11,12 +11,12 @@ from rosproxy.net.addresses import Network, is_inside
 from rosproxy.net.budget import Budget
 from rosproxy.net.gate import Gate
 from rosproxy.net.interfaces import address_towards, interface_networks
-from rosproxy.ros1.clients.master import MasterClient
-from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.clients.master_client import MasterClient
+from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.protocol.xmlrpc import limits
+from rosproxy.ros1.registry.client_kinds import ClientKind, client_kind
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
-from rosproxy.ros1.registry.selection import ClientKind, client_kind
 from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.runtime import Runtime

@@ -18,7 +18,7 @@ from rosproxy.admin.requests import PortProbe
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
-from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
+from rosproxy.ros1.clients.master_client import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc

@@ -11,6 +11,7 @@ import resource
 from collections.abc import Mapping
 from typing import Any
 
+from rosproxy.admin.admin_server import Action
 from rosproxy.admin.requests import (
     ContainerNews,
     EmptyBody,
@@ -19,7 +20,6 @@ from rosproxy.admin.requests import (
     PortProbe,
     read_body,
 )
-from rosproxy.admin.server import Action
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.binding import report_taken_ports, setting_error_if_taken
 from rosproxy.forwarding.kernel.nft import Table
@@ -40,9 +40,9 @@ from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
-from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
+from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
-from rosproxy.ros1.standins.ports import TIDY_INTERVAL, StandInPorts
+from rosproxy.ros1.standins.stand_in_ports import TIDY_INTERVAL, StandInPorts
 from rosproxy.ros1.status import Ros1State
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
@@ -56,7 +56,7 @@ from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
 from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 from rosproxy.runtime import Runtime
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from rosproxy.admin import status_document as document
-from rosproxy.admin.status import with_hidden
+from rosproxy.admin.common_status import with_hidden
 from rosproxy.admin.status_bounds import bounded
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
@@ -18,8 +18,8 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import STATES, Endpoint
 from rosproxy.ros1.rewriting.policing import KINDS
-from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.standins.ports import StandInPorts
+from rosproxy.ros1.servers.tcpros_server import TcprosServer
+from rosproxy.ros1.standins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 from rosproxy.telemetry.metrics import NamedNodes
 

@@ -9,6 +9,8 @@ from typing import Any
 from msgspec.structs import replace
 
 from rosproxy.access.rules import RuleKind
+from rosproxy.admin.admin_server import Action
+from rosproxy.admin.common_status import with_hidden
 from rosproxy.admin.requests import (
     ContainerNews,
     EmptyBody,
@@ -16,8 +18,6 @@ from rosproxy.admin.requests import (
     PortProbe,
     read_body,
 )
-from rosproxy.admin.server import Action
-from rosproxy.admin.status import with_hidden
 from rosproxy.admin.status_document import PortsStatus, ProxyStatus
 from rosproxy.binding import report_taken_ports, setting_error_if_taken
 from rosproxy.forwarding.kernel.nft import Table, Transport
@@ -34,13 +34,13 @@ from rosproxy.ros2.discovery.domain_settings import DomainSettings
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import DomainWatch
-from rosproxy.ros2.registry.ports import REMEMBERED
+from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.registry.selected import NEWS_TIMEOUT
 from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
 from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 
 log = logging.getLogger(__name__)
 

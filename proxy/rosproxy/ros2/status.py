@@ -12,7 +12,13 @@ from rosproxy.admin import status_document as document
 from rosproxy.admin.status_bounds import bounded_names
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_plane import DomainPlane
-from rosproxy.ros2.protocol.names import is_of_service, ros_name, ros_service, ros_topic, ros_type
+from rosproxy.ros2.protocol.ros_names import (
+    is_of_service,
+    ros_name,
+    ros_service,
+    ros_topic,
+    ros_type,
+)
 from rosproxy.ros2.registry.matching import MismatchedPair, mismatched_pairs
 from rosproxy.ros2.registry.participants import (
     DdsEndpoint,

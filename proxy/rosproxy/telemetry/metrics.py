@@ -1,4 +1,4 @@
-"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.status`.
+"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.common_status`.
 
 Counters of few outcomes begin with 0: Prometheus sees no increase in a series that begins with 1,
 and no alert would tell of what happened once.

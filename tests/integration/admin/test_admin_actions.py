@@ -8,7 +8,7 @@ from examples.demo.fake_http import End, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from tests.integration.admin_calls import news, post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -36,7 +36,7 @@ PATIENT = {"cleanup_after": 0.0, "linger": 60.0}
 @pytest.fixture
 def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
     """No caller counts as one on loopback; in these tests all are."""
-    monkeypatch.setattr("rosproxy.admin.server.is_loopback", lambda _: False)
+    monkeypatch.setattr("rosproxy.admin.admin_server.is_loopback", lambda _: False)
 
 
 PATHS = ["/probe", "/containers", "/master-address", "/retire", "/policy", "/page-key"]

@@ -36,7 +36,7 @@ LINK = "topic /chatter /talker /outside"
 @pytest.fixture
 def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
     """No caller counts as one on loopback; in these tests all are."""
-    for module in ("rosproxy.admin.server", "rosproxy.page.visitors"):
+    for module in ("rosproxy.admin.admin_server", "rosproxy.page.visitors"):
         monkeypatch.setattr(f"{module}.is_loopback", lambda _: False)
 
 

@@ -10,7 +10,7 @@ import pytest
 from examples.demo.fake_http import free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.proxy_process import clean_environment
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.ros1.range_probe import probe_range
 from tests.integration.commands import run
 from tests.integration.conftest import MakeNode, MakeProxy

@@ -14,7 +14,7 @@ import pytest
 
 from examples.demo.fake_http import End, Where, where
 from examples.demo.proxy_process import clean_environment
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 from tests.integration.net import (
     HOST,
     MASTER,

@@ -11,9 +11,9 @@ from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Refused
-from rosproxy.ros2.discovery.inside import InsideParticipants
+from rosproxy.ros2.discovery.inside_participants import InsideParticipants
+from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
-from rosproxy.ros2.registry.ports import LocatorPorts
 from rosproxy.runtime import Runtime
 from tests.integration.kernel_fake import FakeTools, clear_the_way
 from tests.integration.net import until

@@ -9,7 +9,7 @@ import pytest
 from examples.demo.fake_http import free_ports, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.ros1.clients.master import MasterClient, Unreachable
+from rosproxy.ros1.clients.master_client import MasterClient, Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind
 from tests.integration.admin_calls import news, post
 from tests.integration.conftest import MakeNode, MakeProxy

@@ -13,7 +13,7 @@ from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers import callers
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import news
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -378,7 +378,7 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
         await robot.stop()
         await proxy.ros1.stand_ins.tidy()
         assert set(problems(proxy)) == {robot.service_api}
-        monkeypatch.setattr("rosproxy.ros1.standins.ports.SERVICE_PROBLEM", 0.0)
+        monkeypatch.setattr("rosproxy.ros1.standins.stand_in_ports.SERVICE_PROBLEM", 0.0)
         await proxy.ros1.stand_ins.tidy()
         assert problems(proxy) == {}
 
@@ -458,7 +458,7 @@ async def test_an_address_that_leads_back_makes_no_loop(
 ) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
-    monkeypatch.setattr("rosproxy.ros1.standins.outside.is_own", lambda address: True)
+    monkeypatch.setattr("rosproxy.ros1.standins.outside_nodes.is_own", lambda address: True)
     proxy.ros1.context.upstream.master_address = PROXY
     assert await knock(service(robot), service_header(), NODE) == "reset"
     assert await refuses(service(robot), NODE)

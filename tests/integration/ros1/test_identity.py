@@ -10,7 +10,7 @@ from examples.demo.fake_http import End, FakeHttpServer, call, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.servers import callers
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import news, post, tell
 from tests.integration.claims import claim, silent_servers

@@ -7,7 +7,7 @@ import pytest
 
 from examples.demo.fake_http import End, free_ports, ok, value
 from examples.demo.fake_node import FakeNode
-from rosproxy.ros1.clients.master import CALLER_ID
+from rosproxy.ros1.clients.master_client import CALLER_ID
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import (
     HOST,

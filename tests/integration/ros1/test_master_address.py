@@ -7,7 +7,7 @@ import pytest
 from examples.demo.fake_http import where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.admin.client import AdminClient
+from rosproxy.admin.admin_client import AdminClient
 from rosproxy.doctor.collect import collect
 from rosproxy.doctor.facts import Reach
 from tests.integration.admin_calls import post, tell

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.admin.findings import Severity
+from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.requests import PortProbe, RangeProbe
 from rosproxy.admin.setup_rules import advertised_host, few_ports, published_range
 from rosproxy.admin.status_document import PortsStatus

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.admin.requests import read_probe
 from rosproxy.admin.status_document import read_status
 from rosproxy.doctor.facts import (

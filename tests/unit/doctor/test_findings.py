@@ -1,7 +1,7 @@
 """How findings are shown."""
 
-from rosproxy.admin.findings import DoctorFinding, Severity, failed
-from rosproxy.doctor.findings import as_json, render
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
+from rosproxy.doctor.presentation import as_json, render
 from rosproxy.doctor.rules import diagnose
 from tests.unit.doctor.cases import make_facts
 

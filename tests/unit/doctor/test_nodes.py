@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach, SystemState
 from rosproxy.doctor.rules import node as node_rules
 from rosproxy.net.addresses import HostPort

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,

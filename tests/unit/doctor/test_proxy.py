@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach
 from rosproxy.doctor.rules import proxy as proxy_rules
 from tests.unit.doctor.cases import (

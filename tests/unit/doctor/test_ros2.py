@@ -3,7 +3,7 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.findings import Severity, failed
+from rosproxy.admin.doctor_finding import Severity, failed
 from rosproxy.admin.requests import PortProbe, RangeProbe
 from rosproxy.admin.status_document import (
     DomainStatus,

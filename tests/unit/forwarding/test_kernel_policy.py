@@ -17,7 +17,7 @@ from rosproxy.forwarding.kernel.decisions import (
 )
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 
 NODE = "10.0.0.5"
 THERE, THERE_SIX = HostPort(NODE, 50000), HostPort("fd00::5", 50000)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from tests.unit.operator.kubernetes.api_server import ApiServer, serving
 
 

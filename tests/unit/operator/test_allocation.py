@@ -5,7 +5,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import (
+from rosproxy_operator.common.port_negotiation import (
     PortsExhausted,
     after_move,
     extended,

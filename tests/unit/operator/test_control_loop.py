@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
-from rosproxy_operator.common.metrics import DockerMetrics
+from rosproxy_operator.common.operator_metrics import DockerMetrics
 
 PACE = Pace("engine", resync=30.0, debounce=0.1, longest=60.0)
 AWAY = LookFailed("no engine", away=True)

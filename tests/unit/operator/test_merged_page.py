@@ -5,7 +5,14 @@ from typing import Any
 
 import pytest
 
-from rosproxy.page.document import BROKEN, MOST_LINKS, Document, PageFinding, PageLink, PageNode
+from rosproxy.page.page_document import (
+    BROKEN,
+    MOST_LINKS,
+    Document,
+    PageFinding,
+    PageLink,
+    PageNode,
+)
 from rosproxy_operator.common.merged_page import merged, read_document
 
 MASTER = "http://robot:11311"

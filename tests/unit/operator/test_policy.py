@@ -13,7 +13,7 @@ from msgspec import structs
 from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json, read_layers
 from rosproxy.access.rules import parse_rules
 from rosproxy.net.addresses import HostPort
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 from rosproxy_operator.common.policy import (
     LONGEST_POLICY,
     MOST_AUTHORS_RULES,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.findings import DoctorFinding, Severity, error, ok
-from rosproxy.doctor.findings import as_json
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, ok
+from rosproxy.doctor.presentation import as_json
 from rosproxy_operator.common.proxy_doctor import read_findings
 from rosproxy_operator.docker.doctor import CURES, host_findings
 from rosproxy_operator.kubernetes.status.conditions import cluster_findings

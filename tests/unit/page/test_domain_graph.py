@@ -10,7 +10,7 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StatusSettings,
 )
-from rosproxy.page.graph import graph_document
+from rosproxy.page.graph_document import graph_document
 from rosproxy.page.measures import Measures
 
 DATA = LocatorStatus(11402, "172.30.0.5:7411", "data", rate=123.0, plane="kernel")

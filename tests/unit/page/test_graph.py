@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.admin.findings import error
+from rosproxy.admin.doctor_finding import error
 from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach, SlaveReport, SystemState
-from rosproxy.page.document import LONGEST, MOST_LINKS
-from rosproxy.page.graph import Judged, graph_document, judge, relayed, topics_to_ask_about
+from rosproxy.page.graph_document import Judged, graph_document, judge, relayed, topics_to_ask_about
 from rosproxy.page.measures import Measures
+from rosproxy.page.page_document import LONGEST, MOST_LINKS
 from tests.unit.doctor.cases import INSIDE_URI, by_name, listener, make_facts, talker
 from tests.unit.status_json import make_connection, make_node, make_status
 

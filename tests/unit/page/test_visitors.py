@@ -6,7 +6,7 @@ import pytest
 from aiohttp.test_utils import make_mocked_request
 
 from rosproxy.page.visitors import KEY, MOST, SESSION, ExpiringTokens, Visitors, is_own_host
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 
 TOKEN = "a token of a test"
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.ros1.clients.master import MasterError, read_value
+from rosproxy.ros1.clients.master_client import MasterError, read_value
 
 STATS = [[["/chatter", [[1, 48, 48, 3, 0]]]], []]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from prometheus_client.exposition import generate_latest
 
-from rosproxy.ros1.registry.selection import ClientKind
+from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.telemetry.metrics import (
     BOUNDS,
     MOST_NAMES,

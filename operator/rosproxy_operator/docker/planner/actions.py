@@ -11,8 +11,8 @@ import msgspec
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import clean
-from rosproxy.values import DataPlane, Direction, SlaveControl
 from rosproxy_operator.docker.planner.model import Key
 
 

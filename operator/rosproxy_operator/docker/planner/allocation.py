@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import (
+from rosproxy_operator.common.port_negotiation import (
     RETRY_FOR,
     Move,
     PortsExhausted,

@@ -9,8 +9,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import is_address
+from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import listed
-from rosproxy.values import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2 import LEAST_PORTS
 from rosproxy_operator.docker.planner.labels.readers import (

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.option_values import NOWHERE
 from rosproxy_operator.docker.planner.actions import (
     Action,
     CreateEar,
@@ -19,8 +20,8 @@ from rosproxy_operator.docker.planner.actions import (
     Rename,
     Start,
 )
+from rosproxy_operator.docker.planner.duplicates import free_name
 from rosproxy_operator.docker.planner.model import HostState, Key
-from rosproxy_operator.docker.planner.selection import free_name
 from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
 from rosproxy_operator.docker.planner.steps import (
     PlanContext,
@@ -29,7 +30,6 @@ from rosproxy_operator.docker.planner.steps import (
     keep_running_steps,
 )
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.docker.values import NOWHERE
 
 
 def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:

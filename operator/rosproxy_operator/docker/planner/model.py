@@ -7,7 +7,7 @@ from ipaddress import IPv4Network
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.values import DataPlane, Direction, SlaveControl
+from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which its nodes run, or may soon."""

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.values import SettingError, hash_token, parse_range
+from rosproxy.setting_kinds import SettingError, hash_token, parse_range
 from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
 from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.common.ros2 import (

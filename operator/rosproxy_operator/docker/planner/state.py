@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import MOVED_FOR, TAKEN_FOR, Move, within
+from rosproxy_operator.common.port_negotiation import MOVED_FOR, TAKEN_FOR, Move, within
 from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Key, Member
 
 # One that is only created has published no port yet: its range may still turn out to be taken.

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy_operator.docker.option_values import NOWHERE
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -30,6 +31,7 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.desired import answers_to, needed_by
+from rosproxy_operator.docker.planner.duplicates import Selection, free_name, select
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
     SERVING,
@@ -42,7 +44,6 @@ from rosproxy_operator.docker.planner.model import (
     OwnContainer,
     Proxy,
 )
-from rosproxy_operator.docker.planner.selection import Selection, free_name, select
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
     proxy_name,
@@ -50,7 +51,6 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.docker.values import NOWHERE
 
 _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator
 import msgspec
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import (
+from rosproxy_operator.common.port_negotiation import (
     PortsExhausted,
     extended,
     is_free,

@@ -9,8 +9,8 @@ import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
+from rosproxy_operator.common.port_negotiation import overlap
 from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
 from rosproxy_operator.kubernetes.planner.access.policies import policy_of

@@ -16,8 +16,8 @@ from msgspec.structs import replace
 from rosproxy.access.layers import PolicyLayer
 from rosproxy_operator.common.proxy_status import Leases
 from rosproxy_operator.kubernetes.planner import departures
+from rosproxy_operator.kubernetes.planner.access.allowed_callers import callers
 from rosproxy_operator.kubernetes.planner.access.bounds import within_bounds
-from rosproxy_operator.kubernetes.planner.access.callers import callers
 from rosproxy_operator.kubernetes.planner.access.policies import policies
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
@@ -55,7 +55,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status import events
 from rosproxy_operator.kubernetes.status.findings import finding, findings
-from rosproxy_operator.kubernetes.status.status import status_of, status_of_invalid
+from rosproxy_operator.kubernetes.status.rosproxy_status import status_of, status_of_invalid
 
 _STEPS = (
     reconcile_service,

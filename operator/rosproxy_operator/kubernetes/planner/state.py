@@ -12,7 +12,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import (
+from rosproxy_operator.common.port_negotiation import (
     MOVED_FOR,
     RETRY_FOR,
     TAKEN_FOR,

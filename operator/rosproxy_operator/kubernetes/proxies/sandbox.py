@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import Json

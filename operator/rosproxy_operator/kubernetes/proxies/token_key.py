@@ -15,7 +15,7 @@ import secrets
 from collections.abc import Sequence
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.kubernetes.api.client import (
+from rosproxy_operator.kubernetes.api.api_client import (
     Api,
     ApiConflict,
     ApiError,

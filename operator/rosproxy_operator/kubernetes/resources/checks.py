@@ -4,8 +4,8 @@ import re
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import is_loopback
+from rosproxy.setting_kinds import SettingError, parse_host, parse_range
 from rosproxy.telemetry.text import shorten
-from rosproxy.values import SettingError, parse_host, parse_range
 from rosproxy_operator.kubernetes.resources.model import Json
 
 _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*")

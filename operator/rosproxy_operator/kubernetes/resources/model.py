@@ -12,7 +12,7 @@ import msgspec
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
-from rosproxy.values import DataPlane, Direction
+from rosproxy.setting_kinds import DataPlane, Direction
 from rosproxy_operator.common.problem import Problem
 
 Json = Mapping[str, Any]

@@ -14,7 +14,7 @@ from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.values import DataPlane, Direction
+from rosproxy.setting_kinds import DataPlane, Direction
 from rosproxy_operator.common.policy import too_much
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
-from rosproxy.admin.findings import DoctorFinding, error, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import INJECT

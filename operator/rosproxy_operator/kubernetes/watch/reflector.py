@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
-from rosproxy_operator.kubernetes.api.client import (
+from rosproxy_operator.kubernetes.api.api_client import (
     Api,
     ApiError,
     ApiExpired,

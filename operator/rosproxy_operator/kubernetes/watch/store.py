@@ -15,7 +15,7 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
-from rosproxy_operator.kubernetes.api.client import ApiError, ApiNotFound, ApiUnavailable
+from rosproxy_operator.kubernetes.api.api_client import ApiError, ApiNotFound, ApiUnavailable
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,

@@ -14,9 +14,15 @@ import time
 from collections.abc import Callable
 from datetime import datetime
 
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import SOON, Api, ApiError, ApiNotFound, ApiUnavailable
+from rosproxy_operator.kubernetes.api.api_client import (
+    SOON,
+    Api,
+    ApiError,
+    ApiNotFound,
+    ApiUnavailable,
+)
 from rosproxy_operator.kubernetes.planner.access.bounds import Consents, bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.injection import Wiring, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected

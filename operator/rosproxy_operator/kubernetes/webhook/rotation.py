@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import (
+from rosproxy_operator.kubernetes.api.api_client import (
     WEBHOOKS,
     Api,
     ApiConflict,

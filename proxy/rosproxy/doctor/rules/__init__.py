@@ -1,14 +1,14 @@
 """The rules of ``rosproxy doctor``: pure functions from gathered facts to findings."""
 
-from rosproxy.admin.findings import DoctorFinding, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, warning
 from rosproxy.doctor.facts import DoctorFacts
-from rosproxy.doctor.rules import node, pair, ros2
+from rosproxy.doctor.rules import node, pair, participant
 from rosproxy.doctor.rules import proxy as proxy_rules
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
     """Everything that can be said: about the proxy, the nodes, and the names asked for."""
-    domains = ros2.check(facts)
+    domains = participant.check(facts)
     if not facts.proxy.settings.for_ros1:
         return [*proxy_rules.alive(facts), *proxy_rules.setup(facts), *domains]
     return [*proxy_rules.check(facts), *node.check(facts), *pair.check(facts), *domains]

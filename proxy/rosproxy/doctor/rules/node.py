@@ -6,7 +6,7 @@ from ipaddress import ip_network
 
 from msgspec.structs import replace
 
-from rosproxy.admin.findings import DoctorFinding, Severity, error, note, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, Reach
 from rosproxy.doctor.rules.proxy import local_master

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from difflib import get_close_matches
 
-from rosproxy.admin.findings import DoctorFinding, error, note, ok
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port

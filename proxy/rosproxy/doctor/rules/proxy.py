@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from urllib.parse import urlsplit
 
-from rosproxy.admin.findings import DoctorFinding, Severity, error, note, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, published_range
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, Reach
 from rosproxy.net.addresses import is_loopback

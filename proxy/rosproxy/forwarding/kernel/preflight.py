@@ -7,7 +7,7 @@ from pathlib import Path
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.nft import NftError, dropping_chains
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
-from rosproxy.values import DataPlane
+from rosproxy.setting_kinds import DataPlane
 
 _INTERFACES = Path("/sys/class/net")
 _LEGACY_TABLES = Path("/proc/net/ip_tables_names")

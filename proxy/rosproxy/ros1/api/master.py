@@ -16,10 +16,10 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 from rosproxy.net.http_client import LongReply
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.bounds import LONGEST_NAME, too_long_to_register
 from rosproxy.ros1.protocol.master_methods import NO_SPEC, method_spec
+from rosproxy.ros1.protocol.name_lengths import LONGEST_NAME, too_long_to_register
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
@@ -40,7 +40,7 @@ from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, count_reply
-from rosproxy.ros1.standins.ports import StandInPorts
+from rosproxy.ros1.standins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer

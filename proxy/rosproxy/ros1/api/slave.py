@@ -14,20 +14,20 @@ from typing import TypeVar
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
-from rosproxy.ros1.protocol.bounds import too_long_to_ask
+from rosproxy.ros1.protocol.name_lengths import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall, passing
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.rewriting import policing, slave_api
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.long_calls import LongCall
-from rosproxy.ros1.servers.tcpros import InsideNodes, TcprosServer
+from rosproxy.ros1.servers.tcpros_server import InsideNodes, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
-from rosproxy.ros1.standins.ports import StandInPorts
+from rosproxy.ros1.standins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 
 log = logging.getLogger(__name__)

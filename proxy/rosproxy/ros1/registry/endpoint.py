@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind, prefix
 from rosproxy.ros1.protocol.uris import InsidePath, parse_slave_uri, path_of
-from rosproxy.ros1.registry.health import Health, ProbeResult
+from rosproxy.ros1.registry.node_health import Health, ProbeResult
 from rosproxy.telemetry.text import listed
 
 MOST_REGISTRATIONS = 10_000

@@ -12,7 +12,7 @@ from rosproxy.access.access_policy import OUTWARDS, PARAMETERS, AccessPolicy
 from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
-from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind, method_spec, prefix
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import passing

@@ -28,10 +28,10 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import method_spec
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.registry.registry import RangeExhausted
-from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.master_calls import CallOutcome, Refusal, registering_uri
 

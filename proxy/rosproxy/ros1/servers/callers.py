@@ -1,6 +1,6 @@
 """Who is let in at the master port, which is for inside nodes alone.
 
-`rosproxy.ros1.registry.selection` decides by the address that a connection comes from, before
+`rosproxy.ros1.registry.client_kinds` decides by the address that a connection comes from, before
 anything that it sends is read. Programs on the proxy's own machine are always let in.
 
 An operator tells of a container some tenths of a second after its start, and the container's first
@@ -23,8 +23,8 @@ from collections.abc import Iterable
 from rosproxy.net.addresses import is_loopback
 from rosproxy.net.interfaces import is_own
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry import selection
-from rosproxy.ros1.registry.selection import ClientKind
+from rosproxy.ros1.registry import client_kinds
+from rosproxy.ros1.registry.client_kinds import ClientKind
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class Callers:
         kind = self._client_kind(source)
         if kind is ClientKind.ADMITTED:
             return None
-        text = selection.refusal(source, kind, self._context.addressing.networks)
+        text = client_kinds.refusal(source, kind, self._context.addressing.networks)
         self._report(text, kind)
         return text
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 from aiohttp import StreamReader, web
 
 from rosproxy.net.http_client import PIECE_TIMEOUT, LongReply
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch, cut
 
 if TYPE_CHECKING:

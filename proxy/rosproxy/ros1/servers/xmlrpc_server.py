@@ -24,7 +24,7 @@ from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
 from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.net.http_client import LongReply, TooLong, is_plain, read_bounded
 from rosproxy.net.sockets import end_if_stalled, hang_up, peek
-from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
+from rosproxy.ros1.clients.master_client import LOOP_HEADER, Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc

@@ -18,7 +18,7 @@ port opens or refuses. Nothing below knows who asked for it.
     until nobody is missed                     connections                        es
     ENFORCE_TICK, once the  policy_enforcer    the registry,      AccessChecks    hidden, shown,
     policy has changed                         connections                        cut
-    TIDY_INTERVAL           standins.ports     problems with                      those of ended
+    TIDY_INTERVAL           stand_in_ports     problems with                      those of ended
                                                nodes outside                      nodes go
     RETRY_BLOCKED           leases             ports that others                  they open
                                                had

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation

@@ -15,12 +15,12 @@ from functools import partial
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.registry.node_health import ProbeResult
+from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.decisions import liveness
 from rosproxy.ros1.upkeep.decisions.adoption import Container

@@ -9,7 +9,7 @@ nobody needs any more is taken back. What is kept, and how: `rosproxy.ros1.regis
 import asyncio
 from collections.abc import Mapping
 
-from rosproxy.ros1.clients.master import MasterError
+from rosproxy.ros1.clients.master_client import MasterError
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry import memory
 from rosproxy.ros1.registry.memory import RememberedLease

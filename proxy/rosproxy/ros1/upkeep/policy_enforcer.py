@@ -16,12 +16,12 @@ from rosproxy.admin.requests import EnforcementCounts
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases.leases import Leases
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.access_checks import AccessChecks
-from rosproxy.ros1.servers.tcpros import UNREGISTERED, TcprosServer
-from rosproxy.ros1.standins.ports import StandInPorts
+from rosproxy.ros1.servers.tcpros_server import UNREGISTERED, TcprosServer
+from rosproxy.ros1.standins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 

@@ -1,11 +1,11 @@
 """Looking after each node by its pulse: probe, unregister the dead, free the ports of the unused.
 
 Every few seconds a node that nobody called is asked for its pid: one that is well over a connection
-that is kept (`rosproxy.ros1.clients.kept`), any other by a call; so is, at once, one that has ended
-that connection. Two failures in a row make its port refuse, so that a dead node looks dead; after
-the time of ``--cleanup-after`` it is unregistered at the master. A node that answers again is
-served again, and registered again if need be. Another pid than before means another process: what
-the former one left is taken back.
+that is kept (`rosproxy.ros1.clients.kept_connections`), any other by a call; so is, at once, one
+that has ended that connection. Two failures in a row make its port refuse, so that a dead node
+looks dead; after the time of ``--cleanup-after`` it is unregistered at the master. A node that
+answers again is served again, and registered again if need be. Another pid than before means
+another process: what the former one left is taken back.
 
 What follows from a probe: `Health.note` says how the node is, `liveness` what is due, and the
 `Registrar` and the modules beside this one do it.
@@ -16,12 +16,12 @@ import logging
 from dataclasses import dataclass, field
 
 from rosproxy.leases.leases import Leases
-from rosproxy.ros1.clients.kept import KeptConnections
-from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.node import ProbeAnswer
+from rosproxy.ros1.clients.kept_connections import KeptConnections
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
+from rosproxy.ros1.clients.node_client import ProbeAnswer
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.upkeep.decisions import liveness
 from rosproxy.ros1.upkeep.decisions.liveness import AfterAnswer
 from rosproxy.ros1.upkeep.recovery import Recovery

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Iterable, Sequence
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -21,7 +21,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import hidden
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.rewriting import policing
-from rosproxy.ros1.standins.ports import StandInPorts
+from rosproxy.ros1.standins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import registration as decisions
 
 log = logging.getLogger(__name__)

@@ -2,9 +2,9 @@
 
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
 graph once, and what the proxy has it remember (`LeaseMemory`), finds the URIs that this proxy
-advertised (`decisions.find_claims`), and rebuilds the endpoints on the ports that they had. Calls
-that register wait for it: a node that registered before would get another port, and the master
-would shut it down for having moved. Before that an operator's policy is waited for
+advertised (`recovery_claims.find_claims`), and rebuilds the endpoints on the ports that they had.
+Calls that register wait for it: a node that registered before would get another port, and the
+master would shut it down for having moved. Before that an operator's policy is waited for
 (``--await-policy``), or what it denies would be registered for a moment.
 
 What the master says is only a claim, since anybody can write to it. Until the node itself has
@@ -30,14 +30,14 @@ from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import is_inside
 from rosproxy.net.resolver import resolve
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
-from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.registry.selection import ClientKind
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.servers.access_checks import AccessChecks
-from rosproxy.ros1.upkeep.decisions import recovery as decisions
-from rosproxy.ros1.upkeep.decisions.recovery import Claim
+from rosproxy.ros1.upkeep.decisions import recovery_claims
+from rosproxy.ros1.upkeep.decisions.recovery_claims import Claim
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
@@ -147,7 +147,7 @@ class Recovery:
         self._context.refresh_networks()
         memory = await self._memory.read()
         graph = await self._context.upstream.read_graph()
-        claims, forgotten = decisions.find_claims(graph, self._context.addressing, memory)
+        claims, forgotten = recovery_claims.find_claims(graph, self._context.addressing, memory)
         restored = [(claim, self._restore(claim)) for claim in await self._settle(claims)]
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served_ids = {id(claim) for claim, endpoint in restored if endpoint is not None}
@@ -175,8 +175,8 @@ class Recovery:
             if is_inside(claim.slave.host, self._context.addressing.networks):
                 claim.node_info = await self._context.nodes.inspect(claim.slave)
 
-        await asyncio.gather(*map(ask, decisions.contested_claims(claims)))
-        return decisions.choose_claims(claims)
+        await asyncio.gather(*map(ask, recovery_claims.contested_claims(claims)))
+        return recovery_claims.choose_claims(claims)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
         """The endpoint of a claim, not trusted yet; None if it is outside, or its port is taken."""
@@ -278,7 +278,7 @@ class Recovery:
         if endpoint.location.address == address:
             endpoint.note_named(address in addresses)
         await self._registrar.disown(
-            endpoint, decisions.unconfirmed_registrations(registrations, info)
+            endpoint, recovery_claims.unconfirmed_registrations(registrations, info)
         )
         # The master has it by a former version's URI: it is registered by that of this one.
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from rosproxy.access.layers import Verdict
-from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
+from rosproxy.ros1.clients.master_client import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind, prefix
 from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri

@@ -21,15 +21,15 @@ from collections.abc import Iterable, Sequence
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import NODES, resolve
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.stand_ins import StandIn
-from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.standins.ports import StandInPorts
+from rosproxy.ros1.servers.tcpros_server import TcprosServer
+from rosproxy.ros1.standins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import resubscription as decisions
 from rosproxy.ros1.upkeep.decisions.registration import one_publisher_per_topic
 from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription

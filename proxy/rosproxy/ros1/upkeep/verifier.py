@@ -12,12 +12,12 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
+from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo
-from rosproxy.ros1.upkeep.decisions import recovery as decisions
+from rosproxy.ros1.upkeep.decisions import recovery_claims
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,8 @@ class Verifier:
         service_ports: Iterable[int] = (),
     ) -> bool | None:
         """Whether the node that says this of itself is the one: one of the names is enough."""
-        by_name = decisions.by_name(registrations)
-        verdicts = {name: decisions.confirmed_by(by_name[name], info) for name in by_name}
+        by_name = recovery_claims.by_name(registrations)
+        verdicts = {name: recovery_claims.confirmed_by(by_name[name], info) for name in by_name}
         if True in verdicts.values():
             return True
         undecided = [r for r in registrations if verdicts[r.caller_id] is None]
@@ -65,7 +65,7 @@ class Verifier:
     ) -> bool:
         """Whether it answers for a topic or service, by a name that has registered it."""
         callers = {r.caller_id for r in undecided}
-        topics, services = decisions.topics_and_services_to_ask(undecided)
+        topics, services = recovery_claims.topics_and_services_to_ask(undecided)
         for topic in topics:
             port = info.topic_ports.get(topic) or await self._topic_port(slave, topic)
             if port is None:

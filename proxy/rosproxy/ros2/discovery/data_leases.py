@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.inside import InsideParticipants
+from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.registry.participants import LeaseKind
 
 

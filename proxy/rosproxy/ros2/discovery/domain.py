@@ -30,13 +30,13 @@ from functools import partial
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores
-from rosproxy.ros2.discovery.inside import InsideParticipants
+from rosproxy.ros2.discovery.hidden_endpoints import has_changed
+from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.keeper import Keeper
 from rosproxy.ros2.discovery.observer import Observer
-from rosproxy.ros2.discovery.outside import OutsideParticipants
-from rosproxy.ros2.discovery.own import OwnParticipants
+from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
+from rosproxy.ros2.discovery.own_participants import OwnParticipants
 from rosproxy.ros2.discovery.partings import Partings
-from rosproxy.ros2.discovery.policing import has_changed
 from rosproxy.ros2.discovery.rates import DiscoveryRates
 from rosproxy.ros2.discovery.returning import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
@@ -49,13 +49,13 @@ from rosproxy.ros2.protocol.rtps import (
     for_all,
     source_vendor,
 )
+from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
     LeaseKind,
     OutsideParticipant,
 )
-from rosproxy.ros2.registry.ports import LocatorPorts
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 
 ANNOUNCED_AGAIN = 0.5

@@ -20,7 +20,7 @@ from math import inf
 
 from rosproxy.ros2.discovery.announced import next_number
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing
-from rosproxy.ros2.discovery.outside import OutsideParticipants
+from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.participants import InsideParticipant
 

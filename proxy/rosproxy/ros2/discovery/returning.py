@@ -18,8 +18,8 @@ from rosproxy.ros2.discovery.domain_settings import (
     Outgoing,
 )
 from rosproxy.ros2.discovery.keeper import Keeper
+from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant
-from rosproxy.ros2.registry.ports import LocatorPorts
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 
 ANSWER_TIME = 5.0

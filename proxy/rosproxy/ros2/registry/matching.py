@@ -14,8 +14,8 @@ from itertools import islice, product
 
 import msgspec
 
-from rosproxy.ros2.protocol.names import ros_name, ros_type
 from rosproxy.ros2.protocol.qos import Liveliness
+from rosproxy.ros2.protocol.ros_names import ros_name, ros_type
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 
 MOST_LOOKED_AT = 20_000

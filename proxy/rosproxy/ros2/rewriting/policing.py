@@ -6,7 +6,7 @@ what is written there goes outwards or inwards.
 """
 
 from rosproxy.access.rules import RuleKind
-from rosproxy.ros2.protocol.names import is_of_requests, is_of_service, ros_name
+from rosproxy.ros2.protocol.ros_names import is_of_requests, is_of_service, ros_name
 from rosproxy.ros2.registry.participants import EndpointKind
 
 GRAPH_TOPIC = "ros_discovery_info"

@@ -4,7 +4,7 @@ from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.allocation import overlap
+from rosproxy_operator.common.port_negotiation import overlap
 from rosproxy_operator.docker.planner.actions import Create, CreateEar, CreateSandbox
 from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane, chosen_udp
 from rosproxy_operator.docker.planner.model import STARTED, Key, Member

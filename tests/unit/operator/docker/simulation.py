@@ -33,7 +33,7 @@ from rosproxy_operator.docker.planner.model import (
     RedirectContainer,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.own import has_own_name
+from rosproxy_operator.docker.planner.own_containers import has_own_name
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_EAR,

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.values import SlaveControl
+from rosproxy.setting_kinds import SlaveControl
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.option_values import read_host_pattern
 from rosproxy_operator.docker.planner.actions import Connect, Create, CreateSandbox
 from rosproxy_operator.docker.planner.labels.bounds import allowed_planes, refused_master
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.docker.values import read_host_pattern
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,

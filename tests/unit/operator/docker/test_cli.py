@@ -8,8 +8,8 @@ from click.testing import CliRunner, Result
 from rosproxy.access.layers import PolicyMode
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.option_values import read_memory
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
-from rosproxy_operator.docker.values import read_memory
 
 
 def run(*words: str, **variables: str) -> Result:

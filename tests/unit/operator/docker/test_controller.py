@@ -9,11 +9,11 @@ from msgspec import structs
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.control_loop import LookFailed
-from rosproxy_operator.common.metrics import DockerMetrics
-from rosproxy_operator.common.resolver import MasterResolver
+from rosproxy_operator.common.master_resolver import MasterResolver
+from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.docker import snapshot
-from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
+from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.planner.actions import Create, CreateRedirect, CreateSandbox
 from rosproxy_operator.docker.planner.plan import plan
 from rosproxy_operator.docker.planner.redirect import _with_fingerprint, redirect_config

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.docker.client import DockerClient
+from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.engine_json import uplink_secret
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.executor import DockerApplier

@@ -2,8 +2,8 @@
 
 import pytest
 
-from rosproxy_operator.common import resolver as module
-from rosproxy_operator.common.resolver import MasterResolver
+from rosproxy_operator.common import master_resolver
+from rosproxy_operator.common.master_resolver import MasterResolver
 
 
 class Names:
@@ -21,9 +21,9 @@ class Names:
 @pytest.fixture
 def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     names = Names()
-    monkeypatch.setattr(module, "resolve", names.resolve)
-    monkeypatch.setattr(module, "AGAIN", 0.0)
-    monkeypatch.setattr(module, "AGAIN_UNRESOLVED", 0.0)
+    monkeypatch.setattr(master_resolver, "resolve", names.resolve)
+    monkeypatch.setattr(master_resolver, "AGAIN", 0.0)
+    monkeypatch.setattr(master_resolver, "AGAIN_UNRESOLVED", 0.0)
     return names
 
 

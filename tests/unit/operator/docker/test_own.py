@@ -9,7 +9,7 @@ from msgspec import structs
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.engine_json import check_inspection, read_making
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
-from rosproxy_operator.docker.planner.own import forgery_reason, has_own_name
+from rosproxy_operator.docker.planner.own_containers import forgery_reason, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     container_config,
     own_labels,

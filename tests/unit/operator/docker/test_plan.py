@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import Move
+from rosproxy_operator.common.port_negotiation import Move
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,

@@ -19,7 +19,7 @@ from rosproxy_operator.docker.planner.model import (
     RedirectContainer,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.own import forgery_reason
+from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.proxy_news import network_facts
 from rosproxy_operator.docker.planner.redirect import redirect_config

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.telemetry.text import width
-from rosproxy_operator.docker import status
+from rosproxy_operator.docker import host_status
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -140,10 +140,10 @@ def test_a_plan_is_its_lines_and_its_exit_code(
     async def survey(settings: PlanSettings) -> dict[str, Any]:
         return {"actions": actions, "problems": problems}
 
-    monkeypatch.setattr(status, "survey", survey)
-    assert status.show_plan(PlanSettings(), as_json=False, wait=0) == code
+    monkeypatch.setattr(host_status, "survey", survey)
+    assert host_status.show_plan(PlanSettings(), as_json=False, wait=0) == code
     assert capsys.readouterr().out.splitlines() == lines
-    assert status.show_plan(PlanSettings(), as_json=True, wait=0) == code
+    assert host_status.show_plan(PlanSettings(), as_json=True, wait=0) == code
     assert json.loads(capsys.readouterr().out) == {"actions": actions, "problems": problems}
 
 

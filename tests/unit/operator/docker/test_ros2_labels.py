@@ -7,10 +7,10 @@ import pytest
 
 from rosproxy.access.rules import parse_rules
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.option_values import read_host_pattern
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import Container, Key, Member, Network
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.docker.values import read_host_pattern
 from tests.unit.operator.docker.builders import (
     HERE,
     KEY,

@@ -3,8 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy_operator.docker.planner.duplicates import IDLE, free_name, select
 from rosproxy_operator.docker.planner.model import SERVING, Proxy
-from rosproxy_operator.docker.planner.selection import IDLE, free_name, select
 from tests.unit.operator.docker.builders import KEY, RANGE, container
 
 STATES = ["running", "paused", "restarting", "created", "exited", "dead", "removing"]

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key

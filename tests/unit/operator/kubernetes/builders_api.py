@@ -21,7 +21,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_id, service_id
 from rosproxy_operator.kubernetes.status.findings import findings
-from rosproxy_operator.kubernetes.status.status import status_of
+from rosproxy_operator.kubernetes.status.rosproxy_status import status_of
 
 Obj = dict[str, Any]
 

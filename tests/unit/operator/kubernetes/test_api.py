@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import (
+from rosproxy_operator.kubernetes.api.api_client import (
     SOON,
     Api,
     ApiConflict,
@@ -52,7 +52,7 @@ async def test_lists_with_selectors(server: ApiServer, api: Api) -> None:
 async def test_a_list_comes_in_pages(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.api.client.PAGE", 2)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.PAGE", 2)
     for name in "abc":
         server.put("pods", pod(name))
     first = await in_thread(api.page, "pods", "")
@@ -65,7 +65,7 @@ async def test_who_is_put_off_asks_again_when_told(
 ) -> None:
     """API Priority and Fairness answers so; who has little time is told at once."""
     slept: list[float] = []
-    monkeypatch.setattr("rosproxy_operator.kubernetes.api.client.time.sleep", slept.append)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.time.sleep", slept.append)
     server.refuse("GET", "nodes", 429, "too many requests")
     server.retry_after = "7"
     with pytest.raises(ApiUnavailable, match="too many requests"):

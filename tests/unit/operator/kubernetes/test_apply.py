@@ -9,7 +9,7 @@ from aiohttp import web
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy_operator.kubernetes.planner.access.callers import callers
+from rosproxy_operator.kubernetes.planner.access.allowed_callers import callers
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.model import Name, Selector
 from tests.unit.operator.kubernetes.builders_api import pod_obj

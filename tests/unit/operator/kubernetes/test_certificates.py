@@ -15,9 +15,9 @@ from cryptography import x509
 
 from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api, ApiError
+from rosproxy_operator.kubernetes.api.api_client import Api, ApiError
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.webhook import certificates, rotation
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
@@ -26,7 +26,7 @@ from rosproxy_operator.kubernetes.webhook.rotation import (
     CertificateRotation,
     SelfSigned,
 )
-from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 from tests.unit.operator.kubernetes.api_server import ApiServer
 
 NAMES = certificates.service_names("ns", "wh")
@@ -354,7 +354,7 @@ async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) ->
 
 
 async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.server.CHECK", 0.01)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.webhook_server.CHECK", 0.01)
     old = certificates.make(NAMES, NOW)
     new = certificates.make(NAMES, NOW, before=old.ca)
     port = free_ports(1)

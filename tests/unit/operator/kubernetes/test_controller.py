@@ -9,11 +9,11 @@ import pytest
 from aiohttp import web
 from msgspec import structs
 
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common import control_loop
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.kubernetes import controller as module
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.proxies import proxy_sync

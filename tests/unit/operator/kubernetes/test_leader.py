@@ -6,11 +6,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import leader as module
-from rosproxy_operator.kubernetes.api.client import Api, NotLeading
-from rosproxy_operator.kubernetes.api.gate import Gate
+from rosproxy_operator.kubernetes.api.api_client import Api, NotLeading
+from rosproxy_operator.kubernetes.api.leader_gate import Gate
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.leader import LeaderElection
 from rosproxy_operator.kubernetes.planner import leadership

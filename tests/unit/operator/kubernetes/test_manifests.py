@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
-from rosproxy.values import hash_token
+from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common.policy import AWAITED, administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.api import client as api_module
-from rosproxy_operator.kubernetes.api.client import Api, ApiError, ApiNotFound, ApiUnavailable
+from rosproxy_operator.kubernetes.api import api_client as api_module
+from rosproxy_operator.kubernetes.api.api_client import Api, ApiError, ApiNotFound, ApiUnavailable
 from rosproxy_operator.kubernetes.proxies import sandbox
 from rosproxy_operator.kubernetes.proxies.sandbox import SandboxFailures
 from rosproxy_operator.kubernetes.resources.cluster import (

@@ -33,7 +33,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.pod_failures import pod_failure
 from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
-from rosproxy_operator.kubernetes.status.status import participants
+from rosproxy_operator.kubernetes.status.rosproxy_status import participants
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes import objects as some
 from tests.unit.operator.kubernetes.builders_api import rosproxy_obj

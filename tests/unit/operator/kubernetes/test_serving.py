@@ -18,16 +18,16 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import serving
-from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.serving import ClusterServing
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings, KubernetesSettings
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateDirectory, CertificateRotation
-from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+from rosproxy_operator.kubernetes.webhook.webhook_server import WebhookServer
 from tests.unit.operator.kubernetes.api_server import ApiServer, until
 from tests.unit.operator.kubernetes.builders_api import (
     INJECT,

@@ -14,7 +14,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Selector
-from rosproxy_operator.kubernetes.status.status import (
+from rosproxy_operator.kubernetes.status.rosproxy_status import (
     LONGEST,
     MOST_NAMES,
     MOST_NODES,

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.client import Api, ApiUnavailable
+from rosproxy_operator.kubernetes.api.api_client import Api, ApiUnavailable
 from rosproxy_operator.kubernetes.proxies.token_key import LENGTH, TokenKey
 from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.api_server import ApiServer

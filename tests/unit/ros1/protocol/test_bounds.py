@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.ros1.protocol.bounds import (
+from rosproxy.ros1.protocol.name_lengths import (
     LONGEST_NAME,
     too_long_to_ask,
     too_long_to_connect,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.ros1.registry.health import Health, ProbeResult
+from rosproxy.ros1.registry.node_health import Health, ProbeResult
 
 A, R, S = ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT
 

@@ -14,7 +14,7 @@ from rosproxy.ros1.registry.endpoint import (
     NodeLocation,
     Registration,
 )
-from rosproxy.ros1.registry.health import Health
+from rosproxy.ros1.registry.node_health import Health
 from rosproxy.ros1.registry.registry import MOST_ADMISSIONS, RangeExhausted, Registry
 from tests.unit.builders import own_uri
 

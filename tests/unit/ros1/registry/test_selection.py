@@ -4,7 +4,7 @@ from ipaddress import ip_network
 
 import pytest
 
-from rosproxy.ros1.registry.selection import ClientKind, client_kind, refusal
+from rosproxy.ros1.registry.client_kinds import ClientKind, client_kind, refusal
 
 NETWORKS = (ip_network("10.0.0.0/24"), ip_network("fd00::/64"))
 ADMITTED, OUTSIDE, UNSELECTED = ClientKind.ADMITTED, ClientKind.OUTSIDE, ClientKind.UNSELECTED

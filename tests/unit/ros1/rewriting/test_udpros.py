@@ -8,7 +8,7 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.tcpros import encode_header
 from rosproxy.ros1.protocol.xmlrpc import document
-from rosproxy.ros1.rewriting.udpros import read_offers, redirect_offer
+from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
 
 HERE = HostPort("10.0.0.1", 25000)
 

@@ -10,7 +10,7 @@ from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.decisions import adoption as policy
 from rosproxy.ros1.upkeep.decisions.adoption import DirectNode
-from rosproxy.ros1.upkeep.decisions.recovery import confirmed_by
+from rosproxy.ros1.upkeep.decisions.recovery_claims import confirmed_by
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 from tests.unit.builders import add_node, make_addressing
 

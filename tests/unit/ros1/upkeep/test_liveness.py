@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import NodeLocation
-from rosproxy.ros1.registry.health import Health, ProbeResult
+from rosproxy.ros1.registry.node_health import Health, ProbeResult
 from rosproxy.ros1.upkeep.decisions import liveness
 from rosproxy.ros1.upkeep.decisions.liveness import AfterAnswer
 from tests.unit.builders import add_node, add_registration, make_addressing

@@ -12,8 +12,8 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry import memory
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
-from rosproxy.ros1.upkeep.decisions import recovery as policy
-from rosproxy.ros1.upkeep.decisions.recovery import Claim
+from rosproxy.ros1.upkeep.decisions import recovery_claims
+from rosproxy.ros1.upkeep.decisions.recovery_claims import Claim
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB, SRV = Kind.PUBLISHER, Kind.SERVICE
@@ -60,7 +60,7 @@ URIS = [
 def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
     uri: str, expected: tuple[int, str, str] | None
 ) -> None:
-    found, forgotten = policy.find_claims(graph({"/n": uri}), make_addressing(), MEMORY)
+    found, forgotten = recovery_claims.find_claims(graph({"/n": uri}), make_addressing(), MEMORY)
     claims = [(one.port, one.uri, str(one.slave), one.topics) for one in found]
     assert forgotten == {}
     if expected is None:
@@ -72,13 +72,15 @@ def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
 
 def test_the_ports_of_services_are_remembered() -> None:
     uris = {"/n": "http://robot-host:45004/", "/m": "http://robot-host:45003/"}
-    found, _ = policy.find_claims(graph(uris), make_addressing(), MEMORY)
+    found, _ = recovery_claims.find_claims(graph(uris), make_addressing(), MEMORY)
     assert [claim.service_ports for claim in found] == [(41234, 41235), ()]
 
 
 def test_of_some_nothing_is_remembered() -> None:
     uri = "http://robot-host:45008/"
-    found, forgotten = policy.find_claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
+    found, forgotten = recovery_claims.find_claims(
+        graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY
+    )
     assert found == []
     assert {one.caller_id for one in forgotten[uri]} == {"/n", "/m"}
 
@@ -87,21 +89,28 @@ def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_list
     addressing = make_addressing(advertise=(30000, 30009))
     uris = {"/n": "http://robot-host:30003/", "/m": "http://robot-host:45003/"}
     kept = memory.read_leases("30003 /10.0.0.5:1/\n", addressing.ports)
-    assert [claim.port for claim in policy.find_claims(graph(uris), addressing, kept)[0]] == [45003]
+    assert [
+        claim.port for claim in recovery_claims.find_claims(graph(uris), addressing, kept)[0]
+    ] == [45003]
 
 
 def test_names_that_share_a_uri_are_one_claim() -> None:
     uri = "http://robot-host:45003/"
-    (claim,), _ = policy.find_claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
+    (claim,), _ = recovery_claims.find_claims(
+        graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY
+    )
     assert {one.caller_id for one in claim.registrations} == {"/n", "/m"}
 
 
 def test_a_node_without_registrations_or_without_a_uri() -> None:
     addressing = make_addressing()
     uri = "http://robot-host:45003/"
-    (claim,), _ = policy.find_claims(Graph({}, {"/n": uri}), addressing, MEMORY)
+    (claim,), _ = recovery_claims.find_claims(Graph({}, {"/n": uri}), addressing, MEMORY)
     assert claim.registrations == []
-    assert policy.find_claims(Graph({"/n": [held("/a")]}, {}), addressing, MEMORY) == ([], {})
+    assert recovery_claims.find_claims(Graph({"/n": [held("/a")]}, {}), addressing, MEMORY) == (
+        [],
+        {},
+    )
 
 
 def claim(
@@ -140,7 +149,9 @@ SETTLED = [
 def test_one_claim_is_kept_for_each_port_and_each_node(
     found: list[Claim], kept: list[tuple[int, str]]
 ) -> None:
-    assert sorted((one.port, one.slave.host) for one in policy.choose_claims(found)) == kept
+    assert (
+        sorted((one.port, one.slave.host) for one in recovery_claims.choose_claims(found)) == kept
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,7 +167,7 @@ def test_one_claim_is_kept_for_each_port_and_each_node(
 def test_claims_to_the_same_port_or_node_are_contested(
     found: list[Claim], ports: list[int]
 ) -> None:
-    assert [one.port for one in policy.contested_claims(found)] == ports
+    assert [one.port for one in recovery_claims.contested_claims(found)] == ports
 
 
 TOPICS = st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True)
@@ -166,9 +177,9 @@ CLAIMS = st.builds(claim, st.integers(1, 4), ADDRESSES, TOPICS, st.none() | TOPI
 
 @given(st.lists(CLAIMS, max_size=6))
 def test_settling_leaves_no_contest_and_forgets_nobody_without_one(found: list[Claim]) -> None:
-    settled = policy.choose_claims(found)
-    assert policy.contested_claims(settled) == []
-    rivals = policy.contested_claims(found)
+    settled = recovery_claims.choose_claims(found)
+    assert recovery_claims.contested_claims(settled) == []
+    rivals = recovery_claims.contested_claims(found)
     assert all(one in settled for one in found if one not in rivals)
 
 
@@ -227,24 +238,26 @@ def test_a_node_bears_out_what_the_master_says_of_it(
         None if names is None else dict.fromkeys(names, "t") for names in (published, subscribed)
     ]
     said = NodeInfo(7, told[0], told[1])
-    assert policy.confirmed_by(endpoint.registrations.values(), said) is confirmed
+    assert recovery_claims.confirmed_by(endpoint.registrations.values(), said) is confirmed
 
 
 def test_names_that_are_not_the_node_s_are_told_apart() -> None:
     own, former = held("/a", "/own"), held("/b", "/former")
     service = Registration(SRV, "/s", "/former")
     everything = [own, former, service, Registration(SRV, "/t", "/untold"), held("/c", "/own")]
-    assert policy.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, {})) == [
+    assert recovery_claims.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, {})) == [
         former,
         service,
     ]
-    assert policy.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, None)) == []
+    assert (
+        recovery_claims.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, None)) == []
+    )
 
 
 def test_a_node_is_asked_for_a_few_of_its_topics_and_services() -> None:
     topics = [held(name) for name in ("/rosout", "/d", "/c", "/b", "/a")]
     services = [Registration(SRV, name, "/n") for name in ("/y", "/x")]
     heard = [Registration(Kind.SUBSCRIBER, "/heard", "/n")]
-    asked = policy.topics_and_services_to_ask([*topics, *services, *heard])
+    asked = recovery_claims.topics_and_services_to_ask([*topics, *services, *heard])
     assert asked == (["/a", "/b", "/c"], [*reversed(services)])
-    assert policy.topics_and_services_to_ask(topics[:2])[0] == ["/d", "/rosout"]
+    assert recovery_claims.topics_and_services_to_ask(topics[:2])[0] == ["/d", "/rosout"]

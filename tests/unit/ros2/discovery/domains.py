@@ -9,7 +9,7 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, Outgoing
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.ports import REMEMBERED
+from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
 

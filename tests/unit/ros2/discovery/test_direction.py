@@ -4,8 +4,8 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.registry.locator_ports import MOST_SHARING
 from rosproxy.ros2.registry.participants import LeaseKind
-from rosproxy.ros2.registry.ports import MOST_SHARING
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -101,7 +101,9 @@ def test_a_port_that_is_taken_is_left_alone() -> None:
 
 
 def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosproxy.ros2.registry.ports.order_for", lambda key, ports: iter([20_000]))
+    monkeypatch.setattr(
+        "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
+    )
     one = domains.domain(both_ways=True)
     meet(one)
     for number in range(MOST_SHARING + 1):

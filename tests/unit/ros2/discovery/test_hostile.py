@@ -16,8 +16,7 @@ from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER
-from rosproxy.ros2.registry import participants
-from rosproxy.ros2.registry import ports as registry_ports
+from rosproxy.ros2.registry import locator_ports, participants
 from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
     EndpointKind,
@@ -110,7 +109,7 @@ def test_an_exhausted_range_is_not_sorted_for_each_locator(monkeypatch: pytest.M
         ordered.append(key)
         return iter(ports.ports())
 
-    monkeypatch.setattr(registry_ports, "order_for", order_for)
+    monkeypatch.setattr(locator_ports, "order_for", order_for)
     locators = [
         (Pid.UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 1000 + number), "<"))
         for number in range(400)

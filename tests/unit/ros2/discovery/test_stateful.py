@@ -18,7 +18,7 @@ from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, Outgoing
 from rosproxy.ros2.discovery.rates import BURST, MOST_SOURCES
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER
-from rosproxy.ros2.registry.ports import MOST_SHARING, STAND_INS
+from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS
 from tests.unit.ros2.discovery.domains import (
     EAR,
     INSIDE,

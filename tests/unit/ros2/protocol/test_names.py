@@ -2,7 +2,13 @@
 
 import pytest
 
-from rosproxy.ros2.protocol.names import is_of_service, ros_name, ros_service, ros_topic, ros_type
+from rosproxy.ros2.protocol.ros_names import (
+    is_of_service,
+    ros_name,
+    ros_service,
+    ros_topic,
+    ros_type,
+)
 
 
 @pytest.mark.parametrize(

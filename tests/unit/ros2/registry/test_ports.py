@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.registry.participants import LeaseKind
-from rosproxy.ros2.registry.ports import (
+from rosproxy.ros2.registry.locator_ports import (
     MOST_SHARING,
     REMEMBERED,
     SETTLING,
@@ -17,6 +16,7 @@ from rosproxy.ros2.registry.ports import (
     order_for,
     stand_in_port,
 )
+from rosproxy.ros2.registry.participants import LeaseKind
 
 RANGE = PortRange(45000, 45019)
 DATA, METATRAFFIC = LeaseKind.DATA, LeaseKind.METATRAFFIC

@@ -15,7 +15,7 @@ from typing import get_args
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.values import DataPlane, read_peer
+from rosproxy.setting_kinds import DataPlane, read_peer
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels import bounds, readers, ros2
+from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
 from rosproxy_operator.docker.planner.labels.readers import (
     ADVERTISE_HOST,
     ENABLE,
@@ -131,29 +131,29 @@ def _requests(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> tuple[list[Member], list[str]]:
     """What a container gets of what it asks for, by version of ROS, and the warnings for it."""
-    ros_versions = ros2.versions(container)
-    requests = [_request(container, observed, settings, proxies)] if "1" in ros_versions else []
-    if "2" in ros_versions:
+    served = ros_versions.versions(container)
+    requests = [_request(container, observed, settings, proxies)] if "1" in served else []
+    if "2" in served:
         requests.append(_ros2_request(container, observed, settings))
     granted = [bounds.narrowed(r, settings) for r in requests]
-    warnings = [*ros2.warnings(container, ros_versions)]
+    warnings = [*ros_versions.warnings(container, served)]
     warnings += dict.fromkeys(text for _, texts in granted for text in texts)
     return [request for request, _ in granted], warnings
 
 
 def _ros2_request(container: Container, observed: HostState, settings: PlanSettings) -> Member:
     labels, host = container.labels, readers.advertise_host(container.labels, settings)
-    ros2.refuse_unserved(container, host)
+    ros_versions.refuse_unserved(container, host)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
-        Key("", host, ros2.domain(container)),
+        Key("", host, ros_versions.domain(container)),
         ports=readers.ports(labels),
         networks=networks,
         data_plane=readers.data_plane(labels),
         direction=readers.direction(labels, networks, observed.networks),
         policy=readers.policy(labels),
-        peers=ros2.peers(labels),
+        peers=ros_versions.peers(labels),
     )
 
 
@@ -189,7 +189,7 @@ def _exposed(container: Container, settings: PlanSettings) -> bool:
     """Whether a container that does not say gets a proxy."""
     if not settings.expose_by_default:
         return False
-    return bool(_own(container) or container.master_uri or "2" in ros2.versions(container))
+    return bool(_own(container) or container.master_uri or "2" in ros_versions.versions(container))
 
 
 def _own(container: Container) -> list[str]:

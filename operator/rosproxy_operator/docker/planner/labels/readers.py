@@ -11,13 +11,13 @@ from urllib.parse import urlsplit
 from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.values import DataPlane, Direction, SlaveControl
+from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.docker.values import MOST_PORTS
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"

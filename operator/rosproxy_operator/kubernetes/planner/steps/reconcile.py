@@ -14,8 +14,8 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.values import hash_token
-from rosproxy_operator.common.allocation import RETRY_FOR
+from rosproxy.setting_kinds import hash_token
+from rosproxy_operator.common.port_negotiation import RETRY_FOR
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,

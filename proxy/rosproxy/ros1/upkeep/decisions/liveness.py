@@ -10,7 +10,7 @@ from enum import Enum
 
 from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
-from rosproxy.ros1.registry.health import UNKNOWN_PID, ProbeResult
+from rosproxy.ros1.registry.node_health import UNKNOWN_PID, ProbeResult
 
 DIRECT_INTERVAL = 2.0
 """Seconds between probes, at most, of a node that registered around the proxy."""

@@ -5,7 +5,7 @@ import logging
 
 from rosproxy.app.signals import stop_event
 from rosproxy.binding import setting_error_if_taken
-from rosproxy.ros2.servers.ear import Ear, EarSettings
+from rosproxy.ros2.servers.multicast_ear import Ear, EarSettings
 
 log = logging.getLogger(__name__)
 

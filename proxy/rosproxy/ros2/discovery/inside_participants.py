@@ -20,7 +20,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     Outgoing,
     Refused,
 )
-from rosproxy.ros2.discovery.policing import is_hidden
+from rosproxy.ros2.discovery.hidden_endpoints import is_hidden
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import (
     RtpsError,
@@ -29,13 +29,13 @@ from rosproxy.ros2.protocol.rtps import (
     source_prefix,
     source_vendor,
 )
+from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
     LeaseKind,
     ParticipantTable,
 )
-from rosproxy.ros2.registry.ports import LocatorPorts
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, rewritten
 
 

@@ -33,7 +33,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, read_state
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import LONGEST_TEXT
 from rosproxy.telemetry.text import brief

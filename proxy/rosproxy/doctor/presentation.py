@@ -5,7 +5,7 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.admin.findings import DoctorFinding, Severity, failed
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, failed
 from rosproxy.telemetry.text import clean, plural, wrap
 
 MOST_ALIKE = 10

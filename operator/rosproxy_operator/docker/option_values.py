@@ -1,11 +1,11 @@
-"""Kinds of values of the Docker operator's options; see `rosproxy.values`."""
+"""Kinds of values of the Docker operator's options; see `rosproxy.setting_kinds`."""
 
 import re
 from pathlib import Path
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.values import Number, Text, read_address, read_master_uri
+from rosproxy.setting_kinds import Number, Text, read_address, read_master_uri
 from rosproxy_operator.common.ros2 import read_peer_name
 
 MOST_PORTS = 1000

@@ -13,11 +13,11 @@ from dataclasses import asdict
 from rosproxy import __version__
 from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus
 from rosproxy.cli.terminal import size, watch, write
+from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
-from rosproxy_operator.common.resolver import MasterResolver
-from rosproxy_operator.docker.client import DockerClient
+from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Member, OwnContainer

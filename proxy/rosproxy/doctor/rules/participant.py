@@ -6,7 +6,7 @@ is on the networks inside but not heard by the proxy, and which topics and servi
 
 from collections.abc import Iterator
 
-from rosproxy.admin.findings import DoctorFinding, error, note, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label

@@ -26,23 +26,23 @@ from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri, slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import stand_ins
+from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.graph import Graph
-from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.callers import Callers
-from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
-from rosproxy.ros1.standins.outside import Outside, OutsideNode
-from rosproxy.ros1.standins.udpros import UdprosRelays
+from rosproxy.ros1.standins.outside_nodes import Outside, OutsideNode
+from rosproxy.ros1.standins.udpros_relays import UdprosRelays
 
 log = logging.getLogger(__name__)
 

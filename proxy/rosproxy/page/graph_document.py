@@ -10,14 +10,15 @@ from itertools import product
 
 import msgspec
 
-from rosproxy.admin.findings import DoctorFinding, Severity, error
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error
 from rosproxy.admin.status_document import EndpointStatus, ProxyStatus, StandInStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SystemState
 from rosproxy.doctor.rules import diagnose_running
 from rosproxy.doctor.rules.pair import judge_pair
 from rosproxy.net.addresses import is_loopback
 from rosproxy.page import domain_graph
-from rosproxy.page.document import (
+from rosproxy.page.measures import FLOWS, Key, Measures
+from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
     HOST,
@@ -36,7 +37,6 @@ from rosproxy.page.document import (
     shown_name,
     shown_text,
 )
-from rosproxy.page.measures import FLOWS, Key, Measures
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 
 MASTER, PROXY = "master", "rosproxy"

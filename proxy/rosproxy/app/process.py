@@ -9,9 +9,9 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
 from typing import Any
 
-from rosproxy.admin.client import default_url
-from rosproxy.admin.server import Action, AdminServer
-from rosproxy.admin.status import common_status
+from rosproxy.admin.admin_client import default_url
+from rosproxy.admin.admin_server import Action, AdminServer
+from rosproxy.admin.common_status import common_status
 from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.app.policy_sources import PolicySources
 from rosproxy.app.self_check import SelfCheck

@@ -27,10 +27,11 @@ from rosproxy.ros2.discovery.domain_settings import (
     Refused,
     sent_to,
 )
-from rosproxy.ros2.discovery.policing import is_hidden
+from rosproxy.ros2.discovery.hidden_endpoints import is_hidden
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import destination, for_all, source_vendor
+from rosproxy.ros2.registry.locator_ports import stand_in_port
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
@@ -38,7 +39,6 @@ from rosproxy.ros2.registry.participants import (
     OutsideParticipant,
     ParticipantTable,
 )
-from rosproxy.ros2.registry.ports import stand_in_port
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     read_discovery,

@@ -19,10 +19,10 @@ from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.budget import Charge, OverBudget
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.bounds import too_long_to_connect
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.name_lengths import too_long_to_connect
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import ROSOUT

@@ -15,10 +15,10 @@ from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback
 from rosproxy.net.interfaces import is_own
 from rosproxy.net.resolver import NODES, resolve
-from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_service_uri, path_of
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.servers.access_checks import AccessChecks
 

@@ -9,7 +9,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.page.routes import Page
-from rosproxy.values import SettingError
+from rosproxy.setting_kinds import SettingError
 
 Check = Callable[[], str | None]
 

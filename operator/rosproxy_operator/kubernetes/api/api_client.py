@@ -33,8 +33,8 @@ from kubernetes.config import ConfigException
 from urllib3.exceptions import HTTPError
 
 from rosproxy import __version__
-from rosproxy_operator.kubernetes.api.gate import Gate
 from rosproxy_operator.kubernetes.api.kubeconfig import NoCluster, configuration
+from rosproxy_operator.kubernetes.api.leader_gate import Gate
 from rosproxy_operator.kubernetes.api.rbac import missing_rule
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.telemetry.text import brief
 
 ROBOT, HOST, CONTAINER = "robot", "host", "container"

@@ -6,8 +6,8 @@ They are those of ``rosproxy run``, but for the words.
 import click
 
 from rosproxy.cli.options import Command, click_option, click_type, with_options
+from rosproxy.setting_kinds import POLICY_RULES, declared
 from rosproxy.settings import Settings
-from rosproxy.values import POLICY_RULES, declared
 from rosproxy_operator.common.proxy_bounds import PREFIX, ProxyBounds
 
 _POLICY = (

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.node import NodeClient
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.clients.master_client import MasterError, Unreachable
+from rosproxy.ros1.clients.node_client import NodeClient
+from rosproxy.ros1.registry.node_health import ProbeResult
 
 LONGEST_ANSWER = 4096
 """Bytes of an answer with its header: rospy's have 400."""

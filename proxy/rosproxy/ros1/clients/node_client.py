@@ -1,7 +1,7 @@
 """Asking a node who it is: does it answer, as which process, with which topics, on which port?
 
 There are four questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over; of
-nodes that are well by `rosproxy.ros1.clients.kept`.
+nodes that are well by `rosproxy.ros1.clients.kept_connections`.
 `NodeClient.inspect` has the node describe itself; whoever is about to believe what somebody else
 said of a node (the master after a restart, an operator, the node's former process) inspects it
 first. `NodeClient.name` asks what it is called, before it is registered for somebody who calls from
@@ -19,7 +19,7 @@ import msgspec
 
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import (
+from rosproxy.ros1.clients.master_client import (
     CALLER_ID,
     MasterClient,
     MasterError,
@@ -29,7 +29,7 @@ from rosproxy.ros1.clients.master import (
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo, read_types
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.node_health import ProbeResult
 
 log = logging.getLogger(__name__)
 

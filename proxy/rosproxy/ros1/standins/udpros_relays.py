@@ -36,12 +36,12 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.values import Edit
+from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
-from rosproxy.ros1.rewriting.udpros import read_offers, redirect_offer
+from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
 from rosproxy.ros1.servers.access_checks import AccessChecks
-from rosproxy.ros1.standins.outside import Outside
+from rosproxy.ros1.standins.outside_nodes import Outside
 
 log = logging.getLogger(__name__)
 
