@@ -14,11 +14,11 @@ import logging
 import time
 from collections.abc import Callable, Collection
 
-from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, network_facts
@@ -39,8 +39,8 @@ class ProxyUpdater:
     After each look the proxy is told its policy if that has changed, and who may use it as its
     master, whether or not that has, asked for its nodes, and told what is new (`ProxyNews`).
     ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
-    ``leases`` are what its participants of ROS 2 have; it is told the ``former`` ones until it has
-    some.
+    ``leases`` are what its participants of ROS 2 have; it is told the ``former_leases`` until it
+    has some.
     """
 
     def __init__(
@@ -49,18 +49,17 @@ class ProxyUpdater:
         access: ProxyAccess,
         proxies: ProxyClient,
         answered: Callable[[], None],
-        former: Leases,
+        former_leases: Leases,
     ) -> None:
         self.access = access
         self.leases: Leases = {}
-        self._former = former
+        self._former_leases = former_leases
         self.error: ProxyError | None = None
         self.silent_since: float | None = time.monotonic()
-        self._name, self._proxies, self._answered = name, proxies, answered
+        self._name, self._answered = name, answered
+        self._session = ProxySession(proxies, access.admin, access.token)
         self._news = ProxyNews()
         self._looked, self._selecting = asyncio.Event(), asyncio.Event()
-        self._policy: tuple[PolicyLayer, ...] | None = None
-        self._telling_policy = asyncio.Lock()
 
     def update(self, network_facts: NetworkFacts) -> None:
         """Take note of what a look has found."""
@@ -80,13 +79,12 @@ class ProxyUpdater:
         while True:
             await self._selecting.wait()
             self._selecting.clear()
-            addresses = self._news.facts.selected
+            addresses = tuple(self._news.facts.selected)
             try:
-                await self._tell_policy()
-                former = None if self.leases else self._former
-                await self._proxies.selected(
-                    self.access.admin, self.access.token, addresses, former=former
-                )
+                await self._session.tell_policy(self._news.policy)
+                former_leases = {} if self.leases else self._former_leases
+                callers = AllowedCallers(addresses, former_leases=former_leases)
+                await self._session.tell_callers(callers)
                 failures, logged = 0, ""
             except ProxyError as error:
                 # Not logged before all pauses are used up, which takes 19 s, and then once.
@@ -97,15 +95,6 @@ class ProxyUpdater:
                 self._selecting.set()
                 await asyncio.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
                 failures += 1
-
-    async def _tell_policy(self) -> None:
-        """Tell the policy, unless this run of the proxy has heard it. Raises ProxyError."""
-        # Both tasks of `run` tell it: the second one waits, and finds that it is told.
-        async with self._telling_policy:
-            policy = self._news.policy
-            if policy != self._policy:
-                await self._proxies.policy(self.access.admin, self.access.token, policy)
-                self._policy = policy
 
     async def _keep_told(self) -> None:
         """Tell what else is new."""
@@ -127,14 +116,13 @@ class ProxyUpdater:
 
     async def _tell(self) -> None:
         self._looked.clear()
-        admin, token = self.access.admin, self.access.token
         refusal = await self._policy_refusal()
-        status = await self._proxies.status(admin)
+        status = await self._session.status()
         self.leases = leases(status)
         # The facts are not older than need be: its nodes may have come since the last look.
         address = self._news.facts.master_address
         if address and status.master.address != address:
-            await self._proxies.master_address(admin, token, address)
+            await self._session.tell_master_address(address)
             text = "%s: its master is now at %s"
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
@@ -143,7 +131,7 @@ class ProxyUpdater:
             body.pop("arrived", None)  # adopted nodes would not be kept to the policy
         if body:
             log.debug("%s is told %s", self._name, body)
-            answer = await self._proxies.containers(admin, token, body)
+            answer = await self._session.tell_containers(body)
             counts = {change: answer.get(change) for change in ("unregistered", "moved", "adopted")}
             if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
                 log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
@@ -153,7 +141,7 @@ class ProxyUpdater:
     async def _policy_refusal(self) -> PolicyRefused | None:
         """Tell the policy; why the proxy does not take it, if it does not. Raises ProxyError."""
         try:
-            await self._tell_policy()
+            await self._session.tell_policy(self._news.policy)
         except PolicyRefused as error:
             return error
         return None

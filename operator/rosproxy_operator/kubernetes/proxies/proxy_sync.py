@@ -22,6 +22,7 @@ from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases
 from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer, report, short
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod, ProxyReport
@@ -51,8 +52,6 @@ REPEATED = 30.0
 
 _KNOWS_NO_CHANGES = (403, 404, 405, 503)
 """HTTP answers of a proxy of a former release, or of one at which too many wait already."""
-_Callers = tuple[tuple[str, ...], tuple[str, ...] | None, Leases]
-"""Addresses that may use a proxy, its ROS 2 peers (None without ROS 2), and former ports."""
 
 
 class CallLimits:
@@ -79,18 +78,16 @@ class ProxyPoller:
         leads: Callable[[], bool] = lambda: True,
     ) -> None:
         self._leads = leads
-        self.target, self.token = address_of(proxy), token_for(proxy, key)
+        self.session = ProxySession(proxies, *_admin_endpoint(proxy, key))
         self.name = str(proxy.pod.id)
         self.report: ProxyReport | None = None
-        self._proxies, self._limits, self._changed = proxies, limits, changed
+        self._limits, self._changed = limits, changed
         self._gone: set[str] = set()
         self._restarts = proxy.restarts
         self._policy: tuple[PolicyLayer, ...] | None = None
-        self._known_policy: tuple[PolicyLayer, ...] | None = None
         self._refusal = ""
-        self._callers: _Callers | None = None
-        self._granted: _Callers | None = None
-        self._granted_at = 0.0
+        self._callers: AllowedCallers | None = None
+        self._callers_told_at = 0.0
         self._pending = asyncio.Event()
         self._recheck, self._failures = False, 0
         self._tells_changes, self._version, self._instance = True, "", ""
@@ -105,21 +102,13 @@ class ProxyPoller:
     def report_policy(self, policy: tuple[PolicyLayer, ...]) -> None:
         """Have the proxy told all layers of its policy."""
         self._policy = policy
-        if policy != self._known_policy:
+        if not self.session.has_policy(policy):
             self._pending.set()
 
-    def report_callers(
-        self,
-        callers: tuple[str, ...],
-        peers: tuple[str, ...] | None = None,
-        former: Leases | None = None,
-    ) -> None:
-        """Have the proxy told the addresses of all pods that may use it as their master.
-
-        And, if it is for ROS 2, its peers, and which ports participants had at the former proxy.
-        """
-        self._callers = callers, peers, former or {}
-        if self._callers != self._granted:
+    def report_callers(self, callers: AllowedCallers) -> None:
+        """Have the proxy told which pods may use it as their master."""
+        self._callers = callers
+        if not self.session.has_callers(callers):
             self._pending.set()
 
     def restarted(self, restarts: int) -> None:
@@ -161,8 +150,11 @@ class ProxyPoller:
     @property
     def _is_busy(self) -> bool:
         """Whether the proxy is yet to answer, or to confirm what it was sent."""
-        done = self._policy in (None, self._known_policy) and self._callers in (None, self._granted)
-        return bool(self._failures or self._recheck or self._gone) or not done
+        policy, callers = self._policy, self._callers
+        confirmed = (policy is None or self.session.has_policy(policy)) and (
+            callers is None or self.session.has_callers(callers)
+        )
+        return bool(self._failures or self._recheck or self._gone) or not confirmed
 
     async def _wait_for_either(self, long_poll: asyncio.Task[None]) -> None:
         """Wait for a change, or until there is something to send."""
@@ -214,7 +206,7 @@ class ProxyPoller:
         if self._tells_changes:
             try:
                 since = self._version if within else ""
-                change = await self._proxies.changes(self.target, self.token, since, within)
+                change = await self.session.changes(since, within)
             except ProxyError as error:
                 if error.status not in _KNOWS_NO_CHANGES:
                     raise
@@ -223,7 +215,7 @@ class ProxyPoller:
                 self._version, status = change
                 self._note_instance(status.instance)
                 return status
-        return await self._proxies.status(self.target)
+        return await self.session.status()
 
     def _note_instance(self, instance: str) -> None:
         """Note which process answers: one that was started again knows nothing."""
@@ -234,27 +226,27 @@ class ProxyPoller:
 
     def _forget(self) -> None:
         """Assume that the proxy knows nothing."""
-        self._granted = self._known_policy = None
+        self.session.forget()
         self._tells_changes = True
 
     async def _tell_policy(self) -> bool:
         """Send its policy, if it does not have that. Returns whether it has it now."""
         policy = self._policy
-        if policy is None or policy == self._known_policy:
+        if policy is None or self.session.has_policy(policy):
             return True
         try:
             async with self._limits.slow:
                 if not self._leads():
                     return False
-                await self._proxies.policy(self.target, self.token, policy)
+                await self.session.tell_policy(policy)
         except PolicyRefused as error:
             self._refusal = short(str(error))
             return False
         except ProxyError as error:
-            log.debug("%s was not told its policy: %s", self.target, error)
+            log.debug("%s was not told its policy: %s", self.session.admin, error)
             return False
         self._recheck = self._recheck or bool(self._refusal)  # it has another report now
-        self._known_policy, self._refusal = policy, ""
+        self._refusal = ""
         return True
 
     async def _tell_callers(self) -> None:
@@ -263,18 +255,18 @@ class ProxyPoller:
         In a call of its own, before the others: those may wait for the master, and pods for this.
         """
         callers = self._callers
-        recent = self._tells_changes or time.monotonic() - self._granted_at < REPEATED
-        if callers is None or (callers == self._granted and recent):
+        recent = self._tells_changes or time.monotonic() - self._callers_told_at < REPEATED
+        if callers is None or (self.session.has_callers(callers) and recent):
             return
         try:
             async with self._limits.questions:
                 if not self._leads():  # the call before may have taken long
                     return
-                await self._proxies.selected(self.target, self.token, *callers)
+                await self.session.tell_callers(callers)
         except ProxyError as error:
-            log.debug("%s was not told that %s may use it: %s", self.target, callers, error)
+            log.debug("%s was not told that %s may use it: %s", self.session.admin, callers, error)
             return
-        self._granted, self._granted_at = callers, time.monotonic()
+        self._callers_told_at = time.monotonic()
 
     async def _tell_gone(self) -> bool:
         """Send which pods are gone, if any are. Returns whether the proxy has confirmed that."""
@@ -285,13 +277,13 @@ class ProxyPoller:
             async with self._limits.slow:
                 if not self._leads():
                     return False
-                answer = await self._proxies.containers(self.target, self.token, {"gone": gone})
+                answer = await self.session.tell_containers({"gone": gone})
         except ProxyError as error:
             # It may just be without its master; it is sent again with the next poll.
-            log.debug("%s was not told that %s are gone: %s", self.target, gone, error)
+            log.debug("%s was not told that %s are gone: %s", self.session.admin, gone, error)
             return False
         self._gone -= set(gone)
-        log.debug("%s was told that %s are gone: %s", self.target, gone, answer)
+        log.debug("%s was told that %s are gone: %s", self.session.admin, gone, answer)
         return True
 
     def _has_waited(self, seconds: float) -> bool:
@@ -323,7 +315,8 @@ class ClusterProxySync:
     @property
     def admin_endpoints(self) -> dict[str, tuple[HostPort, str]]:
         """Each proxy's admin endpoint and the token for it, by the names of their pods."""
-        return {poller.name: (poller.target, poller.token) for poller, _ in self._pollers.values()}
+        sessions = {poller.name: poller.session for poller, _ in self._pollers.values()}
+        return {name: (session.admin, session.token) for name, session in sessions.items()}
 
     def follow(self, proxies: Iterable[ProxyPod], key: bytes = b"") -> None:
         """Poll these and no others, with tokens made from this key."""
@@ -332,7 +325,8 @@ class ClusterProxySync:
             poller, task = self._pollers[uid]
             current = wanted.get(uid)
             endpoint = _admin_endpoint(current, key) if current else None
-            if current is None or endpoint != (poller.target, poller.token) or task.done():
+            session = poller.session
+            if current is None or endpoint != (session.admin, session.token) or task.done():
                 task.cancel()
                 del self._pollers[uid]
             else:
@@ -367,7 +361,8 @@ class ClusterProxySync:
         """Let proxies know, by the uid of their pod, which addresses may use them, and peers."""
         for uid, addresses in callers.items():
             if uid in self._pollers:
-                self._pollers[uid][0].report_callers(addresses, peers.get(uid), former.get(uid))
+                allowed = AllowedCallers(addresses, peers.get(uid), former.get(uid, {}))
+                self._pollers[uid][0].report_callers(allowed)
 
     def report_gone(self, gone: Mapping[str, Iterable[str]]) -> None:
         """Let proxies know, by the uid of their pod, which addresses are no pod's any more."""
