@@ -1,8 +1,9 @@
 """The client's side of XML-RPC: POST over kept connections.
 
-aiohttp's connection and parser do the work. Its ClientSession is left out: cookies, redirects,
-proxies and the like take longer than all the rest of a call that is forwarded. Nothing is ever
-inflated: ROS does not compress, and a small body could become a huge one.
+aiohttp's connection and parser do the work. Its ClientSession is left out: with cookies, redirects,
+proxies and the like a call takes 1.7 times as long, and it closes the connection of a call that is
+given up, which ends roslisp nodes (`rosproxy.net.late_answers`). Nothing is ever inflated: ROS does
+not compress, and a small body could become a huge one.
 
 Bodies that need not be read here, requests and replies alike, go through piece by piece: who can't
 write does not read, so that they take some 100 KiB whatever their length.
