@@ -24,25 +24,25 @@ INSTALL = ROOT / "manifests/install.yaml"
 def custom_resource() -> Mapping[str, Any]:
     """The custom resource definition, as it is installed."""
     documents = yaml.safe_load_all(INSTALL.read_text())
-    return next(one for one in documents if one["kind"] == "CustomResourceDefinition")
+    return next(d for d in documents if d["kind"] == "CustomResourceDefinition")
 
 
-def fields_table(part: str, definition: Mapping[str, Any]) -> str:
+def fields_table(section: str, definition: Mapping[str, Any]) -> str:
     """The fields of the spec or of the status, as a table."""
-    schema = definition["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"][part]
-    rows = ["| field | type | default | meaning |", "|---|---|---|---|", *_fields(schema, part)]
+    schema = definition["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"][section]
+    rows = ["| field | type | default | meaning |", "|---|---|---|---|", *_fields(schema, section)]
     return "\n".join(rows)
 
 
 def _fields(schema: Mapping[str, Any], path: str) -> Iterator[str]:
     required = schema.get("required", [])
     for name, field in schema.get("properties", {}).items():
-        where = f"{path}.{name}"
+        field_path = f"{path}.{name}"
         default = "required" if name in required else _default(field)
-        yield f"| `{where}` | {_type(field)} | {default} | {_meaning(field)} |"
-        yield from _fields(field, where)
+        yield f"| `{field_path}` | {_type(field)} | {default} | {_meaning(field)} |"
+        yield from _fields(field, field_path)
         if _is_list_of_objects(field):
-            yield from _fields(field["items"], f"{where}[]")
+            yield from _fields(field["items"], f"{field_path}[]")
 
 
 def _is_list_of_objects(field: Mapping[str, Any]) -> bool:

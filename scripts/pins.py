@@ -70,7 +70,7 @@ def _read(text: str) -> Iterator[Pin]:
         if not _NAME.match(block):
             continue  # the heading
         lines = block.splitlines()
-        comments = [found[1] for line in lines if (found := _VIA.match(line.strip()))]
+        comments = [match[1] for line in lines if (match := _VIA.match(line.strip()))]
         via = frozenset(_name(comment) for comment in comments if _NAME.match(comment))
         pinned = "\n".join(line for line in lines if not line.lstrip().startswith("#"))
         yield Pin(_name(block), pinned.rstrip(), via)
@@ -78,10 +78,10 @@ def _read(text: str) -> Iterator[Pin]:
 
 def _name(text: str) -> str:
     """The name that a requirement begins with, as indexes compare names (PEP 503)."""
-    found = _NAME.match(text)
-    return re.sub(r"[-_.]+", "-", found[0]).lower() if found else ""
+    match = _NAME.match(text)
+    return re.sub(r"[-_.]+", "-", match[0]).lower() if match else ""
 
 
 if __name__ == "__main__":
-    for one in pins(filter(None, ",".join(sys.argv[1:]).split(","))):
-        print(one.text)
+    for pin in pins(filter(None, ",".join(sys.argv[1:]).split(","))):
+        print(pin.text)

@@ -76,24 +76,24 @@ class Release:
         return f"{self.registry}/{program}:{self.version}".lstrip("/")
 
 
-def run(*words: str | Path, **more: str) -> str:
+def run(*command: str | Path, **more: str) -> str:
     """Run a program; what it prints. Raises Wrong with that if it fails."""
     done = subprocess.run(
-        [str(word) for word in words], cwd=ROOT, env={**os.environ, **more}, text=True,
+        [str(argument) for argument in command], cwd=ROOT, env={**os.environ, **more}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
     if done.returncode:
-        raise Wrong(f"{' '.join(map(str, words))}: exit {done.returncode}\n{done.stdout}")
+        raise Wrong(f"{' '.join(map(str, command))}: exit {done.returncode}\n{done.stdout}")
     return done.stdout
 
 
 def project_version() -> str:
     """The version that the code has."""
     text = (ROOT / "proxy/rosproxy/__init__.py").read_text()
-    found = re.search(r'^__version__ = "(\d+\.\d+\.\d+)"$', text, re.M)
-    if found is None:
+    match = re.search(r'^__version__ = "(\d+\.\d+\.\d+)"$', text, re.M)
+    if match is None:
         raise Wrong("proxy/rosproxy/__init__.py has no __version__ of three numbers")
-    return found[1]
+    return match[1]
 
 
 # == versions ======================================================================================
@@ -113,7 +113,7 @@ def check_versions(release: Release) -> None:
     if release.tag:
         told["tag"] = release.tag.removeprefix("v")
         told["CHANGELOG.md, newest heading"] = newest(ROOT / "CHANGELOG.md")
-    differing = {where: version for where, version in told.items() if version != release.version}
+    differing = {source: version for source, version in told.items() if version != release.version}
     if differing:
         text = f"the code has {release.version}, and others another version: {differing}"
         raise Wrong(f"{text}; docs/releasing.md says what is to be changed")
@@ -125,7 +125,7 @@ def newest(changelog: Path) -> str:
     unreleased = changelog.read_text().partition("## [Unreleased]")[2].partition("\n## ")[0]
     if unreleased.strip():
         raise Wrong("CHANGELOG.md has changes under [Unreleased]: give them the version's heading")
-    return next((one for one in headings if one != "Unreleased"), "none")
+    return next((heading for heading in headings if heading != "Unreleased"), "none")
 
 
 # == packages ======================================================================================
@@ -206,12 +206,14 @@ def check_sbom(release: Release) -> None:
         path = DIST / f"{program}-{release.version}.cdx.json"
         options = ("--pyproject", "pyproject.toml", "--output-reproducible", "--validate")
         run(BIN / "cyclonedx-py", "environment", *options, "-o", path, python)
-        found = {one["name"].lower() for one in json.loads(path.read_text())["components"]}
+        listed = {
+            component["name"].lower() for component in json.loads(path.read_text())["components"]
+        }
         lines = run(BIN / "python", "-m", "pip", "--python", python, "freeze", "--all")
-        there = {line.partition("==")[0].lower() for line in lines.splitlines() if "==" in line}
-        if len(there) < 10 or there - found:
-            raise Wrong(f"{path.name} lacks {sorted(there - found)}")
-        print(f"  {path.name}: {len(found)} components")
+        installed = {line.partition("==")[0].lower() for line in lines.splitlines() if "==" in line}
+        if len(installed) < 10 or installed - listed:
+            raise Wrong(f"{path.name} lacks {sorted(installed - listed)}")
+        print(f"  {path.name}: {len(listed)} components")
 
 
 def check_chart(release: Release) -> None:
@@ -230,11 +232,11 @@ def check_chart(release: Release) -> None:
     named = rf"\b(rosproxy(?:-operator)?:{re.escape(release.version)})(?=\"?$)"
     manifest = re.sub(named, rf"{release.registry}/\1".lstrip("/"), text, flags=re.M)
     (DIST / "install.yaml").write_text(manifest)
-    for where, objects in ((package.name, made), ("install.yaml", manifest)):
+    for file_name, objects in ((package.name, made), ("install.yaml", manifest)):
         for image in (f'image: "{release.image("rosproxy-operator")}"',
                       f"--proxy-image={release.image('rosproxy')}"):  # fmt: skip
             if f"{image}\n" not in objects:
-                raise Wrong(f"{where} does not pull {image}")
+                raise Wrong(f"{file_name} does not pull {image}")
     alerts = (CHART / "files/alerts.yaml").read_text()
     alerts = alerts.replace("runbook_url: docs/guide/alerts.md", f"runbook_url: {release.runbook}")
     (DIST / "alerts.yaml").write_text(alerts)
@@ -283,13 +285,13 @@ def check_images(release: Release) -> None:
 
 def check_registry(release: Release) -> None:
     """What was pushed is what comes back: both images, and the chart by oci://."""
-    with tempfile.TemporaryDirectory() as directory, running_registry(Path(directory)) as where:
+    with tempfile.TemporaryDirectory() as directory, running_registry(Path(directory)) as address:
         for program in PROGRAMS:
-            check_pulled(release.image(program), f"{where}/{program}:{release.version}")
+            check_pulled(release.image(program), f"{address}/{program}:{release.version}")
         helm = shutil.which("helm") or cluster_program("helm")
         package = DIST / f"rosproxy-operator-{release.version}.tgz"
-        run(helm, "push", package, f"oci://{where}/charts", "--plain-http")
-        wanted = (f"oci://{where}/charts/rosproxy-operator", "--version", release.version)
+        run(helm, "push", package, f"oci://{address}/charts", "--plain-http")
+        wanted = (f"oci://{address}/charts/rosproxy-operator", "--version", release.version)
         pulled = run(helm, "template", "r", *wanted, "--plain-http", "--kube-version", "1.30.0")
         made = run(helm, "template", "r", package, "--kube-version", "1.30.0")
         if not pulled.endswith(made):  # before it stands where it was pulled from
@@ -317,9 +319,14 @@ def running_registry(directory: Path) -> Iterator[str]:
     """A registry on loopback, which Docker takes without TLS; where it is."""
     program = run(ROOT / "scripts/install-registry.sh").splitlines()[-1]
     with socket.create_server(("127.0.0.1", 0)) as free:
-        where = f"127.0.0.1:{free.getsockname()[1]}"
+        address = f"127.0.0.1:{free.getsockname()[1]}"
     storage = {"filesystem": {"rootdirectory": str(directory / "data")}}
-    config = {"version": 0.1, "storage": storage, "http": {"addr": where}, "log": {"level": "warn"}}
+    config = {
+        "version": 0.1,
+        "storage": storage,
+        "http": {"addr": address},
+        "log": {"level": "warn"},
+    }
     (directory / "config.yml").write_text(json.dumps(config))
     log = directory / "log"
     with log.open("wb") as output:
@@ -327,19 +334,19 @@ def running_registry(directory: Path) -> Iterator[str]:
                                    stdout=output, stderr=output)  # fmt: skip
     try:
         end = time.monotonic() + 30
-        while not answers(where):
+        while not answers(address):
             if process.poll() is not None or time.monotonic() > end:
                 raise Wrong(f"the registry does not start:\n{log.read_text()}")
             time.sleep(0.1)
-        yield where
+        yield address
     finally:
         process.terminate()
         process.wait(30)
 
 
-def answers(where: str) -> bool:
+def answers(address: str) -> bool:
     try:
-        with urllib.request.urlopen(f"http://{where}/v2/", timeout=5):
+        with urllib.request.urlopen(f"http://{address}/v2/", timeout=5):
             return True
     except OSError:
         return False

@@ -18,7 +18,9 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
 
     Raises SettingError for the first value that can't be used.
     """
-    return _run([word for name, value in options.items() for word in _words(name, value)], {})
+    return _run(
+        [argument for name, value in options.items() for argument in _arguments(name, value)], {}
+    )
 
 
 def settings_of(variables: Mapping[str, str]) -> Settings:
@@ -26,20 +28,20 @@ def settings_of(variables: Mapping[str, str]) -> Settings:
     return _run([], variables)
 
 
-def _run(words: list[str], variables: Mapping[str, str]) -> Settings:
+def _run(arguments: list[str], variables: Mapping[str, str]) -> Settings:
     with mock.patch.dict(os.environ, variables, clear=True):
         try:
-            values = run.make_context("run", words).params
+            values = run.make_context("run", arguments).params
         except click.UsageError as error:
             option, _, message = OneLineError(error, "rosproxy").message.partition(": ")
             raise SettingError(option, message) from None
     return make_settings(Settings, values)
 
 
-def _words(name: str, value: Any) -> Iterator[str]:
+def _arguments(name: str, value: Any) -> Iterator[str]:
     option = f"--{name.replace('_', '-')}"
-    for one in value if isinstance(value, tuple | list) else (value,):
-        if one is True:
+    for single_value in value if isinstance(value, tuple | list) else (value,):
+        if single_value is True:
             yield option
-        elif one is not None and one is not False:
-            yield f"{option}={one}"
+        elif single_value is not None and single_value is not False:
+            yield f"{option}={single_value}"

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from rosproxy.net.resolver import resolve
 
-Where = tuple[str, int]
+Address = tuple[str, int]
 """Host and port."""
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
@@ -72,11 +72,11 @@ def ok(body: bytes, *headers: str) -> bytes:
 
 def value(result: Any) -> bytes:
     """A whole response that holds an XML-RPC value, or a Fault."""
-    held = result if isinstance(result, xmlrpc.client.Fault) else (result,)
-    return ok(xmlrpc.client.dumps(held, methodresponse=True).encode())
+    params = result if isinstance(result, xmlrpc.client.Fault) else (result,)
+    return ok(xmlrpc.client.dumps(params, methodresponse=True).encode())
 
 
-def where(uri: str) -> Where:
+def host_and_port(uri: str) -> Address:
     """Host and port of a URI; raises ValueError when it lacks one."""
     parts = urlsplit(uri)
     if not parts.hostname or not parts.port:
@@ -127,13 +127,13 @@ free_ports = PORTS.draw
 
 
 async def call(
-    address: Where | str, method: str, *params: Any, source: str = "", host: str = ""
+    address: Address | str, method: str, *params: Any, source: str = "", host: str = ""
 ) -> Any:
     """The value of an XML-RPC call. Raises Fault, ValueError, OSError, EOFError, TimeoutError.
 
     `source` is the address to call from; `host` what to call the peer, where that isn't `address`.
     """
-    target = where(address) if isinstance(address, str) else address
+    target = host_and_port(address) if isinstance(address, str) else address
     body = xmlrpc.client.dumps(params, method).encode()
     head = f"POST / HTTP/1.1\r\nHost: {host or authority(target)}\r\n"
     async with asyncio.timeout(CALL_SECONDS):
@@ -147,20 +147,20 @@ async def call(
             writer.close()
 
 
-def authority(address: Where) -> str:
+def authority(address: Address) -> str:
     """A host and port as they stand in a URI."""
     host, port = address
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-async def connect(address: Where, source: str = "") -> Streams:
+async def connect(address: Address, source: str = "") -> Streams:
     """Open a connection, from `source` if it is of the same family. Raises OSError."""
     # Not by the event loop: uvloop's look-up logs a traceback when who waits for it is cancelled.
-    found = await resolve(address[0])
-    if not found:
+    addresses = await resolve(address[0])
+    if not addresses:
         raise OSError(f"{address[0]} has no address")
-    local = (source, 0) if source and ":" not in found[0] else None
-    return await asyncio.open_connection(found[0], address[1], local_addr=local)
+    local = (source, 0) if source and ":" not in addresses[0] else None
+    return await asyncio.open_connection(addresses[0], address[1], local_addr=local)
 
 
 class FakeTcpServer:
@@ -175,7 +175,7 @@ class FakeTcpServer:
         self._tasks: set[asyncio.Task[None]] = set()
         self.admits: Callable[[str], bool] = lambda _peer: True
         self.connections = 0
-        self.address: Where = ("", 0)
+        self.address: Address = ("", 0)
 
     @property
     def listening(self) -> bool:

@@ -108,7 +108,7 @@ class FakeMaster:
         if former != api:
             for kind, table in self.tables.items():
                 for key, providers in [*table.items()]:
-                    self._keep(kind, key, [one for one in providers if one[0] != caller])
+                    self._keep(kind, key, [p for p in providers if p[0] != caller])
             reason = f"[{caller}] Reason: new node registered with same name"
             self._notify(former, "shutdown", reason)
 
@@ -139,10 +139,10 @@ class FakeMaster:
         for uri in self.holds("subscribers", topic):
             self._notify(uri, "publisherUpdate", topic, self.holds("publishers", topic))
 
-    def _announce_param(self, key: str, held: Any, but_not: str = "") -> None:
+    def _announce_param(self, key: str, value: Any, but_not: str = "") -> None:
         for caller, uri in self.tables["params"].get(key, []):
             if caller != but_not:
-                self._notify(uri, "paramUpdate", key, held)
+                self._notify(uri, "paramUpdate", key, value)
 
     # Answering
 
@@ -226,9 +226,9 @@ class FakeMaster:
             return 1, f"[{caller}] is not a registered node", 0
         if (caller, api) not in providers:
             return 1, f"[{caller}] is not a known provider of [{key}]", 0
-        self._keep(kind, key, [one for one in providers if one != (caller, api)])
+        self._keep(kind, key, [p for p in providers if p != (caller, api)])
         left = [row for table in self.tables.values() for row in table.values()]
-        if not any(one[0] == caller for row in left for one in row):
+        if not any(provider[0] == caller for row in left for provider in row):
             del self.nodes[caller]
         if kind == "publishers":
             self._announce_publishers(key)
@@ -244,12 +244,14 @@ class FakeMaster:
 
     def _system_state(self, _caller: str) -> Triple:
         tables = [self.tables[kind] for kind in ("publishers", "subscribers", "services")]
-        state = [[[key, [name for name, _ in row]] for key, row in one.items()] for one in tables]
+        state = [
+            [[key, [name for name, _ in row]] for key, row in table.items()] for table in tables
+        ]
         return 1, "current system state", state
 
-    def _set_param(self, caller: str, key: str, held: Any) -> Triple:
-        self.params[key] = held
-        self._announce_param(key, held, but_not=caller)
+    def _set_param(self, caller: str, key: str, value: Any) -> Triple:
+        self.params[key] = value
+        self._announce_param(key, value, but_not=caller)
         return 1, f"parameter {key} set", 0
 
     def _get_param(self, _caller: str, key: str) -> Triple:

@@ -17,12 +17,12 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from examples.demo.fake_http import (
+    Address,
     Answer,
     End,
     FakeHttpServer,
     FakeRequest,
     FakeTcpServer,
-    Where,
     authority,
     call,
     value,
@@ -103,21 +103,21 @@ class FakeNode:
             await server.stop()
         await self.slave.stop()
 
-    async def call(self, master: Where | str, method: str, *params: Any) -> Any:
+    async def call(self, master: Address | str, method: str, *params: Any) -> Any:
         """Call its master, under its own name and from its own address."""
         return await call(master, method, self.name, *params, source=self.address)
 
-    async def publish(self, master: Where | str, topic: str = "/chatter") -> list[Any]:
+    async def publish(self, master: Address | str, topic: str = "/chatter") -> list[Any]:
         """Register as a publisher; the ROS triple."""
         self.published[topic] = STRING["type"]
         return await self._register(master, "registerPublisher", topic, STRING["type"])
 
-    async def subscribe(self, master: Where | str, topic: str = "/chatter") -> list[Any]:
+    async def subscribe(self, master: Address | str, topic: str = "/chatter") -> list[Any]:
         """Register as a subscriber; the ROS triple."""
         self.subscribed[topic] = STRING["type"]
         return await self._register(master, "registerSubscriber", topic, STRING["type"])
 
-    async def serve(self, master: Where | str, service: str = "/add") -> list[Any]:
+    async def serve(self, master: Address | str, service: str = "/add") -> list[Any]:
         """Register a service; the ROS triple."""
         api = f"rosrpc://{authority((self.host, self.port_of(service)))}"
         return await self._register(master, "registerService", service, api)
@@ -147,7 +147,7 @@ class FakeNode:
         if name in self.own_ports:
             await self.own_ports.pop(name).stop()
 
-    async def _register(self, master: Where | str, method: str, *params: str) -> list[Any]:
+    async def _register(self, master: Address | str, method: str, *params: str) -> list[Any]:
         triple: list[Any] = await self.call(master, method, *params, self.uri)
         return triple
 

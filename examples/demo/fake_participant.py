@@ -79,8 +79,10 @@ class FakeParticipant(asyncio.DatagramProtocol):
         self.admits: Callable[[str], bool] = lambda _peer: True
         self.turned_away = 0
         self.peers: dict[bytes, DdsPeer] = {}
-        self.writers = {one.value: ReliableWriter(one, durable=True) for one in BUILT_IN}
-        self.readers = {one + TO_READER: ReliableReader(one + TO_READER) for one in BUILT_IN}
+        self.writers = {writer.value: ReliableWriter(writer, durable=True) for writer in BUILT_IN}
+        self.readers = {
+            writer + TO_READER: ReliableReader(writer + TO_READER) for writer in BUILT_IN
+        }
         self.locators: list[HostPort] = []
         self._announced_to: list[HostPort] = []
         self._own_locators: dict[bytes, HostPort] = {}
@@ -96,8 +98,8 @@ class FakeParticipant(asyncio.DatagramProtocol):
         """Open both sockets."""
         loop = asyncio.get_running_loop()
         for _ in range(2):
-            where = (self.address, 0)
-            transport, _ = await loop.create_datagram_endpoint(lambda: self, where)
+            local_address = (self.address, 0)
+            transport, _ = await loop.create_datagram_endpoint(lambda: self, local_address)
             self._sockets.append(transport)
             self.locators.append(HostPort(*transport.get_extra_info("sockname")))
         self._ticking = asyncio.create_task(self._tick())
@@ -118,13 +120,13 @@ class FakeParticipant(asyncio.DatagramProtocol):
 
     def describe(self, entity: int, by: BuiltinWriter) -> None:
         """Tell all others of the one writer or reader that it has."""
-        held = [
+        parameters = [
             (Pid.ENDPOINT_GUID, self._guid(entity)),
             (Pid.TOPIC_NAME, string(self.dds_topic)),
             (Pid.TYPE_NAME, string(STRING_TYPE)),
             (RELIABILITY, RELIABLE),
         ]
-        self.writers[by].write(parameter_list(held))
+        self.writers[by].write(parameter_list(parameters))
 
     def publish(self, payload: bytes) -> None:
         """Write a sample, and send it to all readers."""
@@ -147,8 +149,8 @@ class FakeParticipant(asyncio.DatagramProtocol):
                 self._take(datagram, source_prefix(datagram))
 
     def _announce(self, to: list[HostPort], meant: bytes = ANYBODY) -> None:
-        discovery, user = (pack_locator(one, "<") for one in self.locators)
-        held = parameter_list(
+        discovery, user = (pack_locator(locator, "<") for locator in self.locators)
+        payload = parameter_list(
             [
                 (Pid.PROTOCOL_VERSION, VERSION),
                 (Pid.VENDOR_ID, VENDOR),
@@ -159,9 +161,9 @@ class FakeParticipant(asyncio.DatagramProtocol):
                 (Pid.BUILTIN_ENDPOINT_SET, struct.pack("<I", 0x3F)),
             ]
         )
-        spdp = data(SPDP_READER, BuiltinWriter.PARTICIPANTS, 1, held)
-        for one in to:
-            self._send(one, meant, spdp)
+        spdp = data(SPDP_READER, BuiltinWriter.PARTICIPANTS, 1, payload)
+        for locator in to:
+            self._send(locator, meant, spdp)
 
     def _take(self, datagram: bytes, prefix: bytes) -> None:
         for announced in read_discovery(datagram).announcements:
@@ -175,18 +177,18 @@ class FakeParticipant(asyncio.DatagramProtocol):
                 taken = reader.take(writer, sample.sequence)
                 if taken and sample.payload and reader.entity == READER:
                     self.hear(datagram[sample.payload.start : sample.payload.end])
-        for one in told(datagram):
-            self._heed(prefix, one)
+        for submessage in told(datagram):
+            self._heed(prefix, submessage)
 
     def _meet(self, prefix: bytes, announced: Announcement, datagram: bytes) -> None:
         """Take in what a participant announces of itself; answer it if it is new."""
-        found = dict(reversed([*announced.reached_at(datagram)]))
-        discovery = found.get(Pid.METATRAFFIC_UNICAST_LOCATOR)
+        locators = dict(reversed([*announced.reached_at(datagram)]))
+        discovery = locators.get(Pid.METATRAFFIC_UNICAST_LOCATOR)
         if discovery is None:
             return
         if prefix not in self.peers:
             self._announce([discovery], prefix)
-        user = found.get(Pid.DEFAULT_UNICAST_LOCATOR, discovery)
+        user = locators.get(Pid.DEFAULT_UNICAST_LOCATOR, discovery)
         self.peers[prefix] = DdsPeer(discovery, user, monotonic())
         has = announced.parameters.number(datagram, Pid.BUILTIN_ENDPOINT_SET) or 0
         for writer, (has_writer, has_reader) in BUILT_IN.items():
@@ -202,27 +204,32 @@ class FakeParticipant(asyncio.DatagramProtocol):
         if not entity or (announced.topic(datagram), type_name) != (self.dds_topic, STRING_TYPE):
             return
         guid = prefix + entity
-        for _, where in reversed([*announced.reached_at(datagram)]):
-            self._own_locators[guid] = where
+        for _, locator in reversed([*announced.reached_at(datagram)]):
+            self._own_locators[guid] = locator
         if announced.kind is EndpointKind.READER and WRITER in self.writers:
             self.writers[WRITER].match(guid)
         if announced.kind is EndpointKind.WRITER and READER in self.readers:
             self.readers[READER].match(guid)
 
-    def _heed(self, prefix: bytes, one: Told) -> None:
+    def _heed(self, prefix: bytes, submessage: Told) -> None:
         """Take in a heartbeat or a gap for a reader, or an ACKNACK for a writer."""
-        if one.kind == SubmessageId.ACKNACK:
-            guid = prefix + one.reader.to_bytes(4, "big")
-            if one.writer in self.writers and (again := self.writers[one.writer].heed(guid, one)):
+        if submessage.kind == SubmessageId.ACKNACK:
+            guid = prefix + submessage.reader.to_bytes(4, "big")
+            if submessage.writer in self.writers and (
+                again := self.writers[submessage.writer].heed(guid, submessage)
+            ):
                 self._send_to(guid, *again)
             return
-        guid = prefix + one.writer.to_bytes(4, "big")
+        guid = prefix + submessage.writer.to_bytes(4, "big")
         for reader in self.readers.values():
             if guid in reader.expected:
-                is_gap = one.kind == SubmessageId.GAP
-                reader.skip(guid, *((one.first, one.last) if is_gap else (1, one.first - 1)))
-                if one.asks:
-                    self._send_to(guid, reader.answer(guid, one.last))
+                is_gap = submessage.kind == SubmessageId.GAP
+                reader.skip(
+                    guid,
+                    *((submessage.first, submessage.last) if is_gap else (1, submessage.first - 1)),
+                )
+                if submessage.asks:
+                    self._send_to(guid, reader.answer(guid, submessage.last))
 
     async def _tick(self) -> None:
         announced = -inf

@@ -14,7 +14,7 @@ from contextlib import suppress
 from time import monotonic
 from typing import Any
 
-from examples.demo.fake_http import Streams, Where, connect, where
+from examples.demo.fake_http import Address, Streams, connect, host_and_port
 from examples.demo.fake_master import CALL_ERRORS
 from examples.demo.fake_node import STRING, FakeNode, Header, read_header
 from rosproxy.ros1.protocol.tcpros import encode_header
@@ -49,12 +49,12 @@ class Player(FakeNode):
 
     async def ask(self, uri: str, method: str, *params: Any) -> Any:
         """The value of a ROS call under this node's name. Raises Refused, and CALL_ERRORS."""
-        code, message, held = await self.call(uri, method, *params)
+        code, message, value = await self.call(uri, method, *params)
         if code != 1:
             raise Refused(f"{method}: {message}")
-        return held
+        return value
 
-    async def greet(self, address: Where, **fields: str) -> Streams:
+    async def greet(self, address: Address, **fields: str) -> Streams:
         """Open a TCPROS connection and exchange headers. Raises Refused, and CALL_ERRORS."""
         reader, writer = await connect(address, self.address)
         try:
@@ -69,7 +69,7 @@ class Player(FakeNode):
 
     async def add(self, master: str, service: str, a: int, b: int) -> int:
         """Look an adder up at the master and call it. Raises Refused, and CALL_ERRORS."""
-        address = where(await self.ask(master, "lookupService", service))
+        address = host_and_port(await self.ask(master, "lookupService", service))
         async with asyncio.timeout(2.0):
             reader, writer = await self.greet(address, service=service, **ADD_TWO_INTS)
             try:

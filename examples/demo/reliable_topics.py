@@ -47,14 +47,14 @@ class ReliableWriter:
         first = next(iter(self.samples), self.last + 1)
         return heartbeat(_entity(reader), self.entity, first, self.last, self._count)
 
-    def heed(self, reader: bytes, one: Told) -> list[bytes]:
+    def heed(self, reader: bytes, submessage: Told) -> list[bytes]:
         """Take in what a reader has got; what it lacks."""
         if reader not in self.acknowledged:
             return []
-        self.acknowledged[reader] = max(self.acknowledged[reader], one.first - 1)
+        self.acknowledged[reader] = max(self.acknowledged[reader], submessage.first - 1)
         got_by_all = 0 if self.durable else min(self.acknowledged.values())
-        self.samples = {n: held for n, held in self.samples.items() if n > got_by_all}
-        return [self.sample(reader, number) for number in one.missing if number in self.samples]
+        self.samples = {n: sample for n, sample in self.samples.items() if n > got_by_all}
+        return [self.sample(reader, n) for n in submessage.missing if n in self.samples]
 
 
 @dataclass

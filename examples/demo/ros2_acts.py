@@ -156,14 +156,14 @@ def reserve_domain() -> tuple[int, socket.socket]:
     """A domain that nobody on this machine has, and what reserves it. Raises DemoError."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         offset = PORTS_PER_DOMAIN * domain
-        held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        reservation = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            held.bind(("", RESERVING + offset))
+            reservation.bind(("", RESERVING + offset))
         except OSError:
-            held.close()
+            reservation.close()
             continue
         ports = SPDP_MULTICAST + offset, SPDP_UNICAST + offset
         if all(is_free(port, kind=socket.SOCK_DGRAM) for port in ports):
-            return domain, held
-        held.close()
+            return domain, reservation
+        reservation.close()
     raise DemoError("every domain of ROS 2 is in use on this machine")

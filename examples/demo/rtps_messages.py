@@ -63,8 +63,8 @@ def heartbeat(reader: int, writer: int, first: int, last: int, count: int) -> by
 def acknack(reader: int, writer: int, base: int, missing: range, count: int) -> bytes:
     """That a reader has all samples before `base` and lacks those from there on; no answer."""
     bits = min(len(missing), MOST_ASKED)
-    word = 2**MOST_ASKED - 2 ** (MOST_ASKED - bits)  # the first one is the highest bit
-    asked = struct.pack("<II", bits, word) if bits else struct.pack("<I", 0)
+    bitmap = 2**MOST_ASKED - 2 ** (MOST_ASKED - bits)  # the first one is the highest bit
+    asked = struct.pack("<II", bits, bitmap) if bits else struct.pack("<I", 0)
     body = struct.pack(">II", reader, writer) + _number(base) + asked
     return _submessage(SubmessageId.ACKNACK, _FINAL, body + struct.pack("<i", count))
 
@@ -89,14 +89,14 @@ def told(datagram: bytes) -> Iterator[Told]:
 def parameter_list(parameters: Iterable[tuple[int, bytes]]) -> bytes:
     """A payload of discovery."""
     padded = ((pid, value + bytes(-len(value) % 4)) for pid, value in parameters)
-    held = b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in padded)
-    return _PARAMETER_LIST + held + struct.pack("<HH", SENTINEL, 0)
+    encoded = b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in padded)
+    return _PARAMETER_LIST + encoded + struct.pack("<HH", SENTINEL, 0)
 
 
 def string(text: str) -> bytes:
     """A string of CDR."""
-    held = text.encode() + b"\0"
-    return struct.pack("<I", len(held)) + held
+    encoded = text.encode() + b"\0"
+    return struct.pack("<I", len(encoded)) + encoded
 
 
 def pack_string(text: str) -> bytes:

@@ -17,7 +17,7 @@ from ipaddress import ip_address, ip_network
 from time import monotonic
 from typing import Any
 
-from examples.demo.fake_http import free_ports, is_free, where
+from examples.demo.fake_http import free_ports, host_and_port, is_free
 from examples.demo.fake_master import CALL_ERRORS, FakeMaster
 from examples.demo.players import Actor, Adder, Listener, Talker, in_words
 from examples.demo.proxy_process import DemoError, ProxyProcess
@@ -235,7 +235,9 @@ class Scenario:
         self.seen |= await self._addresses_of_inside()
         self._let_talk(self.talker)
         listeners = self.listener, self.far_listener
-        await self._until(lambda: all(one.received for one in listeners), "both sides hear")
+        await self._until(
+            lambda: all(listener.received for listener in listeners), "both sides hear"
+        )
         self.tell("ROS 1: both listeners hear the other side")
         await self._call_both_ways()
         discovery = HostPort(self.layout.host, self.first_port + 2)
@@ -261,17 +263,17 @@ class Scenario:
                 result = in_words(problem)
             told.append(f"{way}: {result}")
         self.tell(f"ROS 1: {', '.join(told)}")
-        return all(one.endswith(": 2 + 3 = 5") for one in told), ", ".join(told)
+        return all(outcome.endswith(": 2 + 3 = 5") for outcome in told), ", ".join(told)
 
     async def _addresses_of_inside(self) -> dict[str, str]:
         """Where outside finds each inside node; that the right one answers there is asked."""
-        found = {}
+        addresses = {}
         for node in self.inside:
             uri = await self.far_listener.ask(self.master.uri, "lookupNode", node.name)
             pid = await self.far_listener.ask(uri, "getPid")
-            host, port = where(uri)
-            found[node.name] = f"{host}:{port}" + ("" if pid == node.pid else " (another node)")
-        return found
+            host, port = host_and_port(uri)
+            addresses[node.name] = f"{host}:{port}" + ("" if pid == node.pid else " (another node)")
+        return addresses
 
     async def _kill_and_restart(self) -> None:
         """Kill the proxy, start it again, and wait until all works as before."""
@@ -299,8 +301,8 @@ class Scenario:
     def _tell_recovery(self, ros: str, took: dict[str, float], away: float) -> None:
         """Tell the seconds that things took to work again; `away` is for how long none could."""
         slowest = max(took.values())
-        each = ", ".join(f"{what} {seconds:.2f} s" for what, seconds in took.items())
-        self.tell(f"{ros}: {each} later; outage {away + slowest:.2f} s")
+        times = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in took.items())
+        self.tell(f"{ros}: {times} later; outage {away + slowest:.2f} s")
 
     async def _service_answers(self) -> bool:
         """Whether outside gets an answer of the inside adder."""
@@ -310,7 +312,7 @@ class Scenario:
         return False
 
     def _check_addresses(self, ros: str, before: dict[str, str], after: dict[str, str]) -> None:
-        told = [", ".join(map(" ".join, one.items())) for one in (before, after)]
+        told = [", ".join(map(" ".join, addresses.items())) for addresses in (before, after)]
         same = before == after and "another" not in told[0]
         detail = told[0] if same else f"before the kill: {told[0]}; afterwards: {told[1]}"
         self._check(f"{ros}: the same ports serve the same nodes", same, detail)
@@ -324,10 +326,12 @@ class Scenario:
             for which, (talker, listener) in self.pairs.items()
         }
         with suppress(DemoError):  # the count tells what is missing
-            await self._until(lambda: all(count(*one)[0] for one in counts.values()), "all arrive")
+            await self._until(
+                lambda: all(count(*flow)[0] for flow in counts.values()), "all arrive"
+            )
         await asyncio.sleep(0.2)  # in which what would arrive twice arrives
-        for (ros, way), one in counts.items():
-            self._check(f"{ros}: every message {way} arrived once", *count(*one))
+        for (ros, way), flow in counts.items():
+            self._check(f"{ros}: every message {way} arrived once", *count(*flow))
 
     def _sent_before_the_kill(self, talker: AnyTalker) -> frozenset[int]:
         """What a talker of ROS 1 sent over connections that ended with the proxy."""
@@ -346,7 +350,7 @@ class Scenario:
         for task in self._talking.values():
             task.cancel()
 
-    async def _until(self, condition: Callable[[], Any], what: str) -> None:
+    async def _until(self, condition: Callable[[], Any], expectation: str) -> None:
         """Wait until `condition`, maybe a coroutine function, holds; DemoError after PATIENCE."""
         end = monotonic() + PATIENCE
         while True:
@@ -354,7 +358,7 @@ class Scenario:
             if await result if isinstance(result, Awaitable) else result:
                 return
             if monotonic() > end:
-                raise DemoError(f"{what}: not within {PATIENCE:g} s")
+                raise DemoError(f"{expectation}: not within {PATIENCE:g} s")
             await asyncio.sleep(0.01)
 
 

@@ -44,8 +44,13 @@ def rows(scenario: Scenario) -> Iterator[tuple[str, Actor | Ros2Talker | Ros2Lis
     for node in scenario.nodes:
         address = f"{node.host}:{node.slave.address[1]}"
         yield "1", node, address, scenario.seen.get(node.name, "")
-    for one in scenario.ros2.nodes:
-        yield "2", one, ", ".join(map(str, one.locators[1:])), scenario.ros2.seen(one)
+    for ros2_node in scenario.ros2.nodes:
+        yield (
+            "2",
+            ros2_node,
+            ", ".join(map(str, ros2_node.locators[1:])),
+            scenario.ros2.seen(ros2_node),
+        )
 
 
 def frame(scenario: Scenario) -> Group:
@@ -108,8 +113,8 @@ def print_summary(scenario: Scenario, console: Console) -> None:
     """Print what was shown, and what did not work."""
     console.out("")
     for check in scenario.checks:
-        word = ("ok    ", "green") if check.kept else ("FAILED", "red")
-        text = Text.assemble(word, f"  {check.promise}: {check.detail}")
+        verdict = ("ok    ", "green") if check.kept else ("FAILED", "red")
+        text = Text.assemble(verdict, f"  {check.promise}: {check.detail}")
         console.print(text, soft_wrap=True)
     kept = sum(check.kept for check in scenario.checks)
     console.out(f"\n{kept} of {len(scenario.checks)} promises kept")

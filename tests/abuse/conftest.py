@@ -26,7 +26,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from examples.demo.fake_http import Where, free_ports
+from examples.demo.fake_http import Address, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from tests.abuse.apart import APART, APART_HOST, APART_MASTER, INSIDE, Apart
@@ -66,7 +66,7 @@ class Abused(Process):
         super().__init__(options | {"prefix": [*group.prefix, *options.get("prefix", [])]})
 
     @property
-    def admin(self) -> Where:
+    def admin(self) -> Address:
         """Its admin endpoint."""
         host, port = self.options["admin_bind"].split(":")
         return host, int(port)
@@ -79,8 +79,8 @@ class Abused(Process):
 
     def status(self) -> dict[str, Any]:
         """What it tells of itself."""
-        found: dict[str, Any] = json.loads(self.get("/status"))
-        return found
+        document: dict[str, Any] = json.loads(self.get("/status"))
+        return document
 
     def refused(self) -> set[str]:
         """The reasons for which it has refused something."""
@@ -88,12 +88,12 @@ class Abused(Process):
         told = [line for line in lines if line.startswith("rosproxy_refused_total{")]
         return {line.split('"')[1] for line in told if float(line.split()[-1])}
 
-    def lease(self, of: FakeNode) -> Where:
+    def lease(self, of: FakeNode) -> Address:
         """Where outside reaches a node."""
-        found = next(held for held in self.status()["nodes"] if of.name in held["nodes"])
-        return self.options["advertise_host"], found["port"]
+        lease = next(lease for lease in self.status()["nodes"] if of.name in lease["nodes"])
+        return self.options["advertise_host"], lease["port"]
 
-    async def publish(self, of: FakeNode) -> Where:
+    async def publish(self, of: FakeNode) -> Address:
         """Have a node register, and find out where outside reaches it."""
         await until(lambda: self.status()["master"]["up"], "the master is found")
         await of.publish(self.master)

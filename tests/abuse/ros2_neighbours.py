@@ -22,7 +22,7 @@ AGAIN = 0.1
 """Seconds after which an announcement is repeated that may be lost."""
 PATIENCE = 60.0
 
-Where = tuple[str, int]
+Address = tuple[str, int]
 
 
 def udp(address: str, port: int = 0) -> socket.socket:
@@ -46,20 +46,20 @@ class Participant:
         self.meta.close()
         self.data.close()
 
-    def announce(self, *to: Where) -> None:
+    def announce(self, *to: Address) -> None:
         """Announce itself."""
-        for where in to:
-            self.meta.sendto(spdp(self.prefix, self.address, self.port), where)
+        for target in to:
+            self.meta.sendto(spdp(self.prefix, self.address, self.port), target)
 
     def hears(self, prefix: bytes, asked: Callable[[], object]) -> list[HostPort]:
         """The locators in another's announcement, once that comes; ``asked`` is done meanwhile."""
-        datagram = self._wait(self.meta, asked, lambda found: _announces(found, prefix))
+        datagram = self._wait(self.meta, asked, lambda received: _announces(received, prefix))
         (told,) = read_discovery(datagram).announcements
-        return [where for _, where in told.reached_at(datagram)]
+        return [locator for _, locator in told.reached_at(datagram)]
 
     def gets(self, content: bytes, asked: Callable[[], object]) -> None:
         """Wait for user's data; ``asked`` is done meanwhile."""
-        self._wait(self.data, asked, lambda found: found == content)
+        self._wait(self.data, asked, lambda received: received == content)
 
     def _wait(
         self, sock: socket.socket, asked: Callable[[], object], wanted: Callable[[bytes], bool]
@@ -71,11 +71,11 @@ class Participant:
             again = monotonic() + AGAIN
             while monotonic() < again:
                 try:
-                    found = sock.recv(65536)
+                    datagram = sock.recv(65536)
                 except TimeoutError:
                     break
-                if wanted(found):
-                    return found
+                if wanted(datagram):
+                    return datagram
         raise AssertionError(f"{self.address} did not get what it waited for")
 
 
@@ -84,7 +84,7 @@ def _announces(datagram: bytes, prefix: bytes) -> bool:
     return source_prefix(datagram) == prefix and told is not None and not told.ended
 
 
-def packet(source: str, to: Where, datagram: bytes) -> bytes:
+def packet(source: str, to: Address, datagram: bytes) -> bytes:
     """An IPv4 packet with a datagram from any address; the kernel adds what is zero here."""
     length = 8 + len(datagram)
     head = struct.pack(">BBHHHBBH", 0x45, 0, 20 + length, 0, 0, 64, socket.IPPROTO_UDP, 0)
@@ -92,7 +92,7 @@ def packet(source: str, to: Where, datagram: bytes) -> bytes:
     return head + struct.pack(">HHHH", WELL_KNOWN, to[1], length, 0) + datagram
 
 
-def forge(source: str, to: Where, datagram: bytes) -> None:
+def forge(source: str, to: Address, datagram: bytes) -> None:
     """Send a datagram from an address that is another's."""
     with socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW) as raw:
         raw.sendto(packet(source, to, datagram), (to[0], 0))
@@ -104,7 +104,7 @@ class Flood:
     Each comes with where it is from, an address of this machine's, and where it goes.
     """
 
-    def __init__(self, datagrams: Iterable[tuple[str, Where, bytes]], is_forged: bool) -> None:
+    def __init__(self, datagrams: Iterable[tuple[str, Address, bytes]], is_forged: bool) -> None:
         self._datagrams, self._is_forged = list(datagrams), is_forged
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -158,13 +158,13 @@ class Counted:
 
     def bytes_from(self, sources: Sequence[str]) -> int:
         """Those that have come from some addresses since it was asked last."""
-        found = 0
+        total = 0
         while True:
             try:
                 data, (source, _) = self._sock.recvfrom(65536)
             except BlockingIOError:
-                return found
-            found += len(data) - 28 if source in sources else 0
+                return total
+            total += len(data) - 28 if source in sources else 0
 
     def close(self) -> None:
         """End."""

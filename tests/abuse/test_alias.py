@@ -5,7 +5,7 @@ from contextlib import AsyncExitStack, closing
 
 import pytest
 
-from examples.demo.fake_http import where
+from examples.demo.fake_http import host_and_port
 from tests.abuse.apart import APART, APART_MASTER, NODES, STRANGERS
 from tests.abuse.conftest import Abused
 from tests.integration.net import connect, exchange, post, refuses, rpc, xml
@@ -17,7 +17,7 @@ PER_UPDATE = 1000
 @pytest.fixture
 def aliased(start_apart, apart_master) -> Abused:
     """A proxy that stands in for the master's host, which is another machine."""
-    port = where(apart_master.uri)[1]
+    port = host_and_port(apart_master.uri)[1]
     return start_apart(master_uri=f"http://robot:{port}", master_address=APART_MASTER)
 
 
@@ -34,7 +34,7 @@ async def test_updates_that_name_every_port_of_the_masters_host(aliased, apart_m
     secret = await asyncio.start_server(lambda *_: None, APART_MASTER)
     port = secret.sockets[0].getsockname()[1]
     lease = await aliased.publish(node)
-    await robot.publish(where(apart_master.uri), "/map")
+    await robot.publish(host_and_port(apart_master.uri), "/map")
     with closing(secret), aliased.watched():
         asked = len(apart_master.named("getSystemState"))
         sources = (STRANGERS[0], NODES[1], NODES[0])
@@ -52,8 +52,8 @@ async def test_updates_that_name_every_port_of_the_masters_host(aliased, apart_m
         assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
         # What the master names is opened meanwhile.
         assert (await node.subscribe(aliased.master, "/map"))[2] == [robot.uri]
-        there = (APART, where(robot.uri)[1])
-        assert (await rpc(there, "getPid", "/n", source=NODES[0]))[2] == robot.pid
+        stand_in = (APART, host_and_port(robot.uri)[1])
+        assert (await rpc(stand_in, "getPid", "/n", source=NODES[0]))[2] == robot.pid
 
 
 async def test_more_nodes_on_the_masters_host_than_there_are_stand_ins(
@@ -62,7 +62,7 @@ async def test_more_nodes_on_the_masters_host_than_there_are_stand_ins(
     """Whoever may register at the master has any ports named: they are bounded in all."""
     node = await make_node(address=NODES[0])
     robot = await make_node("/robot", APART_MASTER, host="robot")
-    await robot.publish(where(apart_master.uri), "/map")
+    await robot.publish(host_and_port(apart_master.uri), "/map")
     apart_master.calls_back = False
     for number in range(3000):
         apart_master.register(
@@ -76,6 +76,6 @@ async def test_more_nodes_on_the_masters_host_than_there_are_stand_ins(
             for row in aliased.status()["stand_ins"][:200]:
                 await stack.enter_async_context(connect((APART, row["port"]), NODES[1]))
             assert (await node.subscribe(aliased.master, "/map"))[2] == [robot.uri]
-            there = (APART, where(robot.uri)[1])
-            assert (await rpc(there, "getPid", "/n", source=NODES[0]))[2] == robot.pid
+            stand_in = (APART, host_and_port(robot.uri)[1])
+            assert (await rpc(stand_in, "getPid", "/n", source=NODES[0]))[2] == robot.pid
             assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid

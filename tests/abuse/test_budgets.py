@@ -26,8 +26,8 @@ async def test_a_small_body_that_inflates_to_a_huge_one(abused, node):
     bomb = gzip.compress(many_publishers(490_000))
     with abused.watched():
         for _ in range(5):
-            for where in (lease, abused.master):
-                reply = await exchange(where, post(bomb, "Content-Encoding: gzip"))
+            for target in (lease, abused.master):
+                reply = await exchange(target, post(bomb, "Content-Encoding: gzip"))
                 assert reply.status == 415
         assert (await rpc(lease, "getPid", "/n"))[2] == node.pid
     assert abused.refused() == {"compressed"}
@@ -36,9 +36,9 @@ async def test_a_small_body_that_inflates_to_a_huge_one(abused, node):
 async def test_documents_with_too_many_elements_and_with_as_many_as_there_may_be(abused, node):
     lease = await abused.publish(node)
     with abused.watched():
-        for where, method in ((lease, b"publisherUpdate"), (abused.master, b"registerService")):
+        for target, method in ((lease, b"publisherUpdate"), (abused.master, b"registerService")):
             whole = many_publishers(490_000, method)
-            assert (await exchange(where, post(whole), NODE)).status == 413
+            assert (await exchange(target, post(whole), NODE)).status == 413
         many, few = many_publishers(18_000, b"registerService"), many_publishers(9_900)
         calls = [exchange(abused.master, post(many), NODE) for _ in range(10)]
         calls += [exchange(lease, post(few)) for _ in range(10)]
@@ -50,14 +50,14 @@ async def test_documents_with_too_many_elements_and_with_as_many_as_there_may_be
 
 async def test_uploads_that_are_never_finished(abused, node):
     lease = await abused.publish(node)
-    part = b" " * 900_000
+    body_start = b" " * 900_000
     with abused.watched():
         async with AsyncExitStack() as stack:
             for number in range(200):
                 source = OUTSIDE if number % 2 else f"127.0.1.{number}"
                 wire = await stack.enter_async_context(connect(lease, source))
                 with suppress(ConnectionError):
-                    await wire.send(post(part, "Content-Length: 1000000"))
+                    await wire.send(post(body_start, "Content-Length: 1000000"))
             assert (await rpc(lease, "getPid", "/n", source="127.0.1.200"))[2] == node.pid
             assert (await rpc(abused.master, "getPid", "/n", source=NODE))[0] == 1
     assert "over_budget" in abused.refused()
@@ -112,9 +112,9 @@ async def test_a_multicall_of_twenty_thousand_calls(abused, node):
     lease = await abused.publish(node)
     calls = [{"methodName": "getPid", "params": ["/n"]}] * 20_000
     with abused.watched():
-        for where in (lease, abused.master):
+        for target in (lease, abused.master):
             body = xml("system.multicall", calls)
-            reply = await exchange(where, post(body), NODE)
+            reply = await exchange(target, post(body), NODE)
             assert reply.status in (200, 413)
         small = xml("system.multicall", calls[:1001])
         assert (await exchange(lease, post(small))).fault in (PARSE_ERROR, INVALID_PARAMS)
@@ -133,8 +133,8 @@ async def test_connections_that_say_nothing(abused, node):
     with abused.watched():
         async with AsyncExitStack() as stack:
             for number in range(700):
-                where = lease if number % 2 else abused.master
-                wire = await stack.enter_async_context(connect(where, OTHER_NODE))
+                target = lease if number % 2 else abused.master
+                wire = await stack.enter_async_context(connect(target, OTHER_NODE))
                 if number % 3:
                     await wire.send(b"POST / HTTP/1.1\r\nX: ")
             assert (await rpc(lease, "getPid", "/n", source=OTHER_NODE))[2] == node.pid

@@ -44,12 +44,12 @@ async def test_strangers_flood_the_master_port(apart, apart_master, make_node):
     with apart.watched():
         async with AsyncExitStack() as stack:
             for number in range(400):
-                where = STRANGERS[number % len(STRANGERS)]
-                wire = await stack.enter_async_context(connect(apart.master, where))
+                source = STRANGERS[number % len(STRANGERS)]
+                wire = await stack.enter_async_context(connect(apart.master, source))
                 await wire.send(post(b" " * 100_000, "Content-Length: 4000000"))
             calls = [
-                exchange(apart.master, registration(f"/s{i}", f"http://{where}:4000/"), where)
-                for i, where in enumerate(STRANGERS * 10)
+                exchange(apart.master, registration(f"/s{i}", f"http://{source}:4000/"), source)
+                for i, source in enumerate(STRANGERS * 10)
             ]
             refused = asyncio.gather(*calls)
             began = monotonic()
@@ -76,8 +76,8 @@ async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node
 
     early = asyncio.gather(
         *(
-            exchange(apart.master, registration(f"/e{i}", f"http://{where}:4000/"), where)
-            for i, where in enumerate(NODES[8:12])
+            exchange(apart.master, registration(f"/e{i}", f"http://{source}:4000/"), source)
+            for i, source in enumerate(NODES[8:12])
         )
     )
     await until(lambda: apart.status()["master"]["up"], "the master is found")
@@ -85,8 +85,8 @@ async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node
     lease = await apart.publish(node)
     with apart.watched():
         calls = [
-            exchange(apart.master, registration(f"/s{i}", f"http://{where}:4000/"), where)
-            for i, where in enumerate(NODES[2:8] * 80)
+            exchange(apart.master, registration(f"/s{i}", f"http://{source}:4000/"), source)
+            for i, source in enumerate(NODES[2:8] * 80)
         ]
         refused = asyncio.gather(*calls)
         waiting = asyncio.create_task(late.publish(apart.master))
@@ -97,7 +97,7 @@ async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node
         assert monotonic() - began < AT_ONCE
         assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
         assert {reply.status for reply in [*await refused, *await early]} == {403}
-    assert {name for held in apart.status()["nodes"] for name in held["nodes"]} == {
+    assert {name for endpoint in apart.status()["nodes"] for name in endpoint["nodes"]} == {
         node.name,
         late.name,
     }
@@ -109,11 +109,14 @@ async def test_dead_uris_of_many_sources(abused, make_node):
     nodes = [await make_node(f"/n{i}", (NODE, THIRD_NODE)[i % 2]) for i in range(PORTS)]
     with abused.watched():
         async with silent_servers(OTHER_NODE, 8) as silent:
-            dead = [(where, f"http://{where}:{i}/") for i in range(1, 41) for where in sources]
-            mute = [(OTHER_NODE, f"http://{one.address[0]}:{one.address[1]}/") for one in silent]
+            dead = [(source, f"http://{source}:{i}/") for i in range(1, 41) for source in sources]
+            mute = [
+                (OTHER_NODE, f"http://{server.address[0]}:{server.address[1]}/")
+                for server in silent
+            ]
             calls = [
-                exchange(abused.master, registration(f"/d{i}", uri), where)
-                for i, (where, uri) in enumerate([*dead, *mute * 5])
+                exchange(abused.master, registration(f"/d{i}", uri), source)
+                for i, (source, uri) in enumerate([*dead, *mute * 5])
             ]
             attack = asyncio.gather(*calls, return_exceptions=True)
             await until(lambda: len(abused.status()["nodes"]) == PORTS, "all ports are taken")
@@ -139,14 +142,16 @@ async def test_forged_addresses_of_others(apart, apart_master, make_node):
             ]
             await rpc(apart.master, "system.multicall", calls, source=evil.address)
         assert (await rpc(lease, "getPid", "/n", source=STRANGERS[1]))[2] == node.pid
-        for held in apart.status()["nodes"]:
-            where = APART_HOST, held["port"]
-            if where != lease:
-                assert await knock(where, topic_header("/rosout"), STRANGERS[1]) != "answered"
+        for endpoint in apart.status()["nodes"]:
+            address = APART_HOST, endpoint["port"]
+            if address != lease:
+                assert await knock(address, topic_header("/rosout"), STRANGERS[1]) != "answered"
     asked = {header["callerid"] for victim in victims for header in victim.headers}
     assert asked <= {"/rosproxy"}  # it only asks them who they are
     assert apart_master.nodes[node.name].startswith(f"http://{APART_HOST}:{lease[1]}/")
-    assert not [uri for uri in apart_master.nodes.values() for one in victims if uri == one.uri]
+    assert not [
+        uri for uri in apart_master.nodes.values() for victim in victims if uri == victim.uri
+    ]
 
 
 @pytest.mark.parametrize("kind", ["refusing", "silent"])

@@ -3,7 +3,7 @@
 import asyncio
 from contextlib import AsyncExitStack
 
-from examples.demo.fake_http import where
+from examples.demo.fake_http import host_and_port
 from tests.abuse.apart import NODES, STRANGERS, a_silent_name_server
 from tests.integration.net import (
     OTHER_NODE,
@@ -75,4 +75,4 @@ async def test_names_that_hang(start_apart, make_node):
             assert await seen_by(apart.master, other, "/named") == [named.uri]
             assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
             await attack
-        assert where(named.uri)[0] == "goodbox"
+        assert host_and_port(named.uri)[0] == "goodbox"

@@ -18,7 +18,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.servers.groups import group_socket, join
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
-from tests.abuse.ros2_neighbours import WELL_KNOWN, Counted, Flood, Participant, Where, forge
+from tests.abuse.ros2_neighbours import WELL_KNOWN, Address, Counted, Flood, Participant, forge
 from tests.integration.net import until
 from tests.unit.ros2.discovery.domains import SEDP_WRITERS, farewell, sedp, spdp
 from tests.unit.ros2.protocol.messages import (
@@ -78,14 +78,14 @@ def robot(abused) -> Iterator[Participant]:
         yield made
 
 
-def served(good: Participant, robot: Participant, word: bytes) -> list[Where]:
+def served(good: Participant, robot: Participant, marker: bytes) -> list[Address]:
     """Hold that both find each other, and that data comes in; where the one inside is reached."""
-    found = robot.hears(GOOD, lambda: good.announce(ANNOUNCED))
-    assert [where.host for where in found] == [APART_HOST] * 2
-    meta, user = ((where.host, where.port) for where in found)
+    locators = robot.hears(GOOD, lambda: good.announce(ANNOUNCED))
+    assert [locator.host for locator in locators] == [APART_HOST] * 2
+    meta, user = ((locator.host, locator.port) for locator in locators)
     (stand_in, _) = good.hears(ROBOT, lambda: robot.announce(meta))
     assert stand_in.host == APART
-    content = message(submessage(0x07, 0, bytes(24) + word), prefix=ROBOT)
+    content = message(submessage(0x07, 0, bytes(24) + marker), prefix=ROBOT)
     good.gets(content, lambda: robot.data.sendto(content, user))
     return [meta, user]
 
@@ -97,9 +97,9 @@ def prefix(number: int) -> bytes:
 def described(number: int, count: int) -> bytes:
     """A topic's description with many locators and parameters."""
     name = b"rt/%06d\0" % number * 20
-    locators = [pack_locator(HostPort(EVIL, 1024 + one), "<") for one in range(count)]
-    held = [(Pid.UNICAST_LOCATOR, one) for one in locators] + [(0x1234, b"")] * count
-    return payload([(Pid.TOPIC_NAME, struct.pack("<I", len(name)) + name), *held])
+    locators = [pack_locator(HostPort(EVIL, 1024 + offset), "<") for offset in range(count)]
+    parameters = [(Pid.UNICAST_LOCATOR, locator) for locator in locators] + [(0x1234, b"")] * count
+    return payload([(Pid.TOPIC_NAME, struct.pack("<I", len(name)) + name), *parameters])
 
 
 def heavy(number: int) -> list[bytes]:
@@ -107,34 +107,51 @@ def heavy(number: int) -> list[bytes]:
     own, sequences = prefix(number % 60), range(number * 256 + 1, number * 256 + 257)
     qos = parameter_list([(0x1234, b"")] * 40)
     kinds = [
-        [data(described(one, 200), writer=SEDP_WRITERS, sequence=one) for one in sequences[:8]],
-        [data(payload([]), qos=qos, writer=SEDP_WRITERS, sequence=one) for one in sequences],
-        [fragment(b"x", 1, 128, 300, writer=SEDP_WRITERS, sequence=one) for one in sequences[:60]],
-        [data(described(one, 1), writer=SEDP_WRITERS, sequence=one) for one in sequences[:150]],
+        [
+            data(described(sequence, 200), writer=SEDP_WRITERS, sequence=sequence)
+            for sequence in sequences[:8]
+        ],
+        [
+            data(payload([]), qos=qos, writer=SEDP_WRITERS, sequence=sequence)
+            for sequence in sequences
+        ],
+        [
+            fragment(b"x", 1, 128, 300, writer=SEDP_WRITERS, sequence=sequence)
+            for sequence in sequences[:60]
+        ],
+        [
+            data(described(sequence, 1), writer=SEDP_WRITERS, sequence=sequence)
+            for sequence in sequences[:150]
+        ],
         [submessage(0x07, 0, bytes(4) + SEDP_WRITERS.to_bytes(4, "big") + b"\1" * 20)] * 256,
     ]
     kinds[2] += kinds[0][:7]
-    return [message(*one, prefix=own)[:65_000] for one in kinds]
+    return [message(*submessages, prefix=own)[:65_000] for submessages in kinds]
 
 
-def announced() -> list[tuple[str, Where, bytes]]:
+def announced() -> list[tuple[str, Address, bytes]]:
     """Participants that come, speak at length, go, and are too many."""
-    said = [[spdp(prefix(one), EVIL, 9000 + one), *heavy(one)] for one in range(100)]
-    said += [[spdp(prefix(one), EVIL), farewell(prefix(one))] for one in range(40, 400)]
-    return [(EVIL, ANNOUNCED, one) for one in itertools.chain(*said)]
+    said = [[spdp(prefix(number), EVIL, 9000 + number), *heavy(number)] for number in range(100)]
+    said += [[spdp(prefix(number), EVIL), farewell(prefix(number))] for number in range(40, 400)]
+    return [(EVIL, ANNOUNCED, datagram) for datagram in itertools.chain(*said)]
 
 
 async def test_one_address_inside_floods(abused, good, robot):
     """Thirty long datagrams a second kept /healthz from answering; fragments took 600 MB."""
     served(good, robot, b"before")
 
-    def known() -> int:
-        return sum(one["address"] == EVIL for one in abused.status()["domains"][0]["inside"])
+    def evil_count() -> int:
+        return sum(
+            participant["address"] == EVIL
+            for participant in abused.status()["domains"][0]["inside"]
+        )
 
     with abused.watched():
-        arrived = [(EVIL, ANNOUNCED, spdp(prefix(one), EVIL, 9000 + one)) for one in range(60)]
+        arrived = [
+            (EVIL, ANNOUNCED, spdp(prefix(number), EVIL, 9000 + number)) for number in range(60)
+        ]
         with Flood(arrived, is_forged=False):
-            await until(lambda: known() == 60, "they have been taken in")
+            await until(lambda: evil_count() == 60, "they have been taken in")
         with Flood(announced(), is_forged=False) as flood:
             served(good, robot, b"amid")
             await until(lambda: "rate" in abused.refused(), "it makes more than it may")
@@ -144,9 +161,9 @@ async def test_one_address_inside_floods(abused, good, robot):
         with Flood(announced(), is_forged=False) as flood:
             flood.wait(AMONG)
         served(good, robot, b"again")
-        goodbyes = [(EVIL, ANNOUNCED, farewell(prefix(one))) for one in range(400)]
+        goodbyes = [(EVIL, ANNOUNCED, farewell(prefix(number))) for number in range(400)]
         with Flood(goodbyes, is_forged=False):
-            await until(lambda: known() == 0, "they have gone")
+            await until(lambda: evil_count() == 0, "they have gone")
     assert abused.most_memory() - most < MORE
 
 
@@ -156,10 +173,12 @@ def test_strangers_flood(abused, good, robot, first):
     ports = [(APART, port) for port in range(first, first + PORTS)]
     said = [spdp(prefix(1), STRANGERS[3]), *heavy(1), farewell(GOOD), b"\0" * 999]
     said += [sedp(ROBOT, STRANGERS[0], 4000, to=GOOD)]
-    own = [(STRANGERS[3], to, one) for to in ports for one in said if to not in leases[1:]]
+    own = [
+        (STRANGERS[3], to, datagram) for to in ports for datagram in said if to not in leases[1:]
+    ]
     forged = [
-        (f"198.18.{3 + number % 200}.{number % 250 + 1}", to, one[:1400])
-        for number, (_, to, one) in enumerate(own * 4)
+        (f"198.18.{3 + number % 200}.{number % 250 + 1}", to, datagram[:1400])
+        for number, (_, to, datagram) in enumerate(own * 4)
     ]
     with closing(Counted(STRANGERS[3])) as counted, abused.watched():
         for kind in (own, forged):
@@ -170,7 +189,7 @@ def test_strangers_flood(abused, good, robot, first):
         assert served(good, robot, b"after") == leases
         assert counted.bytes_from([APART, APART_HOST]) == 0
     (domain,) = abused.status()["domains"]
-    assert [one["address"] for one in domain["outside"]] == [robot.address]
+    assert [participant["address"] for participant in domain["outside"]] == [robot.address]
 
 
 def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
@@ -187,19 +206,21 @@ def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
             message(submessage(0x0C, 0, bytes(8) + GOOD), farewell(GOOD)[20:], prefix=prefix(8)),
         ]
         to = [ANNOUNCED, (APART, first), (APART, leases[0][1])]
-        with Flood([(source, at, one) for at in to for one in said], is_forged=False) as flood:
+        with Flood(
+            [(source, at, datagram) for at in to for datagram in said], is_forged=False
+        ) as flood:
             flood.wait(2000)
             assert served(good, robot, b"amid") == leases
     (domain,) = abused.status()["domains"]
-    led = {lease["where"] for one in domain["inside"] for lease in one["leases"]}
+    led = {lease["where"] for participant in domain["inside"] for lease in participant["leases"]}
     assert led == {f"{good.address}:{WELL_KNOWN}", f"{good.address}:{WELL_KNOWN + 1}"}
-    assert {one["address"] for one in domain["outside"]} == {robot.address}
+    assert {participant["address"] for participant in domain["outside"]} == {robot.address}
 
 
 def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
     """A victim is named by a forger, and inside has much to say to all that it hears of."""
     served(good, robot, b"before")
-    heard = [wrapped(VICTIM, spdp(prefix(one), VICTIM, 4000 + one)) for one in range(50)]
+    heard = [wrapped(VICTIM, spdp(prefix(number), VICTIM, 4000 + number)) for number in range(50)]
     with closing(Counted(VICTIM)) as counted, abused.watched():
         came = got = 0
         for datagram in heard:
@@ -238,7 +259,9 @@ async def test_somebody_floods_the_lan(abused, good, ear):
 
     def is_known() -> bool:
         laptop.announce(GROUP)
-        return STRANGERS[2] in {one["address"] for one in abused.status()["domains"][0]["outside"]}
+        return STRANGERS[2] in {
+            participant["address"] for participant in abused.status()["domains"][0]["outside"]
+        }
 
     def is_announced() -> bool:
         good.announce(ANNOUNCED)
@@ -249,7 +272,7 @@ async def test_somebody_floods_the_lan(abused, good, ear):
                     return True
         return False
 
-    flood = Flood([(STRANGERS[4], GROUP, one) for one in said], is_forged=False)
+    flood = Flood([(STRANGERS[4], GROUP, datagram) for datagram in said], is_forged=False)
     with closing(laptop), closing(listening), abused.watched(), flood:
         flood.wait(AMONG // 10)
         await until(is_known, "a participant on the LAN is met")

@@ -53,7 +53,9 @@ async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
                 register(evil.name, f"/{FILLED}{number * 400 + i}", evil.uri) for i in range(400)
             ]
             await rpc(abused.master, "system.multicall", calls, source=OTHER_NODE)
-        shown = {name: held for held in abused.status()["nodes"] for name in held["nodes"]}
+        shown = {
+            name: endpoint for endpoint in abused.status()["nodes"] for name in endpoint["nodes"]
+        }
         assert shown[evil.name]["left_out"] > 0
         assert shown[node.name]["publishes"] == ["/chatter"]
         assert (await rpc(lease, "getPid", "/n"))[2] == node.pid
@@ -63,7 +65,7 @@ async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
 async def test_subscribers_with_long_names(abused, make_node):
     """From outside, as many as a port takes of one address."""
     node, other = await make_node(), await make_node("/other", OTHER_NODE)
-    lease, there = await abused.publish(node), await abused.publish(other)
+    lease, other_lease = await abused.publish(node), await abused.publish(other)
     with abused.watched():
         async with AsyncExitStack() as stack:
             for number in range(400):
@@ -71,7 +73,7 @@ async def test_subscribers_with_long_names(abused, make_node):
                 await wire.send(topic_header("/chatter", f"/{FILLED}{number}"))
                 assert await wire.exactly(4)
             assert len(abused.get("/status")) < MB
-            assert (await rpc(there, "getPid", "/n"))[2] == other.pid
+            assert (await rpc(other_lease, "getPid", "/n"))[2] == other.pid
 
 
 async def test_names_that_forge_lines_of_the_log(abused, master, make_node):

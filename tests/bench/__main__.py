@@ -81,9 +81,12 @@ def measured(book: Book, name: str, options: argparse.Namespace) -> bool:
 
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
-    known = ", ".join(SECTIONS)
+    section_names = ", ".join(SECTIONS)
     parser.add_argument(
-        "--sections", type=sections, default=list(SECTIONS), help=f"some of {known}, with commas"
+        "--sections",
+        type=sections,
+        default=list(SECTIONS),
+        help=f"some of {section_names}, with commas",
     )
     parser.add_argument("--rounds", type=int, help="instead of each section's own number")
     parser.add_argument("--quick", action="store_true", help="one short round, for a first look")

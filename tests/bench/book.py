@@ -106,16 +106,16 @@ class Book:
     def save(self, path: Path) -> None:
         """Write all of it as JSON."""
         rows = [line.as_json() for line in self.lines()]
-        held = {"machine": self.machine, "axes": self.axes, "notes": self.notes, "rows": rows}
+        document = {"machine": self.machine, "axes": self.axes, "notes": self.notes, "rows": rows}
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(held, indent=1) + "\n")
+        path.write_text(json.dumps(document, indent=1) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> Book:
         """What `save` wrote."""
-        held = json.loads(path.read_text())
-        book = cls(held["machine"], "", held["axes"], held["notes"])
-        for row in held["rows"]:
+        document = json.loads(path.read_text())
+        book = cls(document["machine"], "", document["axes"], document["notes"])
+        for row in document["rows"]:
             key = row["section"], row["row"], row["path"], row["size"]
             book._values[key] = row["values"]
         return book

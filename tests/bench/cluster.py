@@ -68,8 +68,10 @@ class Operator:
             session.get(f"http://{self._admin}/metrics") as reply,
         ):
             text = await reply.text()
-        found = dict(re.findall(r"^rosproxy_operator_look_seconds_(sum|count) (\S+)$", text, re.M))
-        return float(found["sum"]), float(found["count"])
+        samples = dict(
+            re.findall(r"^rosproxy_operator_look_seconds_(sum|count) (\S+)$", text, re.M)
+        )
+        return float(samples["sum"]), float(samples["count"])
 
 
 def run(book: Book, rounds: int, quick: bool) -> None:
@@ -88,14 +90,14 @@ def _apart(book: Book, size: int, seconds: float) -> None:
     done = subprocess.run(
         ["unshare", "--net", "sh", "-c", inside], stdout=subprocess.PIPE, text=True, check=True
     )
-    found = json.loads(done.stdout.splitlines()[-1])
-    for row, value in found["rows"]:
+    measured = json.loads(done.stdout.splitlines()[-1])
+    for row, value in measured["rows"]:
         book.add(row, PATH, value, size)
-    for note in found["notes"]:
+    for note in measured["notes"]:
         book.note(note)
 
 
-async def _one(book: Book, size: int, seconds: float) -> None:
+async def _measure_size(book: Book, size: int, seconds: float) -> None:
     folder = Path(tempfile.mkdtemp(prefix="rosproxy-bench-cluster-"))
     try:
         async with ControlPlane(folder) as plane, CrowdedCluster(plane) as cluster:
@@ -123,7 +125,9 @@ class Bench:
         end, before = time.monotonic() + PATIENCE, -1
         while True:
             asked = self.plane.asked()
-            written = sum(n for what, n in asked.items() if what.split()[0] in ("create", "patch"))
+            written = sum(
+                n for request, n in asked.items() if request.split()[0] in ("create", "patch")
+            )
             if written == before:
                 return
             assert time.monotonic() < end, f"the operator does not come to rest: {asked}"
@@ -179,7 +183,7 @@ async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
 def main() -> None:
     """Measure one size, and print what was found as JSON."""
     book = Book()
-    asyncio.run(_one(book, int(sys.argv[1]), float(sys.argv[2])))
+    asyncio.run(_measure_size(book, int(sys.argv[1]), float(sys.argv[2])))
     rows = [(line.row, line.middle) for line in book.lines()]
     notes = [note.partition(": ")[2] for note in book.notes]
     print(json.dumps({"rows": rows, "notes": notes}))

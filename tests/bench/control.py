@@ -82,7 +82,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
     with world() as machines, machines.master(), ExitStack() as stack:
         loops = [name for name in LOOPS if name == "asyncio" or find_spec(name)]
         proxied = [stack.enter_context(proxy(machines, loop)) for loop in loops]
-        node = where(proxied[0].uri)
+        node = host_and_port(proxied[0].uri)
         direct = Way(DIRECT, (OUTSIDE, MASTER_PORT), node, "/bench_direct", f"http://{OUTSIDE}:9/")
         for _ in range(rounds):
             for method, step in CALLS.items():
@@ -178,7 +178,7 @@ def proxy(machines: World, loop: str) -> Iterator[Way]:
             process.wait_for(rf"{name} at \S+ is advertised as http://{HOST}:(\d+)/")
             with machines.entered("outside"):
                 line = Line((OUTSIDE, MASTER_PORT))
-            lease = where(line.call("lookupNode", name, name)[2])
+            lease = host_and_port(line.call("lookupNode", name, name)[2])
             line.close()
             yield Way(f"rosproxy, {loop}", (GATEWAY, port), lease, name, uri)
 
@@ -194,7 +194,7 @@ def environment(machines: World, loop: str) -> dict[str, str]:
     return env | {"PYTHONPATH": os.pathsep.join([str(folder), env["PYTHONPATH"]])}
 
 
-def where(uri: str) -> Where:
+def host_and_port(uri: str) -> Where:
     parts = urlsplit(uri)
     assert parts.hostname
     assert parts.port

@@ -162,9 +162,9 @@ class ControlPlane:
             self._room,
             self.session.request(method, path, data=data, headers=headers) as reply,
         ):
-            found: Json = await reply.json()
-            assert reply.status < 300 or reply.status in (404, 409), found
-            return found
+            document: Json = await reply.json()
+            assert reply.status < 300 or reply.status in (404, 409), document
+            return document
 
     async def set_status(self, path: str, status: Json) -> None:
         """Write the status of an object."""
@@ -175,20 +175,20 @@ class ControlPlane:
         """The events of a list, from what is there on."""
         async with self.session.get(path, params={"watch": "1", **query}) as reply:
             assert reply.status == 200, await reply.text()
-            held = b""
+            buffer = b""
             async for chunk in reply.content.iter_any():
-                *lines, held = (held + chunk).split(b"\n")
+                *lines, buffer = (buffer + chunk).split(b"\n")
                 for line in lines:
                     yield json.loads(line)
 
     def asked(self) -> Counter[str]:
         """The requests of the operator so far, by verb and resource."""
-        found: Counter[str] = Counter()
+        requests: Counter[str] = Counter()
         log = self.folder / "audit.log"
         for line in log.read_text().splitlines() if log.exists() else ():
             event = json.loads(line)
-            found[f"{event['verb']} {event.get('objectRef', {}).get('resource', '')}"] += 1
-        return found
+            requests[f"{event['verb']} {event.get('objectRef', {}).get('resource', '')}"] += 1
+        return requests
 
 
 def is_there() -> bool:

@@ -52,12 +52,12 @@ def run(book: Book, rounds: int, quick: bool) -> None:
             for size in QUICK_SIZES if quick else SIZES:
                 place = folder / f"{number}-{size}"
                 place.mkdir()
-                _one(book, size, QUICK_SECONDS if quick else SECONDS, place)
+                _measure_size(book, size, QUICK_SECONDS if quick else SECONDS, place)
     shutil.rmtree(folder)
     book.note(f"{SHARE} containers share a network, a master and a proxy with {PORTS} ports")
 
 
-def _one(book: Book, size: int, seconds: float, folder: Path) -> None:
+def _measure_size(book: Book, size: int, seconds: float, folder: Path) -> None:
     def add(row: str, value: float) -> None:
         book.add(row, PATH, value, size)
 
@@ -66,7 +66,7 @@ def _one(book: Book, size: int, seconds: float, folder: Path) -> None:
         stack.enter_context(_masters(size // SHARE))
         names = stack.enter_context(_containers(size))
         early, late = names[::2], names[1::2]
-        _each("start", early)
+        _docker_all("start", early)
         options = ("--proxy-image", PROXY, "--ports", str(PORTS), "--log-level", "debug")
         operator = Process(folder, *options)
         stack.callback(operator.stop)
@@ -80,7 +80,7 @@ def _one(book: Book, size: int, seconds: float, folder: Path) -> None:
         add("CPU of the operator until then, s", cpu_seconds(pid))
 
         seen, cpu, since = len(_looks(operator)), cpu_seconds(pid), time.monotonic()
-        _each("start", late)
+        _docker_all("start", late)
         add("half of the containers started, s", time.monotonic() - since)
         _rest(operator)
         looks = [look.seconds for look in _looks(operator)[seen:]]
@@ -103,7 +103,7 @@ def _serving() -> int:
 
 
 def _looks(operator: Process) -> list[Look]:
-    return [Look(float(one[1]), int(one[2])) for one in _LOOK.finditer(operator.logs())]
+    return [Look(float(match[1]), int(match[2])) for match in _LOOK.finditer(operator.logs())]
 
 
 def _rest(operator: Process, quiet: float = 6.0) -> None:
@@ -122,12 +122,12 @@ def _rest(operator: Process, quiet: float = 6.0) -> None:
 @contextmanager
 def _masters(count: int) -> Iterator[None]:
     """Masters on this host, one for each network."""
-    found = []
+    masters = []
     try:
         for number in range(count):
             port = str(FIRST_MASTER + number)
             argv = ("/usr/bin/python3", "/usr/bin/rosmaster", "--core", "-p", port)
-            found.append(
+            masters.append(
                 subprocess.Popen(
                     argv,
                     env={"PATH": "/usr/bin:/bin"},
@@ -137,7 +137,7 @@ def _masters(count: int) -> Iterator[None]:
             )
         yield
     finally:
-        for master in found:
+        for master in masters:
             master.kill()
             master.wait()
 
@@ -168,6 +168,6 @@ def _containers(count: int) -> Iterator[list[str]]:
         docker("network", "rm", *networks, check=False)
 
 
-def _each(verb: str, names: list[str]) -> None:
+def _docker_all(verb: str, names: list[str]) -> None:
     with ThreadPoolExecutor(AT_ONCE) as pool:
         list(pool.map(lambda name: docker(verb, name, seconds=PATIENCE), names))

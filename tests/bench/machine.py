@@ -54,8 +54,8 @@ def pinned(environment: str, package: str) -> str:
     """A package with its version, as an environment of the ROS 2 layer has it."""
     pins = ENVIRONMENTS / environment / "pins"
     lines = pins.read_text().splitlines() if pins.exists() else []
-    found = (line.split()[0] for line in lines if line.startswith(f"{package}=="))
-    return next(found, f"{package} (not installed)").replace("==", " ")
+    requirements = (line.split()[0] for line in lines if line.startswith(f"{package}=="))
+    return next(requirements, f"{package} (not installed)").replace("==", " ")
 
 
 def version(name: str) -> str:

@@ -93,8 +93,8 @@ def topics_at_master(machines: World) -> int:
     return sum(topic.startswith("/crowd/") for topic, _ in state[2][0])
 
 
-def wait_until(holds: Callable[[], bool], what: str) -> None:
+def wait_until(holds: Callable[[], bool], expectation: str) -> None:
     end = time.monotonic() + PATIENCE
     while not holds():
-        assert time.monotonic() < end, f"waited {PATIENCE:g} s in vain: {what}"
+        assert time.monotonic() < end, f"waited {PATIENCE:g} s in vain: {expectation}"
         time.sleep(0.1)

@@ -36,7 +36,7 @@ def _draw(rows: dict[str, list[Line]], axis: str, file: Path) -> None:
     figure, grid = pyplot.subplots(height, COLUMNS, figsize=(10, 3.4 * height), squeeze=False)
     places = list(grid.flat)
     everybody = paths_of(
-        sorted((one for lines in rows.values() for one in lines), key=_is_not_direct)
+        sorted((line for lines in rows.values() for line in lines), key=_is_not_direct)
     )
     for place, (row, lines) in zip(places, rows.items(), strict=False):
         _plot(place, row, lines, axis, everybody)

@@ -149,11 +149,11 @@ def table(head: list[str], body: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(words) + " |" for words in lines)
 
 
-def paste(page: Path, folder: Path, part: str = "") -> None:
+def paste(page: Path, folder: Path, section: str = "") -> None:
     """Write the results into a page, between the marks of a part. SystemExit if it has none."""
     text = page.read_text()
     begin, end = (
-        mark.replace("results", f"results of {part}" if part else "results")
+        mark.replace("results", f"results of {section}" if section else "results")
         for mark in (BEGIN, END)
     )
     pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.S)

@@ -74,8 +74,8 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         sites = [stack.enter_context(site(name)) for name in (DIRECT, KERNEL, SPLICE)]
         for number in range(rounds):
             for kind, pair in itertools.product(KINDS, PAIRS):
-                for one in in_turn(sites, number):
-                    measure(book, one, kind, pair, QUICK_SECONDS if quick else SECONDS)
+                for current_site in in_turn(sites, number):
+                    measure(book, current_site, kind, pair, QUICK_SECONDS if quick else SECONDS)
 
 
 @contextmanager
@@ -91,23 +91,23 @@ def site(name: str) -> Iterator[Site]:
         yield Site(name, place, nodes)
 
 
-def measure(book: Book, where: Site, kind: Kind, pair: Pair, seconds: float) -> None:
+def measure(book: Book, site: Site, kind: Kind, pair: Pair, seconds: float) -> None:
     """One topic: a new one each time, so that nothing of an earlier one is taken for it."""
     other = "outside" if pair.role == "inside" else "inside"
-    publisher = where.nodes[pair.publisher, pair.role]
-    subscriber = where.nodes[pair.subscriber, other]
+    publisher = site.nodes[pair.publisher, pair.role]
+    subscriber = site.nodes[pair.subscriber, other]
     number = next(_NUMBERS)
-    topic, path = f"/images_{number}", where.world.folder / f"{number}.socket"
+    topic, path = f"/images_{number}", site.world.folder / f"{number}.socket"
     try:
         subscriber.ask("on", topic, path)
         sent = publisher.ask("go", topic, kind.size, kind.rate, seconds, WINDOW, path)
         wait_for_rest(subscriber, int(sent[1]))
         count, took, *times = map(float, subscriber.ask("off")[1:])
-        if pair.role == "inside" and where.name == KERNEL:
-            tcpros_address(where.world, f"/{pair.publisher}_inside", topic, must_be_fast=True)
-        enter(book, where.name, f"{pair.title}, {kind.title}", float(sent[1]), count, took, times)
+        if pair.role == "inside" and site.name == KERNEL:
+            tcpros_address(site.world, f"/{pair.publisher}_inside", topic, must_be_fast=True)
+        enter(book, site.name, f"{pair.title}, {kind.title}", float(sent[1]), count, took, times)
     except RuntimeError as error:
-        book.note(f"{where.name}, {pair.title}, {kind.title}: {error}")
+        book.note(f"{site.name}, {pair.title}, {kind.title}: {error}")
 
 
 def wait_for_rest(subscriber: RosNode, sent: int) -> None:

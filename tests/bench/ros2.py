@@ -73,11 +73,11 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         seconds = QUICK_SECONDS if quick else SECONDS
         for number in range(rounds):
             for title, size in PINGS.items():
-                for one in in_turn(sites, number):
-                    measure_ping(book, one, title, size, seconds)
+                for current_site in in_turn(sites, number):
+                    measure_ping(book, current_site, title, size, seconds)
             for stream in STREAMS:
-                for one in in_turn(sites, number):
-                    measure_stream(book, one, stream, seconds)
+                for current_site in in_turn(sites, number):
+                    measure_stream(book, current_site, stream, seconds)
     for _ in range(min(rounds, MOST_ROUNDS)):
         for size in QUICK_SIZES if quick else SIZES:
             book.add("discovery, s", DIRECT, discovered(size), size)
@@ -89,31 +89,31 @@ def run(book: Book, rounds: int, quick: bool) -> None:
     )
 
 
-def measure_ping(book: Book, where: Site, title: str, size: int, seconds: float) -> None:
-    times = [float(one) for one in where.nodes["outside"].ask("ping", size, seconds)[1:]]
-    enter(book, where, f"{title}, round trip", times)
+def measure_ping(book: Book, site: Site, title: str, size: int, seconds: float) -> None:
+    times = [float(delay) for delay in site.nodes["outside"].ask("ping", size, seconds)[1:]]
+    enter(book, site, f"{title}, round trip", times)
 
 
-def measure_stream(book: Book, where: Site, stream: Stream, seconds: float) -> None:
-    before = cpu_seconds(where.pid) if where.pid else 0.0
-    sent = int(where.nodes["outside"].ask("go", stream.size, stream.rate, seconds)[1])
-    wait_for_rest(where.nodes["inside"], sent)
-    ages = [float(one) for one in where.nodes["inside"].ask("off")[1:]]
-    enter(book, where, f"{stream.title}, one way", ages)
-    book.add(f"{stream.title}, one way: loss, %", where.name, 100 * loss(sent, len(ages)))
-    if where.pid:
-        spent = (cpu_seconds(where.pid) - before) / sent
+def measure_stream(book: Book, site: Site, stream: Stream, seconds: float) -> None:
+    before = cpu_seconds(site.pid) if site.pid else 0.0
+    sent = int(site.nodes["outside"].ask("go", stream.size, stream.rate, seconds)[1])
+    wait_for_rest(site.nodes["inside"], sent)
+    ages = [float(age) for age in site.nodes["inside"].ask("off")[1:]]
+    enter(book, site, f"{stream.title}, one way", ages)
+    book.add(f"{stream.title}, one way: loss, %", site.name, 100 * loss(sent, len(ages)))
+    if site.pid:
+        spent = (cpu_seconds(site.pid) - before) / sent
         row = f"{stream.title}, one way: CPU of the proxy, us a message"
-        book.add(row, where.name, spent * 1e6)
+        book.add(row, site.name, spent * 1e6)
 
 
-def enter(book: Book, where: Site, title: str, times: list[float]) -> None:
+def enter(book: Book, site: Site, title: str, times: list[float]) -> None:
     if len(times) < 2:
-        book.note(f"{where.name}, {title}: {len(times)} messages arrived")
+        book.note(f"{site.name}, {title}: {len(times)} messages arrived")
         return
     for percent in (50, 99):
         row = f"{title}: latency p{percent}, us"
-        book.add(row, where.name, percentile(times, percent))
+        book.add(row, site.name, percentile(times, percent))
 
 
 @contextmanager
@@ -150,7 +150,7 @@ def wait_forwarded(place: World) -> None:
     end = time.monotonic() + PATIENCE
     while True:
         listed = json.loads(place.run("host", *words))["nftables"]
-        if any(len(one["map"].get("elem", [])) == 2 for one in listed if "map" in one):
+        if any(len(record["map"].get("elem", [])) == 2 for record in listed if "map" in record):
             return
         if time.monotonic() > end:
             raise RuntimeError("the kernel does not forward: see `rosproxy status` for the reason")
@@ -210,8 +210,8 @@ def crowded(place: World, size: int, peer: str = "") -> float:
         for address, count in parts.items()
         if count
     ]
-    found = float(watch.wait_for(rf"^found {size} (\S+)", timeout=PATIENCE)[1])
-    return found - min(float(one.wait_for(r"^began (\S+)")[1]) for one in crowds)
+    matched_at = float(watch.wait_for(rf"^found {size} (\S+)", timeout=PATIENCE)[1])
+    return matched_at - min(float(crowd.wait_for(r"^began (\S+)")[1]) for crowd in crowds)
 
 
 def cyclone(place: World, role: str, address: str, discovery: str, *words: str) -> Process:

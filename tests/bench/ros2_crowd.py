@@ -37,12 +37,12 @@ def watch() -> None:
     participant = DomainParticipant(0)
     reader = DataReader(participant, Topic(participant, "rt/crowd", Text))
     print("ready", flush=True)
-    found = 0
+    matched = 0
     while True:
         now = reader.get_subscription_matched_status().current_count
-        if now != found:
-            found = now
-            print("found", found, time.time(), flush=True)
+        if now != matched:
+            matched = now
+            print("found", matched, time.time(), flush=True)
         time.sleep(0.01)
 
 

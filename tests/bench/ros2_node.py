@@ -58,7 +58,7 @@ class Talker:
         """Wait until the other has found all three topics, and this one all of the other's."""
         end = time.monotonic() + PATIENCE
         publishers = (self._ping, self._stream, self._pong)
-        while not all(one.get_subscription_count() for one in publishers):
+        while not all(publisher.get_subscription_count() for publisher in publishers):
             if time.monotonic() > end:
                 return "failed: the other is not found"
             time.sleep(0.05)

@@ -32,15 +32,15 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         for number in range(rounds):
             turns = in_turn(ways, number)
             for size in sizes:
-                each(book, turns, size, stream, QUICK_SECONDS if quick else STREAM_SECONDS)
-                each(book, turns, size, ping, QUICK_SECONDS if quick else PING_SECONDS)
+                measure_ways(book, turns, size, stream, QUICK_SECONDS if quick else STREAM_SECONDS)
+                measure_ways(book, turns, size, ping, QUICK_SECONDS if quick else PING_SECONDS)
     memory(book, 1 if quick else min(rounds, MEMORY_ROUNDS), quick)
 
 
 Measure = Callable[[Book, Way, int, float], None]
 
 
-def each(book: Book, ways: list[Way], size: int, measure: Measure, seconds: float) -> None:
+def measure_ways(book: Book, ways: list[Way], size: int, measure: Measure, seconds: float) -> None:
     """One measurement of each way; a way that fails it is named, and the others go on."""
     for way in ways:
         try:
@@ -72,7 +72,7 @@ def stream(book: Book, way: Way, size: int, seconds: float) -> None:
             expect(process, "end")
             after = spent(relay)
         took = float(line(process))
-        counts = [float(word) for word in line(process).split()]
+        counts = [float(count) for count in line(process).split()]
     total = sum(counts)
     book.add("rate, MB/s", way.name, total / took / 1e6, size)
     if size > 1:
@@ -122,7 +122,7 @@ def per_second(before: Spent, after: Spent) -> tuple[float, float]:
 def ping(book: Book, way: Way, size: int, seconds: float) -> None:
     """A message there and back on one connection after the other."""
     with wire(way, "ping", size, seconds, MESSAGE) as process:
-        times = [float(word) / 1000 for word in line(process).split()]
+        times = [float(duration) / 1000 for duration in line(process).split()]
     book.add("1 KiB ping p50, us", way.name, percentile(times, 50), size)
     book.add("1 KiB ping p99, us", way.name, percentile(times, 99), size)
 
@@ -161,7 +161,7 @@ def connections(book: Book, way: Way, sizes: tuple[int, ...]) -> None:
 def wire(way: Way, role: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
     """The end that connects; RuntimeError with its words if it fails."""
     address, port = way.address
-    words = [str(word) for word in (role, address, port, *arguments)]
+    words = [str(argument) for argument in (role, address, port, *arguments)]
     command = way.world.command(way.end, str(compiled("wire")), *words)
     pipe: Any = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -172,9 +172,9 @@ def wire(way: Way, role: str, *arguments: object) -> Iterator[subprocess.Popen[s
             process.wait(30)
 
 
-def expect(process: subprocess.Popen[str], word: str) -> None:
-    if (got := line(process)) != word:
-        raise RuntimeError(f"{word} was expected, {got!r} came")
+def expect(process: subprocess.Popen[str], expected: str) -> None:
+    if (got := line(process)) != expected:
+        raise RuntimeError(f"{expected} was expected, {got!r} came")
 
 
 def go_on(process: subprocess.Popen[str]) -> None:

@@ -115,7 +115,7 @@ class World:
 
     def start(self, role: str, *argv: str, env: dict[str, str] | None = None) -> Process:
         """Starts a program on a machine; `stop`, or the end of the world, ends it."""
-        title = f"{' '.join(Path(word).name for word in argv[:4])} ({role})"
+        title = f"{' '.join(Path(argument).name for argument in argv[:4])} ({role})"
         log = self.folder / f"{len(self.processes):04d}.log"
         env = self.environment(role) if env is None else env
         process = Process(title, self.places[role], self._pinned(role, argv), env, log)
@@ -189,10 +189,10 @@ def _accepts(address: str, port: int) -> bool:
 
 def processors() -> dict[str, str]:
     """Whose processors are which; of a single one, both have it."""
-    there = sorted(os.sched_getaffinity(0))
-    half = len(there) // 2
-    parts = {"inside": there[:half] or there, "outside": there[half:]}
-    return {role: ",".join(map(str, part)) for role, part in parts.items()}
+    cpus = sorted(os.sched_getaffinity(0))
+    half = len(cpus) // 2
+    parts = {"inside": cpus[:half] or cpus, "outside": cpus[half:]}
+    return {role: ",".join(map(str, role_cpus)) for role, role_cpus in parts.items()}
 
 
 @contextmanager

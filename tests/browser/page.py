@@ -40,8 +40,8 @@ table ip cut {{
 
 def rows(browser: Browser) -> list[Json]:
     """All rows of the table."""
-    found: list[Json] = browser.run(ROWS)
-    return found
+    table: list[Json] = browser.run(ROWS)
+    return table
 
 
 def row(browser: Browser, name: str, **wanted: str) -> Json:
@@ -49,21 +49,21 @@ def row(browser: Browser, name: str, **wanted: str) -> Json:
     seen: list[Json] = []
 
     def fits() -> bool:
-        seen[:] = [one for one in rows(browser) if one["Name"] == name]
-        return any(wanted.items() <= one.items() for one in seen)
+        seen[:] = [topic_row for topic_row in rows(browser) if topic_row["Name"] == name]
+        return any(wanted.items() <= topic_row.items() for topic_row in seen)
 
     try:
         wait_until(f"the row of {name} has {wanted}", fits, 90)
     except AssertionError as error:
         raise AssertionError(f"{error}; it has {seen}") from None
-    return next(one for one in seen if wanted.items() <= one.items())
+    return next(topic_row for topic_row in seen if wanted.items() <= topic_row.items())
 
 
 def line(browser: Browser, source: str, target: str) -> Json:
     """A line of the graph, between two boxes."""
-    found: Json | None = browser.run(LINE, source, target)
-    assert found, f"no line from {source} to {target}"
-    return {**found, "colour": found["colour"].replace(" ", "")}
+    edge: Json | None = browser.run(LINE, source, target)
+    assert edge, f"no line from {source} to {target}"
+    return {**edge, "colour": edge["colour"].replace(" ", "")}
 
 
 def colour(browser: Browser, name: str) -> str:

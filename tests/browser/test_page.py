@@ -65,8 +65,12 @@ def test_hertz_and_bytes_are_those_of_the_nodes(lab: Lab, browser: Browser) -> N
     browser.open(URL)
 
     def told() -> set[str]:
-        known = (UNKNOWN, "0")
-        return {one["Name"] for one in rows(browser) if one["To"] and one["Hz"] not in known}
+        no_rate = (UNKNOWN, "0")
+        return {
+            topic_row["Name"]
+            for topic_row in rows(browser)
+            if topic_row["To"] and topic_row["Hz"] not in no_rate
+        }
 
     wait_until("the page tells both rates", lambda: told() >= {"/chatter", "/back"}, 90)
     back = row(browser, "/back", State="ok", To="/taker")
@@ -80,14 +84,15 @@ def test_what_every_node_has_is_hidden_until_asked_for(lab: Lab, browser: Browse
     talk(lab)
     browser.open(URL)
     row(browser, "/chatter", State="ok", To="/listener")
-    assert not {"/rosout"} & {one["Name"] for one in rows(browser)}
+    assert not {"/rosout"} & {topic_row["Name"] for topic_row in rows(browser)}
     browser.run("document.querySelector('#quiet').focus()")
     browser.press(" ")
     row(browser, "/rosout")
     browser.run("document.querySelector('#filter').focus()")
     browser.press("chatt")
     wait_until(
-        "other names are hidden", lambda: {one["Name"] for one in rows(browser)} == {"/chatter"}
+        "other names are hidden",
+        lambda: {topic_row["Name"] for topic_row in rows(browser)} == {"/chatter"},
     )
 
 
@@ -143,7 +148,7 @@ def test_a_screen_reader_finds_it_all(lab: Lab, browser: Browser) -> None:
     browser.open(URL)
     row(browser, "/chatter", State="ok", To="/listener")
     nodes = browser.devtools("Accessibility.getFullAXTree")["nodes"]
-    told = {(one["role"]["value"], one.get("name", {}).get("value", "")) for one in nodes}
+    told = {(node["role"]["value"], node.get("name", {}).get("value", "")) for node in nodes}
     roles = {role for role, _ in told}
     assert {"table", "columnheader", "status", "searchbox", "checkbox", "heading"} <= roles
     assert ("cell", "/chatter") in told

@@ -148,11 +148,11 @@ def objects(values: Values | None = None, *options: str, **more: Any) -> list[Js
 
 
 def parse(text: str) -> list[Json]:
-    return [one for one in yaml.load_all(text, Loader=Strict) if one]
+    return [document for document in yaml.load_all(text, Loader=Strict) if document]
 
 
-def of_kind(found: list[Json], kind: str) -> list[Json]:
-    return [one for one in found if one["kind"] == kind]
+def of_kind(manifests: list[Json], kind: str) -> list[Json]:
+    return [manifest for manifest in manifests if manifest["kind"] == kind]
 
 
 def combinations(most: int) -> Iterator[tuple[str, Values]]:
@@ -181,11 +181,11 @@ def _covering(most: int) -> Iterator[tuple[str, ...]]:
         yield best
 
 
-def merged(*parts: Values) -> Values:
+def merged(*layers: Values) -> Values:
     """Values on top of each other, as helm lays them."""
     whole: Json = {}
-    for part in parts:
-        for key, value in part.items():
+    for layer in layers:
+        for key, value in layer.items():
             both = isinstance(value, Mapping) and isinstance(whole.get(key), Mapping)
             whole[key] = merged(whole[key], value) if both else value
     return whole

@@ -18,13 +18,15 @@ RUNBOOK = ROOT / "docs/guide/alerts.md"
 def alerts() -> list[Json]:
     """All alerts."""
     (group,) = yaml.safe_load(ALERTS.read_text())["groups"]
-    found: list[Json] = group["rules"]
-    return found
+    rules: list[Json] = group["rules"]
+    return rules
 
 
 def panels() -> list[Json]:
     """The panels that show something, without the rows' titles."""
-    return [one for one in json.loads(DASHBOARD.read_text())["panels"] if one["type"] != "row"]
+    return [
+        panel for panel in json.loads(DASHBOARD.read_text())["panels"] if panel["type"] != "row"
+    ]
 
 
 def expressions() -> Iterator[tuple[str, str]]:

@@ -33,10 +33,10 @@ def fields(schema: Json, path: str = "") -> Iterator[tuple[str, Json]]:
     for name, field in schema.get("properties", {}).items():
         yield f"{path}.{name}", field
         yield from fields(field, f"{path}.{name}")
-    for part in ("items", "additionalProperties"):
-        if part in schema:
-            yield f"{path}[]", schema[part]
-            yield from fields(schema[part], f"{path}[]")
+    for keyword in ("items", "additionalProperties"):
+        if keyword in schema:
+            yield f"{path}[]", schema[keyword]
+            yield from fields(schema[keyword], f"{path}[]")
 
 
 SPEC = dict(fields(SCHEMA["properties"]["spec"], "spec"))
@@ -73,7 +73,11 @@ def test_columns_show_fields() -> None:
     for column in VERSION["additionalPrinterColumns"]:
         path = column["jsonPath"].partition("[")[0]
         assert path.startswith(".metadata.") or path[1:] in STATUS, path
-    always = [one["name"] for one in VERSION["additionalPrinterColumns"] if not one.get("priority")]
+    always = [
+        column["name"]
+        for column in VERSION["additionalPrinterColumns"]
+        if not column.get("priority")
+    ]
     assert always == ["Master", "Domain", "Nodes", "Proxies", "Ready", "Age"]
 
 
@@ -126,10 +130,10 @@ def test_bounds_of_a_policy_are_the_operators() -> None:
 
 
 def test_rules_have_messages() -> None:
-    found = [rule for schema in (SCHEMA, *SPEC.values(), SCHEMA["properties"]["spec"])
+    rules = [rule for schema in (SCHEMA, *SPEC.values(), SCHEMA["properties"]["spec"])
              for rule in schema.get("x-kubernetes-validations", [])]  # fmt: skip
-    assert len(found) > 12
-    assert all(len(rule["message"].split()) >= 5 for rule in found)
+    assert len(rules) > 12
+    assert all(len(rule["message"].split()) >= 5 for rule in rules)
 
 
 def test_status_is_in_the_definition() -> None:

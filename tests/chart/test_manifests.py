@@ -35,10 +35,10 @@ def test_tables_are_the_definition() -> None:
 
 
 def test_install_has_no_trace_of_helm() -> None:
-    for one in parse(INSTALL.read_text()):
-        assert not [key for key in one["metadata"].get("annotations", {}) if "helm" in key]
-        assert one["metadata"].get("labels", {}).get("app.kubernetes.io/managed-by") != "Helm"
-        assert not one["metadata"]["name"].endswith("-test")
+    for manifest in parse(INSTALL.read_text()):
+        assert not [key for key in manifest["metadata"].get("annotations", {}) if "helm" in key]
+        assert manifest["metadata"].get("labels", {}).get("app.kubernetes.io/managed-by") != "Helm"
+        assert not manifest["metadata"]["name"].endswith("-test")
 
 
 def kustomize(directory: Path) -> list[Json]:
@@ -49,8 +49,10 @@ def kustomize(directory: Path) -> list[Json]:
 
 
 def test_kustomize_has_the_same_objects() -> None:
-    def sorted_by_id(found: list[Json]) -> list[Json]:
-        return sorted(found, key=lambda one: (one["kind"], one["metadata"]["name"]))
+    def sorted_by_id(manifests: list[Json]) -> list[Json]:
+        return sorted(
+            manifests, key=lambda manifest: (manifest["kind"], manifest["metadata"]["name"])
+        )
 
     assert sorted_by_id(kustomize(INSTALL.parent)) == sorted_by_id(parse(INSTALL.read_text()))
 
@@ -72,9 +74,9 @@ def test_the_guides_overlay_names_both_images(tmp_path: Path) -> None:
 
 
 def test_install_makes_its_namespace_first() -> None:
-    first, *others = parse(INSTALL.read_text())
+    first, *rest = parse(INSTALL.read_text())
     assert first["kind"] == "Namespace"
-    namespaces = {one["metadata"].get("namespace") for one in others}
+    namespaces = {manifest["metadata"].get("namespace") for manifest in rest}
     assert namespaces == {None, first["metadata"]["name"]}
 
 
@@ -86,10 +88,10 @@ def test_version_is_the_projects() -> None:
 
 def test_every_value_has_a_comment() -> None:
     """helm-docs leaves the meaning empty where values.yaml has no comment that begins with --."""
-    found = re.findall(r"^\| `([\w.]+)` \| (.*) \| (.*) \|$", README.read_text(), re.M)
+    rows = re.findall(r"^\| `([\w.]+)` \| (.*) \| (.*) \|$", README.read_text(), re.M)
     values = yaml.safe_load((CHART / "values.yaml").read_text())
-    assert {path for path, _, _ in found} >= set(leaves(values))
-    assert [path for path, _, meaning in found if not meaning] == []
+    assert {path for path, _, _ in rows} >= set(leaves(values))
+    assert [path for path, _, meaning in rows if not meaning] == []
 
 
 def leaves(values: Json, path: str = "") -> Iterator[str]:
@@ -102,20 +104,23 @@ def leaves(values: Json, path: str = "") -> Iterator[str]:
 
 def test_example_labels_its_pods() -> None:
     example = parse(EXAMPLE.read_text())
-    labelled = [one["metadata"]["name"] for one in of_kind(example, "Deployment")
-                if names.INJECT in one["spec"]["template"]["metadata"]["labels"]]  # fmt: skip
+    labelled = [deployment["metadata"]["name"] for deployment in of_kind(example, "Deployment")
+                if names.INJECT
+                in deployment["spec"]["template"]["metadata"]["labels"]]  # fmt: skip
     assert labelled == ["talker", "listener"]
-    assert {one["metadata"].get("namespace", "ros-example") for one in example} == {"ros-example"}
+    assert {manifest["metadata"].get("namespace", "ros-example") for manifest in example} == {
+        "ros-example"
+    }
     (rosproxy,) = of_kind(example, "RosProxy")
-    services = [one["metadata"]["name"] for one in of_kind(example, "Service")]
+    services = [service["metadata"]["name"] for service in of_kind(example, "Service")]
     assert rosproxy["spec"]["master"]["service"]["name"] in services
 
 
 @pytest.mark.parametrize("values", [{}, {"namespaces": ["a"]}])
 def test_page_lists_the_rights(values: Json) -> None:
     """docs/reference/permissions.md has the rules of the roles, each of them and no other."""
-    found = objects(values)
-    roles = [*of_kind(found, "ClusterRole"), *of_kind(found, "Role")]
+    manifests = objects(values)
+    roles = [*of_kind(manifests, "ClusterRole"), *of_kind(manifests, "Role")]
     granted = {
         (group, resource, tuple(sorted(rule["verbs"])))
         for role in roles
@@ -147,11 +152,11 @@ def test_named_secrets_only() -> None:
 
 
 def test_writes_in_named_namespaces_only() -> None:
-    found = objects({"namespaces": ["a", "b"]})
-    verbs = {verb for role in of_kind(found, "ClusterRole") for rule in role["rules"]
+    manifests = objects({"namespaces": ["a", "b"]})
+    verbs = {verb for role in of_kind(manifests, "ClusterRole") for rule in role["rules"]
              if "resourceNames" not in rule for verb in rule["verbs"]}  # fmt: skip
     assert verbs == {"get", "list", "watch"}
-    writing = {role["metadata"]["namespace"] for role in of_kind(found, "Role")
+    writing = {role["metadata"]["namespace"] for role in of_kind(manifests, "Role")
                if any("create" in rule["verbs"] and rule["resources"] != ["leases"]
                       for rule in role["rules"])}  # fmt: skip
     assert writing == {"a", "b"}

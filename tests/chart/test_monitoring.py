@@ -30,15 +30,15 @@ ALL = {name: {"enabled": True}
        for name in ("serviceMonitor", "podMonitor", "prometheusRule", "dashboard")}  # fmt: skip
 
 
-def dashboards(found: list[Json]) -> list[Json]:
-    return [one for one in of_kind(found, "ConfigMap")
-            if "grafana_dashboard" in one["metadata"]["labels"]]  # fmt: skip
+def dashboards(manifests: list[Json]) -> list[Json]:
+    return [config_map for config_map in of_kind(manifests, "ConfigMap")
+            if "grafana_dashboard" in config_map["metadata"]["labels"]]  # fmt: skip
 
 
 def test_off_by_default() -> None:
-    found = objects()
-    assert not KINDS & {one["kind"] for one in found}
-    assert not dashboards(found)
+    manifests = objects()
+    assert not KINDS & {manifest["kind"] for manifest in manifests}
+    assert not dashboards(manifests)
 
 
 def test_the_chart_has_the_same_dashboard() -> None:
@@ -53,12 +53,12 @@ def test_the_chart_has_the_same_alerts() -> None:
 
 
 def test_alerts_link_to_where_the_values_say() -> None:
-    where = "https://docs.example/alerts/"
-    found = objects({"prometheusRule": {"enabled": True, "runbook": where}})
-    (rule,) = of_kind(found, "PrometheusRule")
+    runbook = "https://docs.example/alerts/"
+    manifests = objects({"prometheusRule": {"enabled": True, "runbook": runbook}})
+    (rule,) = of_kind(manifests, "PrometheusRule")
     (group,) = rule["spec"]["groups"]
-    links = [one["annotations"]["runbook_url"] for one in group["rules"]]
-    assert links == [f"{where}#{one['alert'].lower()}" for one in alerts()]
+    links = [alert["annotations"]["runbook_url"] for alert in group["rules"]]
+    assert links == [f"{runbook}#{alert['alert'].lower()}" for alert in alerts()]
 
 
 @pytest.mark.parametrize(
@@ -98,12 +98,12 @@ def targets(directory: Path, labels: Json, endpoint: Json, *addresses: str) -> l
 
     The Prometheus operator hands those on as they are, in the names of Prometheus' own file.
     """
-    found = directory / "found.json"
-    found.write_text(json.dumps([{"targets": addresses, "labels": labels}]))
+    targets_file = directory / "found.json"
+    targets_file.write_text(json.dumps([{"targets": addresses, "labels": labels}]))
     names = {"sourceLabels": "source_labels", "targetLabel": "target_label"}
     rules = [{names.get(key, key): value for key, value in rule.items()}
              for rule in endpoint["relabelings"]]  # fmt: skip
-    job = {"job_name": "found", "file_sd_configs": [{"files": [str(found)]}],
+    job = {"job_name": "found", "file_sd_configs": [{"files": [str(targets_file)]}],
            "relabel_configs": rules, "scrape_interval": "1h", "scrape_timeout": "1s"}  # fmt: skip
     with running_prometheus(directory, {"scrape_configs": [job]}) as prometheus:
 
@@ -129,29 +129,29 @@ def test_alerts_say_what_it_is_and_what_to_do(alert: Json) -> None:
 
 def test_no_page_without_an_alert() -> None:
     titles = re.findall(r"^## (\w+)$", RUNBOOK.read_text(), re.M)
-    assert titles == [one["alert"] for one in alerts()]
+    assert titles == [alert["alert"] for alert in alerts()]
 
 
 def test_panels_can_be_told_apart_and_do_not_overlap() -> None:
-    every = json.loads(DASHBOARD.read_text())["panels"]
-    ids = [one["id"] for one in every]
+    all_panels = json.loads(DASHBOARD.read_text())["panels"]
+    ids = [panel["id"] for panel in all_panels]
     assert len(set(ids)) == len(ids)
     taken: set[tuple[int, int]] = set()
-    for one in every:
-        at = one["gridPos"]
+    for panel in all_panels:
+        at = panel["gridPos"]
         across, down = range(at["x"], at["x"] + at["w"]), range(at["y"], at["y"] + at["h"])
         cells = set(itertools.product(across, down))
         assert across[-1] < 24
-        assert not cells & taken, one["title"]
+        assert not cells & taken, panel["title"]
         taken |= cells
-    assert {target["datasource"]["uid"] for one in panels() for target in one["targets"]} == {
+    assert {target["datasource"]["uid"] for panel in panels() for target in panel["targets"]} == {
         "${datasource}"
     }
 
 
 def test_what_is_asked_for_is_documented() -> None:
     page = (ROOT / "docs/reference/metrics.md").read_text()
-    asked = {*(query for _, query in expressions()), *(one["expr"] for one in alerts())}
+    asked = {*(query for _, query in expressions()), *(alert["expr"] for alert in alerts())}
     names = {re.sub(r"_bucket$", "", name) for query in asked for name in metrics(query)}
     assert len(names) > 30
     assert not [name for name in names if f"`{name}" not in page and name[:8] != "process_"]
@@ -243,7 +243,7 @@ def rule_test(series: dict[str, str], at: str, expected: list[Json]) -> Json:
 
 def test_each_alert_fires_when_what_it_names_is_broken(tmp_path: Path) -> None:
     """And no other one with it; none at all when all is well."""
-    assert list(FIRING) == [one["alert"] for one in alerts()]
+    assert list(FIRING) == [alert["alert"] for alert in alerts()]
     tests: list[Any] = [rule_test(WELL, "20m", [])]
     for name, (series, at) in FIRING.items():
         fires = [{"labels": f'{{alertname="{name}"}}', "value": 1}]

@@ -89,8 +89,10 @@ def missing(values: Any, schema: Json, path: str = "") -> list[str]:
     properties = schema.get("properties")
     if not isinstance(values, dict) or not values or properties is None:
         return []
-    found = [] if schema.get("additionalProperties") is False else [path]
+    paths = [] if schema.get("additionalProperties") is False else [path]
     for name, value in values.items():
-        where = f"{path}.{name}"
-        found += missing(value, properties[name], where) if name in properties else [where]
-    return found
+        value_path = f"{path}.{name}"
+        paths += (
+            missing(value, properties[name], value_path) if name in properties else [value_path]
+        )
+    return paths

@@ -60,35 +60,43 @@ def test_lint(option: str, choice: str) -> None:
 @pytest.mark.parametrize("combination", THREE)
 def test_objects(combination: str) -> None:
     """Each combination makes objects that are whole, and none of them twice."""
-    found = objects(THREE[combination])
-    ids = [(one["kind"], one["metadata"].get("namespace"), one["metadata"]["name"])
-           for one in found]  # fmt: skip
+    manifests = objects(THREE[combination])
+    ids = [(manifest["kind"], manifest["metadata"].get("namespace"), manifest["metadata"]["name"])
+           for manifest in manifests]  # fmt: skip
     assert len(set(ids)) == len(ids)
-    for one in found:
-        labels = one["metadata"]["labels"]
+    for manifest in manifests:
+        labels = manifest["metadata"]["labels"]
         assert labels["app.kubernetes.io/instance"] == "rosproxy"
-        assert ("namespace" in one["metadata"]) == (one["kind"] not in CLUSTER_SCOPED)
-        assert "status" not in one
-    check_references(found, THREE[combination])
+        assert ("namespace" in manifest["metadata"]) == (manifest["kind"] not in CLUSTER_SCOPED)
+        assert "status" not in manifest
+    check_references(manifests, THREE[combination])
 
 
-def check_references(found: list[Json], values: Any) -> None:
+def check_references(manifests: list[Json], values: Any) -> None:
     """What names another object names one that is there."""
-    (deployment,) = [one for one in of_kind(found, "Deployment") if "helm.sh/hook" not in str(one)]
+    (deployment,) = [
+        manifest
+        for manifest in of_kind(manifests, "Deployment")
+        if "helm.sh/hook" not in str(manifest)
+    ]
     pod = deployment["spec"]["template"]
-    (service,) = [one for one in of_kind(found, "Service") if "helm.sh/hook" not in str(one)]
+    (service,) = [
+        manifest
+        for manifest in of_kind(manifests, "Service")
+        if "helm.sh/hook" not in str(manifest)
+    ]
     for selecting in (service["spec"]["selector"], deployment["spec"]["selector"]["matchLabels"]):
         assert selecting.items() <= pod["metadata"]["labels"].items()
     ports = {port["name"] for port in pod["spec"]["containers"][0]["ports"]}
     assert {port["targetPort"] for port in service["spec"]["ports"]} <= ports
-    roles = {(one["kind"], one["metadata"].get("namespace"), one["metadata"]["name"])
-             for one in found if one["kind"] in ("Role", "ClusterRole")}  # fmt: skip
-    for binding in [*of_kind(found, "RoleBinding"), *of_kind(found, "ClusterRoleBinding")]:
+    roles = {(manifest["kind"], manifest["metadata"].get("namespace"), manifest["metadata"]["name"])
+             for manifest in manifests if manifest["kind"] in ("Role", "ClusterRole")}  # fmt: skip
+    for binding in [*of_kind(manifests, "RoleBinding"), *of_kind(manifests, "ClusterRoleBinding")]:
         role = binding["roleRef"]
         assert (role["kind"], binding["metadata"].get("namespace"), role["name"]) in roles
         (subject,) = binding["subjects"]
         assert subject["name"] == pod["spec"]["serviceAccountName"]
-    for webhook in of_kind(found, "MutatingWebhookConfiguration"):
+    for webhook in of_kind(manifests, "MutatingWebhookConfiguration"):
         client = webhook["webhooks"][0]["clientConfig"]["service"]
         assert client["name"] == service["metadata"]["name"]
         assert client["port"] in [port["port"] for port in service["spec"]["ports"]]
@@ -116,8 +124,8 @@ def test_arguments(combination: str) -> None:
 def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
     """What RosProxies may ask for, and who may reach their proxies."""
     allow = values.get("allow", {})
-    (args,) = (one["args"] for one in pod["containers"])
-    tested = [one.partition("=")[2] for one in args if re.search("--allow-master=.*-test[.]", one)]
+    (args,) = (container["args"] for container in pod["containers"])
+    tested = [arg.partition("=")[2] for arg in args if re.search("--allow-master=.*-test[.]", arg)]
     assert len(tested) == bool(allow)
     expected = ProxyBounds(max_buffered=16, max_connections_per_lease=1_000_000)
     assert settings.plan.proxy_bounds == (expected if allow else ProxyBounds())
@@ -132,45 +140,47 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
         slave_control="master" if allow else "any",
     )
     assert settings.plan.network_policy
-    operator, *others = settings.plan.admin_from or ()
+    operator, *peers = settings.plan.admin_from or ()
     own = {"matchLabels": {"kubernetes.io/metadata.name": NAMESPACE}}
     assert operator["namespaceSelector"] == own
-    assert list(others) == ([{"podSelector": {"matchLabels": {"a": "b"}}}] if allow else [])
+    assert list(peers) == ([{"podSelector": {"matchLabels": {"a": "b"}}}] if allow else [])
     assert settings.key_secret is not None
     assert settings.key_secret.namespace == NAMESPACE
 
 
-def check_webhook(webhook: WebhookSettings | None, ports: Any, found: list[Json]) -> None:
-    configurations = of_kind(found, "MutatingWebhookConfiguration")
+def check_webhook(webhook: WebhookSettings | None, ports: Any, manifests: list[Json]) -> None:
+    configurations = of_kind(manifests, "MutatingWebhookConfiguration")
     assert bool(webhook) == ("webhook" in ports) == bool(configurations)
-    key, *secrets = sorted(one["metadata"]["name"] for one in of_kind(found, "Secret"))
+    key, *secrets = sorted(secret["metadata"]["name"] for secret in of_kind(manifests, "Secret"))
     assert key.endswith("-key")
     if webhook is None:
         assert secrets == []
     elif webhook.directory:
         assert secrets == []
-        assert of_kind(found, "Certificate")
+        assert of_kind(manifests, "Certificate")
     else:
         assert webhook.bind.port == ports["webhook"]
         assert [webhook.secret.name if webhook.secret else ""] == secrets
         assert webhook.configuration == configurations[0]["metadata"]["name"]
 
 
-def operator(found: Any) -> list[Json]:
+def operator(manifests: Any) -> list[Json]:
     return [
-        one["spec"]["template"]["spec"]
-        for one in of_kind(list(found), "Deployment")
-        if one["metadata"]["labels"]["app.kubernetes.io/component"] == "operator"
+        deployment["spec"]["template"]["spec"]
+        for deployment in of_kind(list(manifests), "Deployment")
+        if deployment["metadata"]["labels"]["app.kubernetes.io/component"] == "operator"
     ]
 
 
 @pytest.mark.parametrize("combination", TWO)
 def test_pods_are_restricted(combination: str) -> None:
     """The Pod Security Standard "restricted", for the operator and for the test's pods."""
-    found = list(rendered(combination))
-    pods = [one["spec"]["template"]["spec"] for one in of_kind(found, "Deployment")]
-    pods += [one["spec"] for one in of_kind(found, "Pod")]
-    names = {one["metadata"]["name"] for one in of_kind(found, "Deployment")}
+    manifests = list(rendered(combination))
+    pods = [
+        deployment["spec"]["template"]["spec"] for deployment in of_kind(manifests, "Deployment")
+    ]
+    pods += [pod["spec"] for pod in of_kind(manifests, "Pod")]
+    names = {deployment["metadata"]["name"] for deployment in of_kind(manifests, "Deployment")}
     has_master = "rosproxy-operator-test-master" in names  # the test of ROS 2 has none
     assert len(pods) == 3 + has_master
     for pod in pods:
@@ -190,8 +200,8 @@ def test_pods_are_restricted(combination: str) -> None:
 
 
 def test_two_operators() -> None:
-    (deployment,) = [one for one in of_kind(objects(), "Deployment")
-                     if one["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
+    (deployment,) = [manifest for manifest in of_kind(objects(), "Deployment")
+                     if manifest["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
     assert deployment["spec"]["replicas"] == 2
     assert deployment["spec"]["strategy"]["rollingUpdate"] == {"maxUnavailable": 0, "maxSurge": 1}
     container = deployment["spec"]["template"]["spec"]["containers"][0]
@@ -202,8 +212,8 @@ def test_two_operators() -> None:
 
 
 def test_operators_are_apart_and_go_one_by_one() -> None:
-    found = objects()
-    (pod,), (budget,) = operator(found), of_kind(found, "PodDisruptionBudget")
+    manifests = objects()
+    (pod,), (budget,) = operator(manifests), of_kind(manifests, "PodDisruptionBudget")
     assert budget["spec"]["maxUnavailable"] == 1
     (apart,) = pod["topologySpreadConstraints"]
     assert apart["topologyKey"] == "kubernetes.io/hostname"
@@ -212,12 +222,12 @@ def test_operators_are_apart_and_go_one_by_one() -> None:
 
 
 def test_operators_have_a_right_to_their_lease_alone() -> None:
-    found = objects()
-    (lease,), (pod,) = of_kind(found, "Lease"), operator(found)
+    manifests = objects()
+    (lease,), (pod,) = of_kind(manifests, "Lease"), operator(manifests)
     assert "spec" not in lease  # so that upgrades leave alone who holds it
     name = lease["metadata"]["name"]
     assert f"--lease={NAMESPACE}/{name}" in pod["containers"][0]["args"]
-    rules = [rule for role in (*of_kind(found, "Role"), *of_kind(found, "ClusterRole"))
+    rules = [rule for role in (*of_kind(manifests, "Role"), *of_kind(manifests, "ClusterRole"))
              for rule in role["rules"] if "leases" in rule["resources"]]  # fmt: skip
     assert [(rule.get("resourceNames"), rule["verbs"]) for rule in rules] == [
         ([name], ["get", "patch"]),
@@ -266,11 +276,11 @@ def test_secrets_are_empty() -> None:
 
 def test_the_operator_may_reach_its_proxies() -> None:
     """The peer that proxies' NetworkPolicies let in is the operator's pod."""
-    found = objects({"podLabels": {"x": "y"}})
-    (deployment,) = [one for one in of_kind(found, "Deployment")
-                     if one["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
-    (pod,) = operator(found)
-    (text,) = [one for one in pod["containers"][0]["args"] if one.startswith("--admin-from=")]
+    manifests = objects({"podLabels": {"x": "y"}})
+    (deployment,) = [manifest for manifest in of_kind(manifests, "Deployment")
+                     if manifest["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
+    (pod,) = operator(manifests)
+    (text,) = [arg for arg in pod["containers"][0]["args"] if arg.startswith("--admin-from=")]
     (peer,) = json.loads(text.removeprefix("--admin-from="))
     labels = deployment["spec"]["template"]["metadata"]["labels"]
     assert peer["podSelector"]["matchLabels"].items() <= labels.items()
@@ -280,26 +290,28 @@ def test_the_operator_may_reach_its_proxies() -> None:
 
 
 def test_helms_test_may_name_its_master() -> None:
-    found = objects({"namespaces": ["robots"], "allow": {"masters": ["http://192.0.2.*:11311"]}})
-    (pod,), (rosproxy,) = operator(found), of_kind(found, "RosProxy")
+    manifests = objects(
+        {"namespaces": ["robots"], "allow": {"masters": ["http://192.0.2.*:11311"]}}
+    )
+    (pod,), (rosproxy,) = operator(manifests), of_kind(manifests, "RosProxy")
     service = rosproxy["spec"]["master"]["service"]["name"]
     master = f"http://{service}.{rosproxy['metadata']['namespace']}.svc:11311"
     assert f"--allow-master={master}" in pod["containers"][0]["args"]
 
 
 def test_cert_manager() -> None:
-    found = objects(OPTIONS["webhook"]["cert-manager"])
-    (certificate,) = of_kind(found, "Certificate")
-    (issuer,) = of_kind(found, "Issuer")
+    manifests = objects(OPTIONS["webhook"]["cert-manager"])
+    (certificate,) = of_kind(manifests, "Certificate")
+    (issuer,) = of_kind(manifests, "Issuer")
     assert certificate["spec"]["dnsNames"] == [f"rosproxy-operator.{NAMESPACE}.svc"]
     assert certificate["spec"]["issuerRef"] == {
         "kind": "Issuer", "name": issuer["metadata"]["name"],
     }  # fmt: skip
-    (configuration,) = of_kind(found, "MutatingWebhookConfiguration")
+    (configuration,) = of_kind(manifests, "MutatingWebhookConfiguration")
     assert configuration["metadata"]["annotations"] == {
         "cert-manager.io/inject-ca-from": f"{NAMESPACE}/{certificate['metadata']['name']}"
     }
-    (pod,) = operator(found)
+    (pod,) = operator(manifests)
     (volume,) = pod["volumes"]
     assert volume["secret"]["secretName"] == certificate["spec"]["secretName"]
     (mount,) = pod["containers"][0]["volumeMounts"]
@@ -307,10 +319,10 @@ def test_cert_manager() -> None:
 
 
 def test_own_issuer() -> None:
-    found = objects(OPTIONS["webhook"]["own-issuer"])
-    (certificate,) = of_kind(found, "Certificate")
+    manifests = objects(OPTIONS["webhook"]["own-issuer"])
+    (certificate,) = of_kind(manifests, "Certificate")
     assert certificate["spec"]["issuerRef"] == {"name": "ca", "kind": "ClusterIssuer"}
-    assert not of_kind(found, "Issuer")
+    assert not of_kind(manifests, "Issuer")
 
 
 def test_definition_is_kept() -> None:
@@ -335,17 +347,25 @@ def test_definition_is_kept() -> None:
     ],
 )
 def test_names(release: str, values: Json, name: str) -> None:
-    found = objects(values, release=release)
-    names = {one["metadata"]["name"] for one in found if one["kind"] != "CustomResourceDefinition"}
+    manifests = objects(values, release=release)
+    names = {
+        manifest["metadata"]["name"]
+        for manifest in manifests
+        if manifest["kind"] != "CustomResourceDefinition"
+    }
     assert name in names
-    assert all(each.startswith(name) for each in names)
-    (rosproxy,) = of_kind(found, "RosProxy")
+    assert all(object_name.startswith(name) for object_name in names)
+    (rosproxy,) = of_kind(manifests, "RosProxy")
     assert len(rosproxy["metadata"]["name"]) <= 46
 
 
 def test_everything_of_the_test_is_removed() -> None:
-    hooks = [one for one in objects() if "helm.sh/hook" in one["metadata"].get("annotations", {})]
-    assert sorted(one["kind"] for one in hooks) == [
+    hooks = [
+        manifest
+        for manifest in objects()
+        if "helm.sh/hook" in manifest["metadata"].get("annotations", {})
+    ]
+    assert sorted(hook["kind"] for hook in hooks) == [
         "ConfigMap", "Deployment", "Deployment", "Pod", "RosProxy", "Service",
     ]  # fmt: skip
     for hook in hooks:
@@ -364,16 +384,21 @@ def test_everything_of_the_test_is_removed() -> None:
     ],
 )
 def test_the_test_runs_where_the_operator_may(values: Json, namespace: str) -> None:
-    hooks = [one for one in objects(values) if "helm.sh/hook" in str(one["metadata"])]
-    assert {one["metadata"]["namespace"] for one in hooks} == {namespace}
+    hooks = [
+        manifest for manifest in objects(values) if "helm.sh/hook" in str(manifest["metadata"])
+    ]
+    assert {hook["metadata"]["namespace"] for hook in hooks} == {namespace}
 
 
 def test_the_test_without_a_webhook() -> None:
     """Nobody wires its pod then, so it is wired in its template."""
-    found = objects(merged(OPTIONS["webhook"]["off"]))
-    (echo,) = [one for one in of_kind(found, "Deployment")
-               if one["metadata"]["name"] == "rosproxy-operator-test-echo"]  # fmt: skip
-    env = {one["name"]: one for one in echo["spec"]["template"]["spec"]["containers"][0]["env"]}
+    manifests = objects(merged(OPTIONS["webhook"]["off"]))
+    (echo,) = [manifest for manifest in of_kind(manifests, "Deployment")
+               if manifest["metadata"]["name"] == "rosproxy-operator-test-echo"]  # fmt: skip
+    env = {
+        variable["name"]: variable
+        for variable in echo["spec"]["template"]["spec"]["containers"][0]["env"]
+    }
     assert env["ROS_MASTER_URI"]["value"] == "http://rosproxy-rosproxy-operator-test:11311"
 
 

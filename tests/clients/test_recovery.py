@@ -30,12 +30,12 @@ def test_nodes_that_live_stay_registered(lab: Lab) -> None:
     kinds = {"pub": LIBRARIES, "sub": LIBRARIES, "serve": able(SERVE)}
     names = {f"{kind}_{library}": (kind, library) for kind in kinds for library in kinds[kind]}
     for name, (kind, library) in names.items():
-        what = {"service" if kind == "serve" else "topic": f"/{name}/{kind}"}
-        lab.node(library, "c1", kind, name=name, **what).wait_for("^ready")
+        endpoint = {"service" if kind == "serve" else "topic": f"/{name}/{kind}"}
+        lab.node(library, "c1", kind, name=name, **endpoint).wait_for("^ready")
 
     def state() -> set[str]:
         """What is registered of each node, apart from what all have."""
-        return {item for part in lab.ask_master("getSystemState") for item, _ in part} & wanted
+        return {item for table in lab.ask_master("getSystemState") for item, _ in table} & wanted
 
     wanted = {f"/{name}/{kind}" for name, (kind, _) in names.items()}
     wait_until("all are registered", lambda: state() == wanted)

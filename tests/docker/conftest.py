@@ -100,8 +100,8 @@ def other_machine(ros_image: str, named: Robot) -> Iterator[Machine]:
 @pytest.fixture(scope="module")
 def lan(ros2_image: str) -> Iterator[Outside]:
     """A machine outside with ROS 2, which hears this host's multicast."""
-    with machine_on_lan(ros2_image) as found:
-        yield found
+    with machine_on_lan(ros2_image) as outside:
+        yield outside
 
 
 @pytest.fixture
@@ -116,8 +116,10 @@ def _no_other_controller(_engine: None) -> None:
     """Where all proxies have the tests' image, a killed run has left them: they are taken away."""
     if {proxy.image for proxy in proxies()} == {images.PROXY}:
         remove_proxies()
-    found = [proxy.name for proxy in proxies()]
-    assert not found, f"a controller is at work on this engine, or has left its proxies: {found}"
+    proxy_names = [proxy.name for proxy in proxies()]
+    assert not proxy_names, (
+        f"a controller is at work on this engine, or has left its proxies: {proxy_names}"
+    )
 
 
 @pytest.fixture
@@ -151,8 +153,8 @@ def controller(
     try:
         with running_controller(
             controller_image, "--proxy-image", proxy_image, *options, names=names
-        ) as found:
-            yield found
+        ) as started_controller:
+            yield started_controller
     finally:
         remove_proxies()
 

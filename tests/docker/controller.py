@@ -46,8 +46,8 @@ class Proxy:
     @property
     def image(self) -> str:
         """The image it was made of, as it was named."""
-        found = inspect(self.name, check=False) or inspect(self.sandbox, check=False)
-        return str(found["Config"]["Image"]) if found else ""
+        inspection = inspect(self.name, check=False) or inspect(self.sandbox, check=False)
+        return str(inspection["Config"]["Image"]) if inspection else ""
 
     @property
     def ports(self) -> range:
@@ -57,19 +57,26 @@ class Proxy:
     @property
     def running(self) -> bool:
         """Whether both run, the one in the network of the other."""
-        found = [inspect(name, check=False) for name in (self.name, self.sandbox)]
-        if not all(one and one["State"]["Running"] and not one["State"]["Paused"] for one in found):
+        inspections = [inspect(name, check=False) for name in (self.name, self.sandbox)]
+        if not all(
+            inspection and inspection["State"]["Running"] and not inspection["State"]["Paused"]
+            for inspection in inspections
+        ):
             return False
-        return bool(found[0]["HostConfig"]["NetworkMode"] == f"container:{found[1]['Id']}")
+        return bool(
+            inspections[0]["HostConfig"]["NetworkMode"] == f"container:{inspections[1]['Id']}"
+        )
 
     @property
     def networks(self) -> set[str]:
-        found = inspect(self.sandbox, check=False)
-        return set(found["NetworkSettings"]["Networks"]) - {UPLINK} if found else set()
+        inspection = inspect(self.sandbox, check=False)
+        return set(inspection["NetworkSettings"]["Networks"]) - {UPLINK} if inspection else set()
 
     def aliases(self, network: str) -> set[str]:
-        found = inspect(self.sandbox)
-        return set(found["NetworkSettings"]["Networks"][network]["Aliases"]) - {found["Id"][:12]}
+        inspection = inspect(self.sandbox)
+        return set(inspection["NetworkSettings"]["Networks"][network]["Aliases"]) - {
+            inspection["Id"][:12]
+        }
 
     def flowing(self) -> set[str]:
         """Of which topics and services something has gone out through it, on connections it has."""
@@ -83,8 +90,10 @@ class Proxy:
 
 def managed(role: str, *, check: bool = True) -> list[str]:
     """The names of the containers that a controller has made, in whatever state."""
-    found = containers(MANAGED, f"io.rosproxy.role={role}", check=check)
-    return sorted(one["Names"][0].removeprefix("/") for one in found if one["Names"])
+    listed = containers(MANAGED, f"io.rosproxy.role={role}", check=check)
+    return sorted(
+        container["Names"][0].removeprefix("/") for container in listed if container["Names"]
+    )
 
 
 def proxies(*, check: bool = True) -> list[Proxy]:
@@ -96,8 +105,8 @@ def proxies(*, check: bool = True) -> list[Proxy]:
 
 def published_ranges() -> list[range]:
     """The ranges of all proxies in one look: one that is being replaced can't be inspected."""
-    found = containers(MANAGED, "io.rosproxy.role=ports")
-    ranges = (one["Labels"]["io.rosproxy.range"] for one in found)
+    listed = containers(MANAGED, "io.rosproxy.role=ports")
+    ranges = (container["Labels"]["io.rosproxy.range"] for container in listed)
     ends = [tuple(map(int, text.split("-"))) for text in ranges]
     return [range(first, last + 1) for first, last in ends]
 
@@ -135,11 +144,13 @@ class Controller:
                       *words, check=check)  # fmt: skip
 
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.command("status", "--json", check=False))
-        return found
+        document: dict[str, Any] = json.loads(self.command("status", "--json", check=False))
+        return document
 
     def problems(self) -> str:
-        return "\n".join(f"{one['subject']}: {one['text']}" for one in self.status()["problems"])
+        return "\n".join(
+            f"{problem['subject']}: {problem['text']}" for problem in self.status()["problems"]
+        )
 
     def kill(self) -> None:
         docker("kill", self.container)
@@ -158,7 +169,11 @@ def running_controller(
     """
     container = container or f"rosproxy-test-controller-{os.getpid()}"
     every = (*OPTIONS, *options)
-    hosts = [word for name, at in names.items() for word in ("--add-host", f"{name}:{at}")]
+    hosts = [
+        argument
+        for name, address in names.items()
+        for argument in ("--add-host", f"{name}:{address}")
+    ]
     docker("run", "--detach", "--name", container, "--network", "host", *HARDENED, *hosts,
            "--volume", "/var/run/docker.sock:/var/run/docker.sock", image, "docker",
            *every)  # fmt: skip

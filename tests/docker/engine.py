@@ -29,7 +29,7 @@ _PID = Path("/run/docker.pid")
 def run(*command: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
     """Run a command, return what it prints, show all of it when it fails."""
     done = subprocess.run(
-        [str(part) for part in command],
+        [str(argument) for argument in command],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -83,25 +83,25 @@ def inspect(name: str, *, check: bool = True) -> dict[str, Any]:
     try:
         api = _api(engine_url())
         try:
-            found: dict[str, Any] = api.inspect_container(name)
+            inspection: dict[str, Any] = api.inspect_container(name)
         except NotFound:
-            found = api.inspect_image(name)
+            inspection = api.inspect_image(name)
     except (DockerException, RequestException) as error:
         if check:
             raise AssertionError(f"inspect {name}: {error}") from None
         return {}
-    return found
+    return inspection
 
 
 def containers(*labels: str, check: bool = True) -> list[dict[str, Any]]:
     """All containers with these labels, in whatever state, as the engine lists them."""
     try:
-        found = _api(engine_url()).containers(all=True, filters={"label": list(labels)})
+        listed = _api(engine_url()).containers(all=True, filters={"label": list(labels)})
     except (DockerException, RequestException) as error:
         if check:
             raise AssertionError(f"containers with {' '.join(labels)}: {error}") from None
         return []
-    return list(found)
+    return list(listed)
 
 
 def logs(name: str) -> str:
@@ -112,16 +112,20 @@ def logs(name: str) -> str:
         return f"logs of {name}: {error}"
 
 
-def wait_until(true: Callable[[], bool], seconds: float, what: str | Callable[[], str]) -> float:
+def wait_until(
+    condition: Callable[[], bool], seconds: float, message: str | Callable[[], str]
+) -> float:
     """Wait for something to come true; return the seconds it took.
 
     Who has waited long is asked less often: many questions are a program to start.
     """
     started = time.monotonic()
-    while not true():
+    while not condition():
         waited = time.monotonic() - started
         if waited > seconds:
-            raise AssertionError(f"not in {seconds} s: {what if isinstance(what, str) else what()}")
+            raise AssertionError(
+                f"not in {seconds} s: {message if isinstance(message, str) else message()}"
+            )
         time.sleep(min(max(0.1, waited / 20), 0.5))
     return time.monotonic() - started
 

@@ -18,8 +18,8 @@ ENABLE = "rosproxy.enable=true"
 _numbers = itertools.count(1)
 
 
-def unique(what: str) -> str:
-    return f"rpx-{what}-{os.getpid()}-{next(_numbers)}"
+def unique(kind: str) -> str:
+    return f"rpx-{kind}-{os.getpid()}-{next(_numbers)}"
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Inside:
         words = [verb, *(["--detach"] if verb == "run" else []), "--name", name]
         words += ["--network", network, "--label", MARK, "--init", *options]
         words += ["--env", f"ROS_MASTER_URI={uri}"] if uri else []
-        words += [word for label in labels for word in ("--label", label)]
+        words += [argument for label in labels for argument in ("--label", label)]
         docker(*words, image or self.image, *command)
         return Container(name)
 
@@ -111,9 +111,9 @@ def inside(image: str, master_uri: str) -> Iterator[Inside]:
 
 def remove_marked(mark: str = MARK) -> None:
     """Remove all containers and networks that the tests have made, here or with another mark."""
-    found = [one["Id"] for one in containers(mark)]
-    if found:
-        docker("rm", "--force", *found, check=False, seconds=120)
+    ids = [container["Id"] for container in containers(mark)]
+    if ids:
+        docker("rm", "--force", *ids, check=False, seconds=120)
     for network in docker("network", "ls", "--quiet", "--filter", f"label={mark}").split():
         for container in attached(network):
             docker("network", "disconnect", "--force", network, container, check=False)
@@ -131,5 +131,5 @@ def remove_leftovers() -> None:
 
 def attached(network: str) -> list[str]:
     """The names of the running containers on a network."""
-    found = json.loads(docker("network", "inspect", network, check=False) or "[]")
-    return [one["Name"] for net in found for one in net["Containers"].values()]
+    inspections = json.loads(docker("network", "inspect", network, check=False) or "[]")
+    return [container["Name"] for net in inspections for container in net["Containers"].values()]

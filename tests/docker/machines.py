@@ -105,18 +105,19 @@ def plug(container: str, number: int, namespace: str = "") -> None:
     run(*far, "ip", "link", "set", interface, "up")
 
 
-def join(one: Machine, other: Machine) -> None:
+def join(first: Machine, second: Machine) -> None:
     """Lay a cable between two machines, so that they reach each other by their addresses."""
-    pids = [str(inspect(machine.container)["State"]["Pid"]) for machine in (one, other)]
+    pids = [str(inspect(machine.container)["State"]["Pid"]) for machine in (first, second)]
     ends = [("nsenter", "--target", pid, "--net") for pid in pids]
     run(*ends[0], "ip", "link", "add", "eth1", "type", "veth", "peer", "name", "eth1",
         "netns", pids[1])  # fmt: skip
-    for end, there in ((ends[0], other), (ends[1], one)):
+    for end, peer in ((ends[0], second), (ends[1], first)):
         run(*end, "ip", "link", "set", "eth1", "up")
-        run(*end, "ip", "route", "add", there.address, "dev", "eth1")
+        run(*end, "ip", "route", "add", peer.address, "dev", "eth1")
 
 
-def reach(one: Machine, address: str) -> None:
+def reach(source: Machine, address: str) -> None:
     """Let a machine reach another of this host's addresses by its cable."""
-    pid = str(inspect(one.container)["State"]["Pid"])
-    run("nsenter", "--target", pid, "--net", "ip", "route", "add", address, "via", one.host_address)
+    pid = str(inspect(source.container)["State"]["Pid"])
+    run("nsenter", "--target", pid, "--net", "ip", "route", "add", address, "via",
+        source.host_address)  # fmt: skip

@@ -38,11 +38,11 @@ def reply(query: bytes, names: Mapping[str, str]) -> bytes:
     name, end = question(query)
     kind = struct.unpack(">H", query[end : end + 2])[0]
     address = names.get(name.lower(), "")
-    found = bool(address) and kind == _ADDRESS
+    answered = bool(address) and kind == _ADDRESS
     flags = 0x8180 if address else 0x8183
-    head = query[:2] + struct.pack(">5H", flags, 1, int(found), 0, 0)
+    head = query[:2] + struct.pack(">5H", flags, 1, int(answered), 0, 0)
     answer = struct.pack(">3HIH", 0xC00C, _ADDRESS, 1, 1, 4) + socket.inet_aton(address or "0")
-    return head + query[12 : end + 4] + (answer if found else b"")
+    return head + query[12 : end + 4] + (answer if answered else b"")
 
 
 def question(query: bytes) -> tuple[str, int]:

@@ -22,7 +22,7 @@ def node_command(library: str, role: str, *options: str) -> tuple[str, ...]:
 class Got:
     """A message or reply that a node has received; ``at`` is the clock's time in seconds."""
 
-    word: str
+    text: str
     number: int
     at: float
 
@@ -33,33 +33,33 @@ class Log:
 
     read: Callable[[], str]
 
-    def got(self, word: str = "", verb: str = "got") -> list[Got]:
+    def got(self, text: str = "", verb: str = "got") -> list[Got]:
         """The messages with that word that it has received, or sent."""
-        found = (Got(m[2], int(m[3]), float(m[4])) for m in _GOT.finditer(self.read())
+        messages = (Got(m[2], int(m[3]), float(m[4])) for m in _GOT.finditer(self.read())
                  if m[1] == verb)  # fmt: skip
-        return [got for got in found if not word or got.word == word]
+        return [got for got in messages if not text or got.text == text]
 
     def wait_for(
-        self, word: str, count: int = 3, seconds: float = 60, since: float = 0, verb: str = "got"
+        self, text: str, count: int = 3, seconds: float = 60, since: float = 0, verb: str = "got"
     ) -> float:
         """Wait until it has received that many with a word; return when the first came."""
 
         def fresh() -> list[Got]:
-            return [got for got in self.got(word, verb) if got.at >= since]
+            return [got for got in self.got(text, verb) if got.at >= since]
 
         wait_until(
             lambda: len(fresh()) >= count, seconds,
-            lambda: f"{count} messages {word!r} since {since} in:\n{self.read()[-3000:]}",
+            lambda: f"{count} messages {text!r} since {since} in:\n{self.read()[-3000:]}",
         )  # fmt: skip
         return fresh()[0].at
 
-    def lost(self, word: str, since: float) -> int:
+    def lost(self, text: str, since: float) -> int:
         """How many messages are missing between those received since then."""
-        numbers = {got.number for got in self.got(word) if got.at >= since}
+        numbers = {got.number for got in self.got(text) if got.at >= since}
         return max(numbers) - min(numbers) + 1 - len(numbers)
 
-    def longest_gap(self, word: str, since: float, until: float, verb: str = "got") -> float:
+    def longest_gap(self, text: str, since: float, until: float, verb: str = "got") -> float:
         """The longest time in which no message came."""
-        times = [got.at for got in self.got(word, verb) if since <= got.at <= until]
+        times = [got.at for got in self.got(text, verb) if since <= got.at <= until]
         edges = [since, *times, until]
         return max(later - earlier for earlier, later in itertools.pairwise(edges))

@@ -69,9 +69,9 @@ class PrivateEngine:
 
     def clear(self) -> None:
         """Remove all containers, end the engine and delete what it has stored."""
-        found = docker("ps", "--all", "--quiet", engine=self.url, check=False).split()
-        if found:
-            docker("rm", "--force", *found, engine=self.url, check=False, seconds=120)
+        container_ids = docker("ps", "--all", "--quiet", engine=self.url, check=False).split()
+        if container_ids:
+            docker("rm", "--force", *container_ids, engine=self.url, check=False, seconds=120)
         self.end()
         for line in reversed(Path("/proc/self/mounts").read_text().splitlines()):
             mount = line.split()[1]

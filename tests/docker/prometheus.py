@@ -35,29 +35,33 @@ class Prometheus:
         """The labels of what a query has given at any time since the beginning."""
         now = time.time()
         step = str(max(1, round((now - self.since) / 500)))
-        found = self.ask("query_range", query=query, start=f"{self.since}", end=f"{now}", step=step)
-        return [one["metric"] for one in found["result"]]
+        answer = self.ask(
+            "query_range", query=query, start=f"{self.since}", end=f"{now}", step=step
+        )
+        return [series["metric"] for series in answer["result"]]
 
     def firing(self) -> list[dict[str, Any]]:
         """The alerts that fire now."""
-        return [one for one in self.ask("alerts")["alerts"] if one["state"] == "firing"]
+        return [alert for alert in self.ask("alerts")["alerts"] if alert["state"] == "firing"]
 
     def wait_for_alert(self, name: str, seconds: float = 60, **labels: str) -> dict[str, Any]:
         """Wait until an alert with these labels fires, and return it."""
         wanted = {"alertname": name, **labels}.items()
 
-        def found() -> list[dict[str, Any]]:
-            return [one for one in self.firing() if wanted <= one["labels"].items()]
+        def matching_alerts() -> list[dict[str, Any]]:
+            return [alert for alert in self.firing() if wanted <= alert["labels"].items()]
 
-        wait_until(lambda: bool(found()), seconds, lambda: f"{wanted} in {self.firing()}")
-        return found()[0]
+        wait_until(lambda: bool(matching_alerts()), seconds, lambda: f"{wanted} in {self.firing()}")
+        return matching_alerts()[0]
 
     def answering(self) -> set[tuple[str, str]]:
         """The targets that answer, by job and instance."""
         labels = [
-            one["labels"] for one in self.ask("targets")["activeTargets"] if one["health"] == "up"
+            target["labels"]
+            for target in self.ask("targets")["activeTargets"]
+            if target["health"] == "up"
         ]
-        return {(one["job"], one["instance"]) for one in labels}
+        return {(target_labels["job"], target_labels["instance"]) for target_labels in labels}
 
 
 def guides_configuration(directory: Path, operator: str) -> Any:
@@ -84,17 +88,17 @@ def running_prometheus(directory: Path, config: Any) -> Iterator[Prometheus]:
     """Prometheus as a program of this host, with its files in a directory."""
     path = directory / "prometheus.yml"
     path.write_text(yaml.safe_dump(config))
-    where = f"127.0.0.1:{free_ports(1)}"
+    address = f"127.0.0.1:{free_ports(1)}"
     words = [f"--config.file={path}", f"--storage.tsdb.path={directory / 'data'}",
-             f"--web.listen-address={where}", "--log.level=warn"]  # fmt: skip
+             f"--web.listen-address={address}", "--log.level=warn"]  # fmt: skip
     log = directory / "prometheus.log"
     with log.open("wb") as output:
         process = subprocess.Popen(["prometheus", *words], stdout=output, stderr=output)
-    found = Prometheus(f"http://{where}", time.time())
+    prometheus = Prometheus(f"http://{address}", time.time())
     try:
-        wait_until(lambda: process.poll() is not None or _ready(found), 30, log.read_text)
+        wait_until(lambda: process.poll() is not None or _ready(prometheus), 30, log.read_text)
         assert process.poll() is None, log.read_text()
-        yield found
+        yield prometheus
     finally:
         process.terminate()
         process.wait(30)

@@ -18,8 +18,8 @@ def rules(container: Container) -> str:
 
 
 def leads_to_the_proxy(container: Container, network: str) -> bool:
-    found = inspect(the_proxy().sandbox, check=False).get("NetworkSettings", {})
-    address = found.get("Networks", {}).get(network, {}).get("IPAddress")
+    settings = inspect(the_proxy().sandbox, check=False).get("NetworkSettings", {})
+    address = settings.get("Networks", {}).get(network, {}).get("IPAddress")
     return bool(address) and f"dnat to {address}:11311" in rules(container)
 
 

@@ -47,8 +47,8 @@ class Robot(Machine):
         if not self.hidden:
             return nodes_at(f"http://{self.address}:{port}")
         text = self.run("python3", "-c", _NODES, f"http://{self.address}:{port}", check=False)
-        found: dict[str, str] = json.loads(text) if text.startswith("{") else {}
-        return found
+        uris: dict[str, str] = json.loads(text) if text.startswith("{") else {}
+        return uris
 
     def uri(self, node: str, port: int = 11311) -> str:
         """The URI that the master has of a node; empty if none."""
@@ -95,8 +95,8 @@ class _Transport(xmlrpc.client.Transport):
 def robot_outside(image: str) -> Iterator[Robot]:
     """A robot that calls itself by its address."""
     settings = ("--env", f"ROS_MASTER_URI={MASTER_URI}", "--env", f"ROS_IP={ROBOT_ADDRESS}")
-    with machine(image, "addressed", ADDRESSED, *settings) as found:
-        yield _robot(found, found.address)
+    with machine(image, "addressed", ADDRESSED, *settings) as own_machine:
+        yield _robot(own_machine, own_machine.address)
 
 
 @contextmanager
@@ -104,8 +104,8 @@ def named_robot(
     image: str, name: str = "robot", number: int = NAMED, namespace: str = ""
 ) -> Iterator[Robot]:
     """A robot as most are: it calls itself by its name, in URIs too."""
-    with machine(image, name, number, *_names(name, number), namespace=namespace) as found:
-        yield _robot(found, name, hidden=bool(namespace))
+    with machine(image, name, number, *_names(name, number), namespace=namespace) as own_machine:
+        yield _robot(own_machine, name, hidden=bool(namespace))
 
 
 @contextmanager
@@ -114,10 +114,10 @@ def laptop(image: str, robot: Robot) -> Iterator[Machine]:
     own = addresses(LAPTOP)[1]
     settings = ("--env", f"ROS_MASTER_URI={robot.master_uri}", "--env", f"ROS_IP={own}",
                 "--add-host", f"{robot.name}:{robot.address}")  # fmt: skip
-    with machine(image, "laptop", LAPTOP, *settings) as found:
-        join(robot, found)
-        reach(found, robot.host_address)
-        yield found
+    with machine(image, "laptop", LAPTOP, *settings) as second_machine:
+        join(robot, second_machine)
+        reach(second_machine, robot.host_address)
+        yield second_machine
 
 
 def _names(name: str, number: int) -> tuple[str, ...]:
@@ -125,5 +125,5 @@ def _names(name: str, number: int) -> tuple[str, ...]:
             "--env", f"ROS_MASTER_URI=http://{name}:11311")  # fmt: skip
 
 
-def _robot(found: Machine, name: str, hidden: bool = False) -> Robot:
-    return Robot(**vars(found), name=name, hidden=hidden)
+def _robot(own_machine: Machine, name: str, hidden: bool = False) -> Robot:
+    return Robot(**vars(own_machine), name=name, hidden=hidden)

@@ -63,11 +63,11 @@ def machine_on_lan(
     image: str, name: str = "lan", number: int = NUMBER, namespace: str = ""
 ) -> Iterator[Outside]:
     """A machine one cable away, which sends multicast into it."""
-    with machine(image, name, number, namespace=namespace) as found:
-        process = str(inspect(found.container)["State"]["Pid"])
+    with machine(image, name, number, namespace=namespace) as lan_machine:
+        process = str(inspect(lan_machine.container)["State"]["Pid"])
         run("nsenter", "--target", process, "--net",
             "ip", "route", "add", "224.0.0.0/4", "dev", "eth0")  # fmt: skip
-        yield Outside(found)
+        yield Outside(lan_machine)
 
 
 @dataclass(frozen=True)
@@ -91,17 +91,17 @@ def domain(proxy: Proxy) -> DomainStatus:
     """What a proxy tells of its domain; nothing while it does not answer."""
     text = docker("exec", proxy.name, "rosproxy", "status", "--json", check=False)
     try:
-        (found,) = parse_status(text).domains
+        (status,) = parse_status(text).domains
     except ValueError:
         return DomainStatus()
-    return found
+    return status
 
 
 def ports(proxy: Proxy) -> dict[str, list[tuple[int, str]]]:
     """The ports of the range with their locators, by participant inside."""
     return {
-        one.guid_prefix: sorted((lease.port, lease.where) for lease in one.leases)
-        for one in domain(proxy).inside
+        participant.guid_prefix: sorted((lease.port, lease.where) for lease in participant.leases)
+        for participant in domain(proxy).inside
     }
 
 
@@ -118,10 +118,10 @@ def ros2_proxies() -> list[Proxy]:
     return [proxy for proxy in proxies() if proxy.name.startswith("rosproxy-domain-")]
 
 
-def kept(proxy: Proxy) -> bool:
+def ports_are_kept(proxy: Proxy) -> bool:
     """Whether all participants inside keep their ports for the next process."""
-    found = domain(proxy).inside
-    return len(found) == 2 and all(one.kept for one in found)
+    participants = domain(proxy).inside
+    return len(participants) == 2 and all(participant.kept for participant in participants)
 
 
 def all_run(proxy: Proxy) -> bool:
@@ -132,12 +132,16 @@ def all_run(proxy: Proxy) -> bool:
 
 def runs(proxy: Proxy) -> list[tuple[str, str]]:
     """Which containers there are, and since when each runs."""
-    found = (inspect(name, check=False) for name in (proxy.name, proxy.sandbox, proxy.ear))
-    return [(one["Id"], one["State"]["StartedAt"]) for one in found if one]
+    inspections = (inspect(name, check=False) for name in (proxy.name, proxy.sandbox, proxy.ear))
+    return [
+        (inspection["Id"], inspection["State"]["StartedAt"])
+        for inspection in inspections
+        if inspection
+    ]
 
 
 class Flow:
-    """A talker and a listener on either side; ``words`` are what each hears."""
+    """A talker and a listener on either side; ``heard`` is what each listener hears."""
 
     def __init__(self, lan: Outside, inside2: Inside2, network: str = "", **more: Any) -> None:
         network = network or inside2.made.network()
@@ -159,14 +163,14 @@ class Flow:
         since 23.0 have it do (github.com/moby/moby/pull/44742); Debian 12 has 20.10.
         """
         run("conntrack", "-D", "-p", "udp", "--orig-dst", HERE, check=False)  # there may be none
-        for log, word in self.heard:
-            log.wait_for(word, count=10, since=since, seconds=seconds)
+        for log, text in self.heard:
+            log.wait_for(text, count=10, since=since, seconds=seconds)
 
     def gaps(self, since: float) -> str:
         """The longest times without messages since then, and how many were lost."""
         now = time.time()
-        out, back = (log.longest_gap(word, since, now) for log, word in self.heard)
-        lost = sum(log.lost(word, since) for log, word in self.heard)
+        out, back = (log.longest_gap(text, since, now) for log, text in self.heard)
+        lost = sum(log.lost(text, since) for log, text in self.heard)
         return (
             f"seconds without messages outward {out:.1f}, inward {back:.1f}; messages lost {lost}"
         )

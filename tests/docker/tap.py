@@ -83,8 +83,8 @@ class EngineTap:
 def body_to_come(request: bytes) -> int:
     """How many bytes of a request's body are not in the packet that it begins with."""
     head, _, body = request.partition(b"\r\n\r\n")
-    found = re.search(rb"\r\ncontent-length: *(\d+)", head, re.IGNORECASE)
-    return int(found[1]) - len(body) if found else 0
+    match = re.search(rb"\r\ncontent-length: *(\d+)", head, re.IGNORECASE)
+    return int(match[1]) - len(body) if match else 0
 
 
 def accepted(listener: socket.socket) -> Iterator[socket.socket]:

@@ -32,17 +32,17 @@ def test_status_shows_containers_proxies_nodes_and_problems(
 
     text = controller.command("status", check=False)
 
-    for word in (node.name, proxy.name, f"{proxy.ports[0]}-{proxy.ports[-1]}", f"/{node.node}",
+    for expected in (node.name, proxy.name, f"{proxy.ports[0]}-{proxy.ports[-1]}", f"/{node.node}",
                  bad.name, "rosproxy.ports"):  # fmt: skip
-        assert word in text, text
+        assert expected in text, text
 
     status = controller.status()
-    (found,) = status["proxies"]
-    assert found["name"] == proxy.name
-    assert found["master_uri"] == named.master_uri
-    assert found["master_address"] == named.address
-    assert found["master_up"]
-    (container,) = (one for one in status["containers"] if one["name"] == node.name)
+    (proxy_status,) = status["proxies"]
+    assert proxy_status["name"] == proxy.name
+    assert proxy_status["master_uri"] == named.master_uri
+    assert proxy_status["master_address"] == named.address
+    assert proxy_status["master_up"]
+    (container,) = (row for row in status["containers"] if row["name"] == node.name)
     assert container["proxy"] == proxy.name
     assert container["nodes"][0]["names"] == [f"/{node.node}"]
     assert container["nodes"][0]["advertised_uri"] == named.uri(node.node)

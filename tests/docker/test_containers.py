@@ -107,7 +107,7 @@ def test_renamed_container_goes_on(controller: Controller, net: Inside, named: R
 
         ear.wait_for("inside", count=60, since=before)
         assert ear.lost("inside", before) == 0
-        names = {one["name"] for one in controller.status()["containers"]}
+        names = {row["name"] for row in controller.status()["containers"]}
         assert node.name + "-renamed" in names
     finally:
         named.end("ear")
@@ -139,29 +139,29 @@ def test_container_moves_to_another_network(
 def test_nodes_of_two_networks_hear_each_other(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    one, other = net.network(), net.network("--internal")
-    speaking = net.node(one, "roscpp", "pub", "--topic", "/across", "--word", "neighbour")
-    hearing = net.node(other, "rospy", "sub", "--topic", "/across")
+    first, second = net.network(), net.network("--internal")
+    speaking = net.node(first, "roscpp", "pub", "--topic", "/across", "--word", "neighbour")
+    hearing = net.node(second, "rospy", "sub", "--topic", "/across")
 
     hearing.log.wait_for("neighbour")
 
-    assert the_proxy().networks == {one, other}
+    assert the_proxy().networks == {first, second}
     assert named.knows_proxied(speaking.node)
 
 
 def test_container_of_two_networks(controller: Controller, net: Inside, named: Robot) -> None:
     """It is served on both; leaving one of them cuts nothing."""
-    one, other = net.network(), net.network()
-    node = net.node(one, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create")
-    docker("network", "connect", other, node.name)
+    first, second = net.network(), net.network()
+    node = net.node(first, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create")
+    docker("network", "connect", second, node.name)
     docker("start", node.name)
     ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
     try:
         ear.wait_for("inside")
         proxy = the_proxy()
-        assert proxy.networks == {one, other}
+        assert proxy.networks == {first, second}
 
-        docker("network", "disconnect", proxy_free_network(node, proxy, one, other), node.name)
+        docker("network", "disconnect", proxy_free_network(node, proxy, first, second), node.name)
 
         wait_until(lambda: len(proxy.networks) == 1, 60, lambda: str(proxy.networks))
         ear.wait_for("inside", since=time.time())
@@ -180,14 +180,14 @@ def proxy_free_network(node: Container, proxy: Proxy, *networks: str) -> str:
 def test_network_can_be_removed_when_its_containers_are_gone(
     controller: Controller, net: Inside
 ) -> None:
-    network, kept = net.network(), net.network()
+    network, remaining = net.network(), net.network()
     node = net.idle(network)
-    net.idle(kept)
+    net.idle(remaining)
     proxy = the_proxy()
-    wait_until(lambda: proxy.networks == {network, kept}, 60, "the proxy has joined both")
+    wait_until(lambda: proxy.networks == {network, remaining}, 60, "the proxy has joined both")
 
     docker("rm", "--force", node.name)
-    wait_until(lambda: proxy.networks == {kept}, 3, "the proxy has left")
+    wait_until(lambda: proxy.networks == {remaining}, 3, "the proxy has left")
     docker("network", "rm", network)
 
     net.networks.remove(network)

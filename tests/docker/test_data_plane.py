@@ -21,19 +21,19 @@ OPTIONS = ("--allow-data-plane", "kernel")
 
 
 def status(proxy: Proxy) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(
+    document: dict[str, Any] = json.loads(
         docker("exec", proxy.name, "rosproxy", "status", "--json", check=False)
     )
-    return found
+    return document
 
 
 def plane_of(node: str) -> dict[str, Any]:
     """How the topics of an inside node are forwarded."""
     nodes = status(the_proxy())["nodes"]
-    mine = [one["data_plane"] for one in nodes if f"/{node}" in one["nodes"]]
+    mine = [row["data_plane"] for row in nodes if f"/{node}" in row["nodes"]]
     assert len(mine) == 1, nodes
-    found: dict[str, Any] = mine[0]
-    return found
+    plane: dict[str, Any] = mine[0]
+    return plane
 
 
 def wait_forwarded(flow: Traffic) -> dict[str, Any]:
@@ -56,8 +56,8 @@ def test_kernel_forwards_what_the_label_asks_for(
     with traffic(net, named, net.network(), library, labels=KERNEL) as flow:
         wait_forwarded(flow)
 
-        found = status(the_proxy())["data_plane"]
-        assert (found["mode"], found["plane"]) == ("kernel", "kernel")
+        plane = status(the_proxy())["data_plane"]
+        assert (plane["mode"], plane["plane"]) == ("kernel", "kernel")
         assert controller.status()["proxies"][0]["data_plane"] == "kernel"
         has_one_capability(the_proxy())
 
@@ -107,8 +107,8 @@ def test_nobody_asks_and_the_proxy_says_why_the_kernel_does_not_forward(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
     with traffic(net, named, net.network(), "roscpp") as flow:
-        found = plane_of(flow.talker.node)
-        assert found["plane"] == "splice"
+        plane = plane_of(flow.talker.node)
+        assert plane["plane"] == "splice"
         whole = status(the_proxy())["data_plane"]
         assert (whole["mode"], whole["plane"]) == ("auto", "splice")
         assert "NET_ADMIN" in whole["reason"]

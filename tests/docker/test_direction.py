@@ -18,7 +18,7 @@ CONNECT = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.ar
 
 def told_direction() -> str:
     """What the proxy has been told."""
-    env = dict(one.split("=", 1) for one in inspect(the_proxy().name)["Config"]["Env"])
+    env = dict(variable.split("=", 1) for variable in inspect(the_proxy().name)["Config"]["Env"])
     return env.get("ROSPROXY_DIRECTION", "out")
 
 
@@ -53,10 +53,10 @@ def test_the_label_alone_is_enough(controller: Controller, net: Inside, named: R
     ) as flow:
         flow.wait()
         assert told_direction() == "both"
-        found = json.loads(
+        document = json.loads(
             docker("exec", the_proxy().name, "rosproxy", "status", "--json", check=False)
         )
-        assert sum(one["connections"] for one in found["stand_ins"]) > 0
+        assert sum(stand_in["connections"] for stand_in in document["stand_ins"]) > 0
 
 
 def test_udpros_of_the_robot_reaches_a_container_that_asks_for_it(
@@ -72,8 +72,8 @@ def test_udpros_of_the_robot_reaches_a_container_that_asks_for_it(
     try:
         listener.log.wait_for("quick", count=10)
         ear.wait_for("back", count=10)
-        found = json.loads(docker("exec", the_proxy().name, "rosproxy", "status", "--json"))
-        assert {row["topic"] for row in found["udpros"]} == {"/quick", "/back"}
+        document = json.loads(docker("exec", the_proxy().name, "rosproxy", "status", "--json"))
+        assert {row["topic"] for row in document["udpros"]} == {"/quick", "/back"}
 
         lost = time.time()
         docker("rm", "--force", the_proxy().name)

@@ -26,22 +26,24 @@ def asked(process: Process, *words: str) -> tuple[int, dict[str, Any]]:
     """The exit code of a command, and what it prints as JSON."""
     text = process.once(*words, "--json", check=False)
     assert process.process is not None
-    found: dict[str, Any] = json.loads(text[text.index("{") :])
-    return process.process.returncode, found
+    document: dict[str, Any] = json.loads(text[text.index("{") :])
+    return process.process.returncode, document
 
 
 def wrong(process: Process) -> tuple[int, list[dict[str, Any]]]:
     """The exit code of ``doctor``, and all that it finds wrong."""
-    code, found = asked(process, "doctor")
-    severe = [one for one in found["findings"] if one["severity"] in ("error", "warning")]
+    code, report = asked(process, "doctor")
+    severe = [
+        finding for finding in report["findings"] if finding["severity"] in ("error", "warning")
+    ]
     return code, severe
 
 
 def page() -> dict[str, Any]:
     """What the operator's live page shows of all proxies."""
     with urllib.request.urlopen(f"http://{OPTIONS[-1]}/graph", timeout=30) as reply:
-        found: dict[str, Any] = json.loads(reply.read())
-    return found
+        graph: dict[str, Any] = json.loads(reply.read())
+    return graph
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +83,13 @@ def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named
         assert shown[f"{named.master_uri} master"]["lane"] == "robot"
         assert "nobody subscribes to it" in text
 
-        where = "http://127.0.0.1:11312/policy"
+        url = "http://127.0.0.1:11312/policy"
         body = '{"layers": [{"name": "a", "mode": "enforce", "rules": "deny everything"}]}'
         code_here = (
             "import sys, urllib.request as u; r = u.Request(sys.argv[1], sys.argv[2].encode(), "
             "method='POST')\ntry: u.urlopen(r)\nexcept u.HTTPError as e: print(e.code)"
         )
-        assert docker("exec", the_proxy().name, "python3", "-c", code_here, where, body) == "400"
+        assert docker("exec", the_proxy().name, "python3", "-c", code_here, url, body) == "400"
         assert "the operator's policy: refused" in waiting.once("status", check=False)
     finally:
         process.stop()
@@ -96,8 +98,8 @@ def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named
 
 def test_a_misspelt_label(process: Process, net: Inside) -> None:
     node = net.idle(net.network(), labels=("ros-proxy.enable=true",))
-    _, found = wrong(process)
-    (told,) = [one for one in found if one["subject"] == f"container {node.name}"]
+    _, findings = wrong(process)
+    (told,) = [finding for finding in findings if finding["subject"] == f"container {node.name}"]
     assert "label ros-proxy.enable is unknown and ignored" in told["text"]
     assert "did you mean rosproxy.enable?" in told["text"]
     assert "did you mean rosproxy.enable?" in process.once("status", check=False)
@@ -111,20 +113,20 @@ def test_a_masters_name_that_leads_nowhere_and_its_cure(
     blind._names.clear()
     blind._hosts.write_text("")
     node = net.idle(net.network())
-    code, found = wrong(blind)
+    code, findings = wrong(blind)
     assert code == 1
-    assert found[0]["subject"] == f"master {named.name}"
-    (told,) = [one for one in found if one["subject"] == f"container {node.name}"]
-    for one in (found[0], told):
-        assert f"the name {named.name} can't be resolved where the operator runs" in one["text"]
-        assert f"--add-host {named.name}:ADDRESS" in one["text"]
-        assert "rosproxy.advertise-host" not in one["text"]
+    assert findings[0]["subject"] == f"master {named.name}"
+    (told,) = [finding for finding in findings if finding["subject"] == f"container {node.name}"]
+    for finding in (findings[0], told):
+        assert f"the name {named.name} can't be resolved where the operator runs" in finding["text"]
+        assert f"--add-host {named.name}:ADDRESS" in finding["text"]
+        assert "rosproxy.advertise-host" not in finding["text"]
     try:
         blind.name(named.name, named.address)
         blind.once("--once")
         assert [proxy.running for proxy in proxies()] == [True]
-        assert not [one for one in wrong(blind)[1] if "container" in one["subject"]]
-        assert not [one for one in wrong(blind)[1] if "master" in one["check"]]
+        assert not [finding for finding in wrong(blind)[1] if "container" in finding["subject"]]
+        assert not [finding for finding in wrong(blind)[1] if "master" in finding["check"]]
     finally:
         remove_proxies()
 
@@ -134,8 +136,8 @@ def test_a_proxy_that_outside_does_not_reach(process: Process, net: Inside) -> N
     net.idle(net.network(), labels=(ENABLE, "rosproxy.advertise-host=192.0.2.1"))
     try:
         process.once("--once")
-        code, found = wrong(process)
-        (told,) = [one for one in found if one["check"] == "published range"]
+        code, findings = wrong(process)
+        (told,) = [finding for finding in findings if finding["check"] == "published range"]
         assert code == 1
         assert "192.0.2.1" in told["text"]
         assert "label rosproxy.advertise-host=ADDRESS" in told["fix"]

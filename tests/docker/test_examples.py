@@ -46,22 +46,22 @@ def example(
     hosts = f'["{robot.name}:{robot.address}"]'
     extra.write_text(f"services:\n  operator:\n    extra_hosts: {hosts}\n")
     variables = {"ROS_MASTER_URI": robot.master_uri, "ADVERTISE_HOST": robot.host_address}
-    found = Example(directory, {**variables, **images}, extra)
-    with running(found):
-        yield found
+    project = Example(directory, {**variables, **images}, extra)
+    with running(project):
+        yield project
 
 
 @contextmanager
-def running(found: Example) -> Iterator[None]:
+def running(project: Example) -> Iterator[None]:
     """An example that is up, and of which nothing is left in the end."""
     try:
-        found.compose("up", "--detach", "--no-build")
+        project.compose("up", "--detach", "--no-build")
         yield
     finally:
-        print(found.compose("logs", "operator"))
-        found.compose("rm", "--stop", "--force", "talker", "listener")
+        print(project.compose("logs", "operator"))
+        project.compose("rm", "--stop", "--force", "talker", "listener")
         remove_proxies()
-        found.compose("down", "--timeout", "2")
+        project.compose("down", "--timeout", "2")
         remove_proxies()
 
 
@@ -77,7 +77,7 @@ def images(
     }
 
 
-def works_both_ways(found: Example, robot: Robot) -> None:
+def works_both_ways(project: Example, robot: Robot) -> None:
     """What the README says is to be seen."""
     heard = robot.run("rostopic", "echo", "-n", "3", "/chatter")
     assert heard.count("hello from inside") == 3
@@ -85,23 +85,23 @@ def works_both_ways(found: Example, robot: Robot) -> None:
     words = ("rostopic", "pub", "-r", "2", "/command", "std_msgs/String", "hello from outside")
     robot.start("timeout", "20", *words)
     wait_until(
-        lambda: found.compose("logs", "listener").count("hello from outside") >= 3, 20,
-        lambda: found.compose("logs", "listener"),
+        lambda: project.compose("logs", "listener").count("hello from outside") >= 3, 20,
+        lambda: project.compose("logs", "listener"),
     )  # fmt: skip
 
 
 @pytest.mark.usefixtures("_no_other_controller")
 def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Path) -> None:
-    with example(EXAMPLES, named, images, tmp_path) as found:
-        works_both_ways(found, named)
+    with example(EXAMPLES, named, images, tmp_path) as project:
+        works_both_ways(project, named)
 
-        status = found.compose(*STATUS)
+        status = project.compose(*STATUS)
         assert the_proxy().name in status
         assert "talker" in status
         assert "listener" in status
         assert 11412 in the_proxy().ports
 
-        found.compose("rm", "--stop", "--force", "talker", "listener")
+        project.compose("rm", "--stop", "--force", "talker", "listener")
         wait_until(lambda: not the_proxy().networks, 5, "the proxy has left the network")
 
 
@@ -110,11 +110,11 @@ def test_example_with_a_master_by_address(
     robot: Robot, images: dict[str, str], tmp_path: Path
 ) -> None:
     """Its services are stock ones, but for the label."""
-    with example(BY_ADDRESS, robot, images, tmp_path) as found:
-        assert found.variables["ROS_MASTER_URI"] == f"http://{robot.address}:11311"
-        works_both_ways(found, robot)
+    with example(BY_ADDRESS, robot, images, tmp_path) as project:
+        assert project.variables["ROS_MASTER_URI"] == f"http://{robot.address}:11311"
+        works_both_ways(project, robot)
 
-        status = found.compose("exec", "-T", "operator", "rosproxy-operator", "docker", "status")
+        status = project.compose("exec", "-T", "operator", "rosproxy-operator", "docker", "status")
         assert status.count(f"{robot.address}:11311 leads to its proxy there") == 2
 
 
@@ -123,10 +123,10 @@ def test_example_behind_a_socket_proxy(
     named: Robot, images: dict[str, str], tmp_path: Path
 ) -> None:
     docker("network", "create", UPLINK)
-    with example(SOCKET_PROXY, named, images, tmp_path) as found:
-        works_both_ways(found, named)
+    with example(SOCKET_PROXY, named, images, tmp_path) as project:
+        works_both_ways(project, named)
 
-        operator = inspect(found.container("operator"))
+        operator = inspect(project.container("operator"))
         assert operator["Config"]["User"] == "10001:10001"
         assert not operator["Mounts"]
         forbidden = (
@@ -167,17 +167,17 @@ def test_example_with_ros_2(
 ) -> None:
     extra = tmp_path / "none.yaml"
     extra.write_text("services: {}\n")
-    found = Example(ROS2, {**variables, **images, "ROS2_IMAGE": ros2_image}, extra)
+    project = Example(ROS2, {**variables, **images, "ROS2_IMAGE": ros2_image}, extra)
     try:
-        with running(found):
+        with running(project):
             ear = lan.node("jazzy", "sub", "/chatter")
             lan.node("jazzy", "pub", "/command", "--word", "hello")
             wait_for_line(ear.log, "^got hello from inside ")
             wait_until(
-                lambda: found.compose("logs", "listener").count("hello ") >= 3, 30,
-                lambda: found.compose("logs", "listener"),
+                lambda: project.compose("logs", "listener").count("hello ") >= 3, 30,
+                lambda: project.compose("logs", "listener"),
             )  # fmt: skip
-            status = found.compose(*STATUS)
+            status = project.compose(*STATUS)
             assert "domain 0" in status
             assert status.count("1 participant") == 2
     finally:

@@ -16,9 +16,9 @@ def proxy(controller: Controller, net: Inside) -> Proxy:
     """The proxy of a container."""
     network = net.network()
     net.idle(network)
-    found = the_proxy()
-    wait_until(lambda: network in found.networks, 60, "the proxy has joined the network")
-    return found
+    own_proxy = the_proxy()
+    wait_until(lambda: network in own_proxy.networks, 60, "the proxy has joined the network")
+    return own_proxy
 
 
 @pytest.fixture(params=["sandbox", "proxy"])
@@ -29,7 +29,12 @@ def forged_image(request: pytest.FixtureRequest, proxy: Proxy, ros_image: str) -
     changes = [f'LABEL {key}="{value}"' for key, value in inspect(name)["Config"]["Labels"].items()]
     changes += ["USER 10001:10001", 'ENTRYPOINT ["sleep"]', 'CMD ["infinity"]']
     try:
-        docker("commit", *(word for each in changes for word in ("--change", each)), made, tag)
+        docker(
+            "commit",
+            *(argument for change in changes for argument in ("--change", change)),
+            made,
+            tag,
+        )
         yield tag
     finally:
         docker("rm", made)
@@ -53,10 +58,10 @@ def test_image_with_the_labels_of_a_proxy_is_told_and_left_alone(
     wait_until(lambda: proxy.running, 60, lambda: docker("ps", "--all"))
 
     assert (inspect(proxy.sandbox)["Id"], proxy.ports) == (before[1], ports)
-    found = inspect(forged.name)
-    assert found["State"]["Running"]
-    assert found["RestartCount"] == 0
-    assert set(found["NetworkSettings"]["Networks"]) == {alone}
+    inspection = inspect(forged.name)
+    assert inspection["State"]["Running"]
+    assert inspection["RestartCount"] == 0
+    assert set(inspection["NetworkSettings"]["Networks"]) == {alone}
     assert inspect(proxy.name)["HostConfig"]["NetworkMode"] == f"container:{before[1]}"
 
 
@@ -86,17 +91,17 @@ def test_label_takes_no_name_of_a_server_of_others(controller: Controller, net: 
     wait_until(lambda: node.name in controller.problems(), 60, controller.logs)
 
     assert "--allow-master api.example.com:443" in controller.problems()
-    assert not [one for one in proxies() if network in one.networks]
+    assert not [proxy for proxy in proxies() if network in proxy.networks]
     assert node.resolve("api.example.com") == set()
 
 
 def test_proxy_is_bounded_and_has_no_token_and_its_controller_knows_it_anyway(
     controller: Controller, net: Inside, proxy: Proxy
 ) -> None:
-    found, before = inspect(proxy.name), proxy.id
-    host = found["HostConfig"]
+    inspection, before = inspect(proxy.name), proxy.id
+    host = inspection["HostConfig"]
     assert (host["Memory"], host["PidsLimit"]) == (1024**3, 8192)
-    names = {word.partition("=")[0] for word in found["Config"]["Env"]}
+    names = {variable.partition("=")[0] for variable in inspection["Config"]["Env"]}
     assert "ROSPROXY_ADMIN_TOKEN_HASH" in names
     assert "ROSPROXY_ADMIN_TOKEN" not in names
 

@@ -22,19 +22,19 @@ def test_label_alone_is_heard_and_hears(
     net.node(network, library, "pub", "--topic", "/out", "--word", "inside")
     hearing = net.node(network, library, "sub", "--topic", "/in")
     outside = {"robot": named, "laptop": other_machine}
-    for word, machine in outside.items():
-        machine.node("mouth_" + word, library, "pub", "--topic", "/in", "--word", word)
-    ears = [machine.node("ear_" + word, library, "sub", "--topic", "/out")
-            for word, machine in outside.items()]  # fmt: skip
+    for name, machine in outside.items():
+        machine.node("mouth_" + name, library, "pub", "--topic", "/in", "--word", name)
+    ears = [machine.node("ear_" + name, library, "sub", "--topic", "/out")
+            for name, machine in outside.items()]  # fmt: skip
     try:
         for ear in ears:
             ear.wait_for("inside")
-        for word in outside:
-            hearing.log.wait_for(word)
+        for name in outside:
+            hearing.log.wait_for(name)
     finally:
-        for word, machine in outside.items():
-            machine.end("ear_" + word)
-            machine.end("mouth_" + word)
+        for name, machine in outside.items():
+            machine.end("ear_" + name)
+            machine.end("mouth_" + name)
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -86,14 +86,14 @@ def test_proxy_containers_have_no_rights(controller: Controller, net: Inside) ->
     proxy = the_proxy()
 
     for name in (proxy.name, proxy.sandbox):
-        found = inspect(name)
-        host, config = found["HostConfig"], found["Config"]
+        inspection = inspect(name)
+        host, config = inspection["HostConfig"], inspection["Config"]
         assert config["User"] == "10001:10001"
         assert host["ReadonlyRootfs"]
         assert host["CapDrop"] == ["ALL"]
         assert not host["CapAdd"]
         assert not host["Privileged"]
-        assert not found["Mounts"]
+        assert not inspection["Mounts"]
         assert any(option.startswith("no-new-privileges") for option in host["SecurityOpt"])
         assert host["RestartPolicy"]["Name"] == "always"
 
@@ -106,8 +106,8 @@ def test_publishes_what_is_asked_for_by_ipv4_only(controller: Controller, net: I
 
     published = inspect(proxy.sandbox)["NetworkSettings"]["Ports"]
 
-    bound = [(port, one["HostIp"], one["HostPort"])
-             for port, bindings in published.items() for one in bindings or ()]  # fmt: skip
+    bound = [(port, binding["HostIp"], binding["HostPort"])
+             for port, bindings in published.items() for binding in bindings or ()]  # fmt: skip
     assert sorted(bound) == [(f"{port}/tcp", "0.0.0.0", str(port)) for port in proxy.ports]
     assert len(bound) == 7
 
@@ -126,18 +126,20 @@ def test_bad_labels_leave_out_their_container_alone(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
     network = net.network()
-    bad = {net.idle(network, labels=(ENABLE, label)).name: word for label, word in BAD.items()}
+    bad = {
+        net.idle(network, labels=(ENABLE, label)).name: expected for label, expected in BAD.items()
+    }
     good = net.node(network, "roscpp", "pub", "--topic", "/out")
 
     wait_until(lambda: named.knows_proxied(good.node), 60, good.log.read)
 
     status = controller.status()
-    proxy_of = {one["name"]: one["proxy"] for one in status["containers"]}
+    proxy_of = {row["name"]: row["proxy"] for row in status["containers"]}
     assert proxy_of[good.name] == the_proxy().name
-    for name, word in bad.items():
+    for name, expected in bad.items():
         assert not proxy_of.get(name)
-        texts = [one["text"] for one in status["problems"] if name in one["subject"]]
-        assert any(word in text for text in texts), (name, texts)
+        texts = [problem["text"] for problem in status["problems"] if name in problem["subject"]]
+        assert any(expected in text for text in texts), (name, texts)
 
 
 def test_misspelt_label_is_named_with_the_right_one(controller: Controller, net: Inside) -> None:
@@ -145,8 +147,10 @@ def test_misspelt_label_is_named_with_the_right_one(controller: Controller, net:
 
     wait_until(lambda: "rosproxy.ports" in controller.logs(), 60, controller.logs)
 
-    problems = [one for one in controller.status()["problems"] if node.name in one["subject"]]
-    assert [one["fatal"] for one in problems] == [False]
+    problems = [
+        problem for problem in controller.status()["problems"] if node.name in problem["subject"]
+    ]
+    assert [problem["fatal"] for problem in problems] == [False]
     assert "rosproxy.port " in problems[0]["text"] or "'rosproxy.port'" in problems[0]["text"]
     assert the_proxy().running
 
@@ -161,7 +165,7 @@ def test_no_label_no_proxy(controller: Controller, net: Inside) -> None:
     wait_until(lambda: bool(proxy.networks), 60, "the proxy has joined a network")
 
     assert network not in proxy.networks
-    listed = {one["name"] for one in controller.status()["containers"]}
+    listed = {row["name"] for row in controller.status()["containers"]}
     assert on.name in listed
     assert plain.name not in listed
     assert off.name not in listed
@@ -194,7 +198,11 @@ def test_default_bridge_is_told_to_be_of_no_use(
 
     wait_until(lambda: node.name in controller.logs(), 60, controller.logs)
 
-    texts = [one["text"] for one in controller.status()["problems"] if node.name in one["subject"]]
+    texts = [
+        problem["text"]
+        for problem in controller.status()["problems"]
+        if node.name in problem["subject"]
+    ]
     assert any("network" in text for text in texts), texts
 
 

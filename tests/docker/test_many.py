@@ -16,17 +16,17 @@ def test_twenty_containers_at_once(
 ) -> None:
     start_controller("--ports", str(COUNT + 4))
     network = net.network()
-    words = [f"number{number}" for number in range(COUNT)]
+    texts = [f"number{number}" for number in range(COUNT)]
     ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
     nodes = [
         net.node(network, ("rospy", "roscpp")[number % 2], "pub", "--topic", "/out", "--rate", "2",
-                 "--word", word, verb="create")
-        for number, word in enumerate(words)
+                 "--word", text, verb="create")
+        for number, text in enumerate(texts)
     ]  # fmt: skip
     started = time.time()
     docker("start", *(node.name for node in nodes), seconds=120)
     try:
-        heard = [ear.wait_for(word, seconds=60) for word in words]
+        heard = [ear.wait_for(text, seconds=60) for text in texts]
 
         print(f"{COUNT} containers: the first heard after {min(heard) - started:.1f} s, "
               f"the last after {max(heard) - started:.1f} s")  # fmt: skip

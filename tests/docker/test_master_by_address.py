@@ -45,10 +45,10 @@ def test_the_label_alone_is_enough(
         caller = near.node(network, library, "call", "--service", "/there", "--count", "3")
         caller.log.wait_for("ask", verb="reply")
 
-        for one in (node, listener):
-            assert robot.knows_proxied(one.node)
-            assert inspect(one.name)["RestartCount"] == 0
-            redirected(one, network)
+        for container in (node, listener):
+            assert robot.knows_proxied(container.node)
+            assert inspect(container.name)["RestartCount"] == 0
+            redirected(container, network)
     finally:
         for name in ("ear", "mouth", "server", "caller"):
             robot.end(name)
@@ -61,7 +61,7 @@ def test_it_is_told_and_leaves_no_more_than_a_record(
     node = addressed_talker(near, network, robot)
     redirected(node, network)
 
-    (row,) = (one for one in controller.status()["containers"] if one["name"] == node.name)
+    (row,) = (row for row in controller.status()["containers"] if row["name"] == node.name)
     assert row["redirect"] == {"master": f"{robot.address}:11311", "in_place": True}
     assert f"{robot.address}:11311 leads to its proxy there" in controller.command("status")
     assert "goes around" not in controller.problems()
@@ -84,31 +84,31 @@ def test_a_network_in_common_that_is_not_the_way_outwards(
     controller: Controller, near: Inside, robot: Robot
 ) -> None:
     """Nodes' connections are to come from the address by which the proxy knows them."""
-    one, other = sorted((near.network(), near.network()))
+    first, second = sorted((near.network(), near.network()))
     node = near.node(
-        one, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create",
-        labels=(ENABLE, f"rosproxy.network={other}"),
+        first, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create",
+        labels=(ENABLE, f"rosproxy.network={second}"),
     )  # fmt: skip
-    docker("network", "connect", other, node.name)
+    docker("network", "connect", second, node.name)
     docker("start", node.name)
 
     wait_until(lambda: robot.knows_proxied(node.node), 60, node.log.read)
 
-    assert the_proxy().networks == {other}
-    redirected(node, other)
+    assert the_proxy().networks == {second}
+    redirected(node, second)
 
 
 def test_networks_joined_later_and_left(controller: Controller, near: Inside, robot: Robot) -> None:
-    one, other = near.network(), near.network()
-    node = addressed_talker(near, one, robot)
+    first, second = near.network(), near.network()
+    node = addressed_talker(near, first, robot)
     ear = robot.node("ear", "roscpp", "sub", "--topic", "/out")
     try:
         ear.wait_for("inside")
-        docker("network", "connect", other, node.name)
-        wait_until(lambda: the_proxy().networks == {one, other}, 60, "both are joined")
-        docker("network", "disconnect", one, node.name)
+        docker("network", "connect", second, node.name)
+        wait_until(lambda: the_proxy().networks == {first, second}, 60, "both are joined")
+        docker("network", "disconnect", first, node.name)
 
-        redirected(node, other)
+        redirected(node, second)
         ear.wait_for("inside", since=time.time())
     finally:
         robot.end("ear")

@@ -40,10 +40,10 @@ def test_two_masters_on_one_network(
     try:
         for name, ear in ears.items():
             ear.wait_for(name)
-            assert {got.word for got in ear.got()} == {name}
+            assert {got.text for got in ear.got()} == {name}
             assert robots[name].knows_proxied(nodes[name].node)
-        one, other = proxies()
-        assert not set(one.ports) & set(other.ports)
+        first, second = proxies()
+        assert not set(first.ports) & set(second.ports)
     finally:
         for robot in robots.values():
             robot.end("ear")

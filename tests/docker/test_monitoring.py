@@ -41,8 +41,8 @@ def cell(ros_image: str, patrol: Robot) -> Iterator[Inside]:
 
 @pytest.fixture
 def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
-    with running_prometheus(tmp_path, guides_configuration(tmp_path, OPERATOR)) as found:
-        yield found
+    with running_prometheus(tmp_path, guides_configuration(tmp_path, OPERATOR)) as server:
+        yield server
 
 
 @pytest.fixture
@@ -52,8 +52,8 @@ def operator(start_controller: Callable[..., Controller], patrol: Robot) -> Cont
 
 
 def ros1_proxy() -> Proxy:
-    (found,) = {one.name for one in proxies()} - {one.name for one in ros2_proxies()}
-    return Proxy(found)
+    (name,) = {proxy.name for proxy in proxies()} - {proxy.name for proxy in ros2_proxies()}
+    return Proxy(name)
 
 
 def of_kubernetes(query: str) -> bool:
@@ -61,10 +61,12 @@ def of_kubernetes(query: str) -> bool:
     return bool(metrics(query) & (families(ClusterMetrics()) - families(DockerMetrics())))
 
 
-def families(found: CommonMetrics) -> set[str]:
+def families(metrics: CommonMetrics) -> set[str]:
     """The names of its metrics in queries."""
-    described = found.registry.collect()
-    return {f"{one.name}_total" if one.type == "counter" else one.name for one in described}
+    described = metrics.registry.collect()
+    return {
+        f"{family.name}_total" if family.type == "counter" else family.name for family in described
+    }
 
 
 def test_dashboard_and_alerts(
@@ -83,7 +85,7 @@ def test_dashboard_and_alerts(
         start_node(box, "victim")
         ear.log.wait_for("inside")
         proxy = ros1_proxy()
-        everybody = {("rosproxy", one.name) for one in (proxy, *ros2_proxies())}
+        everybody = {("rosproxy", target.name) for target in (proxy, *ros2_proxies())}
         everybody |= {("rosproxy-operator", "rosproxy-operator")}
         wait_until(lambda: prometheus.answering() == everybody, 30, str(everybody))
         wait_until(
@@ -94,8 +96,8 @@ def test_dashboard_and_alerts(
         wait_until(lambda: prometheus.firing() == [], 30, lambda: str(prometheus.firing()))
 
         box.run("sh", "-c", "kill -KILL $(cat /tmp/victim.pid)")
-        found = prometheus.wait_for_alert("RosproxyNodeDown", instance=proxy.name, node="/victim")
-        assert f"The ROS node /victim behind {proxy.name}" in found["annotations"]["summary"]
+        alert = prometheus.wait_for_alert("RosproxyNodeDown", instance=proxy.name, node="/victim")
+        assert f"The ROS node /victim behind {proxy.name}" in alert["annotations"]["summary"]
 
         # The port of the dead one goes to one of them, and the last gets none.
         for number in range(NODES + 2):
@@ -104,8 +106,8 @@ def test_dashboard_and_alerts(
         prometheus.wait_for_alert("RosproxyNodesRefused", instance=proxy.name)
 
         docker("kill", patrol.container)
-        found = prometheus.wait_for_alert("RosproxyMasterDown", instance=proxy.name)
-        assert f"docker exec {proxy.name} rosproxy doctor" in found["annotations"]["description"]
+        alert = prometheus.wait_for_alert("RosproxyMasterDown", instance=proxy.name)
+        assert f"docker exec {proxy.name} rosproxy doctor" in alert["annotations"]["description"]
 
         operator.kill()
         docker("kill", proxy.name)
@@ -113,7 +115,7 @@ def test_dashboard_and_alerts(
         prometheus.wait_for_alert("RosproxyDown", instance=proxy.name)
 
     asked = [(title, query) for title, query in expressions() if not of_kubernetes(query)]
-    assert not [each for each in asked if not prometheus.series(each[1])]
+    assert not [panel for panel in asked if not prometheus.series(panel[1])]
 
 
 def start_node(box: Container, name: str) -> None:

@@ -14,9 +14,9 @@ from tests.docker.robot import Robot
 def everything() -> object:
     """What a plan must leave as it is."""
     containers = docker("ps", "--all", "--no-trunc", "--format", "{{json .}}").splitlines()
-    kept = ("ID", "Names", "Networks", "State", "Labels")
-    found = [{key: one[key] for key in kept} for one in map(json.loads, containers)]
-    return found, docker("network", "ls", "--no-trunc", "--format", "{{.ID}} {{.Name}}")
+    columns = ("ID", "Names", "Networks", "State", "Labels")
+    rows = [{key: row[key] for key in columns} for row in map(json.loads, containers)]
+    return rows, docker("network", "ls", "--no-trunc", "--format", "{{.ID}} {{.Name}}")
 
 
 @pytest.fixture

@@ -57,9 +57,13 @@ def test_updated_image_replaces_the_proxy(
 
 def secret(proxy: Proxy) -> str:
     """The hash of its token; nobody but the controller has the token itself."""
-    words = [str(word) for word in inspect(proxy.name)["Config"]["Env"]]
-    assert not [word for word in words if word.startswith("ROSPROXY_ADMIN_TOKEN=")]
-    return next(word for word in words if word.startswith("ROSPROXY_ADMIN_TOKEN_HASH="))
+    environment = [str(variable) for variable in inspect(proxy.name)["Config"]["Env"]]
+    assert not [
+        variable for variable in environment if variable.startswith("ROSPROXY_ADMIN_TOKEN=")
+    ]
+    return next(
+        variable for variable in environment if variable.startswith("ROSPROXY_ADMIN_TOKEN_HASH=")
+    )
 
 
 def test_missing_image_is_told_with_what_to_do(
@@ -96,5 +100,5 @@ def test_data_plane_of_the_controller_is_for_those_who_ask_for_none(
 
 
 def variables(proxy: Proxy) -> list[str]:
-    found: list[str] = inspect(proxy.name, check=False).get("Config", {}).get("Env", [])
-    return found
+    environment: list[str] = inspect(proxy.name, check=False).get("Config", {}).get("Env", [])
+    return environment

@@ -18,11 +18,11 @@ FIRST = WINDOW[0]
 
 def occupy(port: int, *, listen: bool) -> socket.socket:
     """Hold a port of this host; one that is only bound is in no list of listening sockets."""
-    found = socket.socket()
-    found.bind(("0.0.0.0", port))
+    holder = socket.socket()
+    holder.bind(("0.0.0.0", port))
     if listen:
-        found.listen()
-    return found
+        holder.listen()
+    return holder
 
 
 @pytest.fixture
@@ -90,7 +90,9 @@ def test_range_grows_in_place(
         changed = time.time()
 
         wait_until(
-            lambda: [len(one) for one in published_ranges()] == [12], 60, "the range has grown"
+            lambda: [len(port_range) for port_range in published_ranges()] == [12],
+            60,
+            "the range has grown",
         )
 
         flow.wait(since=time.time())
@@ -118,7 +120,9 @@ def test_range_taken_by_another_while_the_proxy_was_down(
     controller.start()
 
     wait_until(
-        lambda: [before[1] in one for one in published_ranges()] == [False], 40, controller.logs
+        lambda: [before[1] in port_range for port_range in published_ranges()] == [False],
+        40,
+        controller.logs,
     )
     the_proxy(40)
     wait_until(lambda: "HAS LEFT ITS PORTS" in controller.logs(), 40, controller.logs)

@@ -29,8 +29,8 @@ def process(
     try:
         yield start
     finally:
-        for one in made:
-            one.stop()
+        for started in made:
+            started.stop()
         remove_proxies()
 
 
@@ -46,9 +46,9 @@ def test_nodes_that_were_quicker_are_adopted(
     network = near.network()
     node = near.node(network, library, "pub", "--topic", "/out", "--word", "inside")
     server = near.node(network, library, "serve", "--service", "/ask")
-    for one in (node, server):
-        wait_until(lambda: robot.uri(one.node) != "", 60, one.log.read)  # noqa: B023
-        assert not robot.knows_proxied(one.node)
+    for container in (node, server):
+        wait_until(lambda: robot.uri(container.node) != "", 60, container.log.read)  # noqa: B023
+        assert not robot.knows_proxied(container.node)
     ear = robot.node("ear", library, "sub", "--topic", "/out")
     try:
         process()
@@ -57,10 +57,10 @@ def test_nodes_that_were_quicker_are_adopted(
         robot.node("caller", library, "call", "--service", "/ask", "--count", "3").wait_for(
             "ask", verb="reply"
         )
-        for one in (node, server):
-            assert robot.knows_proxied(one.node)
-            assert inspect(one.name)["RestartCount"] == 0
-            assert "shutdown" not in one.log.read()
+        for container in (node, server):
+            assert robot.knows_proxied(container.node)
+            assert inspect(container.name)["RestartCount"] == 0
+            assert "shutdown" not in container.log.read()
     finally:
         for name in ("ear", "caller"):
             robot.end(name)
@@ -75,14 +75,14 @@ def test_after_whatever_is_lost_it_is_there_again(
     ear = robot.node("ear", "rospy", "sub", "--topic", "/out")
     try:
         ear.wait_for("inside")
-        for what in (
+        for command in (
             ("restart", "--time", "0", node.name),
             ("kill", the_proxy().name),
             ("rm", "--force", the_proxy().name),
             ("rm", "--force", the_proxy().name, the_proxy().sandbox),
         ):
             since = time.time()
-            docker(*what, seconds=120)
+            docker(*command, seconds=120)
             ear.wait_for("inside", since=since)
             redirected(node, network)
         running.kill()

@@ -41,20 +41,21 @@ def _nodes_end(lan: Outside) -> Iterator[None]:
     lan.end()
 
 
-@pytest.mark.parametrize(("here", "there"), PAIRS)
-def test_topics(here: str, there: str, lan: Outside, inside2: Inside2) -> None:
-    ear = lan.node(there, "sub", "/out")
-    lan.node(there, "pub", "/back", "--word", "outside")
+@pytest.mark.parametrize(("vendor_inside", "vendor_outside"), PAIRS)
+def test_topics(vendor_inside: str, vendor_outside: str, lan: Outside, inside2: Inside2) -> None:
+    ear = lan.node(vendor_outside, "sub", "/out")
+    lan.node(vendor_outside, "pub", "/back", "--word", "outside")
     network = inside2.made.network()
     started = time.time()
 
-    inside2.node(network, here, "pub", "/out", "--word", "inside")
-    listener = inside2.node(network, here, "sub", "/back")
+    inside2.node(network, vendor_inside, "pub", "/out", "--word", "inside")
+    listener = inside2.node(network, vendor_inside, "sub", "/back")
 
     outward = ear.log.wait_for("inside")
     inward = listener.log.wait_for("outside")
-    print(f"{here} inside, {there} outside: the first message outside {outward - started:.1f} s "
-          f"after docker run, inside {inward - started:.1f} s")  # fmt: skip
+    print(f"{vendor_inside} inside, {vendor_outside} outside: the first message outside "
+          f"{outward - started:.1f} s after docker run, inside "
+          f"{inward - started:.1f} s")  # fmt: skip
 
 
 @pytest.mark.parametrize("vendor", ["jazzy", "cyclone"])
@@ -64,14 +65,14 @@ def test_one_more_where_a_proxy_is(vendor: str, lan: Outside, inside2: Inside2) 
     inside2.node(network, "jazzy", "pub", "/out", "--word", "first")
     ear.log.wait_for("first")
 
-    for place, word in ((network, "near"), (inside2.made.network(), "far")):
+    for place, text in ((network, "near"), (inside2.made.network(), "far")):
         started = time.time()
-        node = inside2.node(place, vendor, "pub", "/out", "--word", word)
-        heard = ear.log.wait_for(word)
+        node = inside2.node(place, vendor, "pub", "/out", "--word", text)
+        heard = ear.log.wait_for(text)
         sent = datetime.fromisoformat(
             docker("logs", "--timestamps", node.name).split()[0]
         ).timestamp()
-        print(f"{vendor}, {word}: outside hears it {heard - started:.1f} s after docker run, "
+        print(f"{vendor}, {text}: outside hears it {heard - started:.1f} s after docker run, "
               f"{heard - sent:.1f} s after it has sent its first message")  # fmt: skip
     assert len(ros2_proxies()) == 1
 
@@ -182,10 +183,10 @@ def test_a_container_with_both_versions_has_two_proxies(
         network, uri=named.master_uri, labels=(ENABLE, "rosproxy.ros=1,2"),
     )  # fmt: skip
 
-    wait_until(lambda: [one.running for one in proxies()] == [True, True], 60, controller.logs)
+    wait_until(lambda: [proxy.running for proxy in proxies()] == [True, True], 60, controller.logs)
 
-    one, other = (set(proxy.ports) for proxy in proxies())
-    assert not one & other
+    first, second = (set(proxy.ports) for proxy in proxies())
+    assert not first & second
     rows = [row for row in controller.status()["containers"] if row["name"] == both.name]
     assert {row["ros"] for row in rows} == {"1", "2"}
     assert "domain 0" in controller.command("status", "--wait", "60")
@@ -197,10 +198,10 @@ def test_the_ear_has_the_hosts_network_and_no_other_right(inside2: Inside2) -> N
     proxy = the_proxy()
     wait_until(lambda: bool(inspect(proxy.ear, check=False)), 30, "the ear is there")
 
-    found = inspect(proxy.ear)
+    inspection = inspect(proxy.ear)
 
-    assert found["Config"]["User"] == "10001:10001"
-    host = found["HostConfig"]
+    assert inspection["Config"]["User"] == "10001:10001"
+    host = inspection["HostConfig"]
     assert (host["NetworkMode"], host["ReadonlyRootfs"], host["Privileged"]) == (
         "host",
         True,

@@ -33,8 +33,8 @@ def engine(
 @pytest.fixture(scope="module")
 def neighbour(ros2_image: str, engine: PrivateEngine) -> Iterator[Outside]:
     """A machine on the LAN, which outlives the engine: it runs on this machine's."""
-    with machine_on_lan(ros2_image, "neighbour", NUMBER, engine.namespace) as found:
-        yield found
+    with machine_on_lan(ros2_image, "neighbour", NUMBER, engine.namespace) as outside:
+        yield outside
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_everything_comes_back_with_the_engine(
     Their addresses may be others.
     """
     proxy = the_proxy()
-    held = proxy.ports
+    port_range = proxy.ports
 
     engine.end(how)
     engine.start(*then)
@@ -75,10 +75,10 @@ def test_everything_comes_back_with_the_engine(
 
     wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
     flow.wait(since=time.time(), seconds=90)
-    first = [min(got.at for got in log.got(word) if got.at > began) for log, word in flow.heard]
+    first = [min(got.at for got in log.got(text) if got.at > began) for log, text in flow.heard]
     print(f"{how.name}: heard outside {first[0] - began:.1f} s, inside {first[1] - began:.1f} s "
           "after the engine was there again")  # fmt: skip
-    assert proxy.ports == held
+    assert proxy.ports == port_range
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])

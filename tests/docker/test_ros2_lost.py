@@ -8,7 +8,7 @@ import pytest
 from tests.docker.controller import Controller, Proxy, the_proxy
 from tests.docker.engine import docker, wait_until
 from tests.docker.ros2 import OPTIONS as ROS2_OPTIONS
-from tests.docker.ros2 import Flow, Inside2, Outside, all_run, domain, kept, ports, runs
+from tests.docker.ros2 import Flow, Inside2, Outside, all_run, domain, ports, ports_are_kept, runs
 from tests.docker.traffic import crash
 
 OPTIONS = ROS2_OPTIONS
@@ -44,8 +44,8 @@ LOSSES: dict[str, Callable[[Proxy], object]] = {
 def test_what_is_lost_comes_back(how: str, flow: Flow) -> None:
     """On the same ports, which participants keep for their proxy."""
     proxy = the_proxy()
-    wait_until(lambda: kept(proxy), 30, lambda: str(domain(proxy).inside))
-    before, held, former = ports(proxy), proxy.ports, runs(proxy)
+    wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
+    before, port_range, former = ports(proxy), proxy.ports, runs(proxy)
     lost = time.time()
 
     LOSSES[how](proxy)
@@ -56,7 +56,7 @@ def test_what_is_lost_comes_back(how: str, flow: Flow) -> None:
     wait_until(lambda: ports(proxy) == before, 60, lambda: f"{ports(proxy)} is not {before}")
     flow.wait(since=time.time())
     print(f"{how}: all run again after {took:.1f} s; {flow.gaps(lost)}")
-    assert proxy.ports == held
+    assert proxy.ports == port_range
 
 
 def test_an_outside_node_that_comes_after_the_ear_was_lost_is_heard(

@@ -16,8 +16,8 @@ from tests.docker.ros2 import (
     Outside,
     all_run,
     domain,
-    kept,
     ports,
+    ports_are_kept,
 )
 
 
@@ -28,8 +28,8 @@ def test_udp_ports_that_are_taken_are_not_chosen(
     network = inside2.made.network()
     first = WINDOW[0]
     web = inside2.made.idle(network, labels=(), options=("--publish", f"{first + 3}:80/udp"))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
-        held.bind(("0.0.0.0", first + 30))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound_socket:
+        bound_socket.bind(("0.0.0.0", first + 30))
         start_controller(*OPTIONS)
         inside2.node(network, "jazzy", "pub", "/out")
 
@@ -51,7 +51,7 @@ def test_on_another_range_participants_meet_anew(
         flow = Flow(lan, inside2)
         proxy = the_proxy()
         before = proxy.ports
-        wait_until(lambda: kept(proxy), 30, lambda: str(domain(proxy).inside))
+        wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
         time.sleep(6)  # the operator looks every five seconds
         pause(controller.container)
         lost = time.time()
@@ -62,7 +62,9 @@ def test_on_another_range_participants_meet_anew(
         docker("unpause", controller.container)
 
         wait_until(
-            lambda: [before[4] in one for one in published_ranges()] == [False], 60, controller.logs
+            lambda: [before[4] in port_range for port_range in published_ranges()] == [False],
+            60,
+            controller.logs,
         )
         wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
         flow.wait(since=time.time())
@@ -88,7 +90,9 @@ def test_range_taken_by_another_while_neither_proxy_nor_operator_was_there(
         controller.start()
 
         wait_until(
-            lambda: [before[4] in one for one in published_ranges()] == [False], 60, controller.logs
+            lambda: [before[4] in port_range for port_range in published_ranges()] == [False],
+            60,
+            controller.logs,
         )
         wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
         lan.end()
@@ -106,17 +110,23 @@ def test_range_grows_in_place(
     try:
         flow = Flow(lan, inside2)
         proxy = the_proxy()
-        wait_until(lambda: kept(proxy), 30, lambda: str(domain(proxy).inside))
-        before, held = proxy.ports, ports(proxy)
+        wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
+        before, participant_ports = proxy.ports, ports(proxy)
         changed = time.time()
 
         inside2.made.idle(inside2.made.network(), labels=(ENABLE, "rosproxy.ports=40"))
 
         wait_until(
-            lambda: [len(one) for one in published_ranges()] == [40], 60, "the range has grown"
+            lambda: [len(port_range) for port_range in published_ranges()] == [40],
+            60,
+            "the range has grown",
         )
         wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
-        wait_until(lambda: ports(proxy) == held, 60, lambda: f"{ports(proxy)} is not {held}")
+        wait_until(
+            lambda: ports(proxy) == participant_ports,
+            60,
+            lambda: f"{ports(proxy)} is not {participant_ports}",
+        )
         flow.wait(since=time.time())
         print(f"range extended: {flow.gaps(changed)}")
         assert proxy.ports[0] == before[0]
@@ -147,8 +157,8 @@ def test_a_new_image_replaces_proxy_and_ear(
     try:
         flow = Flow(lan, inside2)
         proxy = the_proxy()
-        wait_until(lambda: kept(proxy), 30, lambda: str(domain(proxy).inside))
-        before, held = ids(proxy), ports(proxy)
+        wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
+        before, participant_ports = ids(proxy), ports(proxy)
         changed = time.time()
 
         update(moving_image)
@@ -156,7 +166,11 @@ def test_a_new_image_replaces_proxy_and_ear(
         wait_until(
             lambda: not ids(proxy) & {*before, ""}, 60, lambda: docker("ps", "--all")
         )  # fmt: skip
-        wait_until(lambda: ports(proxy) == held, 60, lambda: f"{ports(proxy)} is not {held}")
+        wait_until(
+            lambda: ports(proxy) == participant_ports,
+            60,
+            lambda: f"{ports(proxy)} is not {participant_ports}",
+        )
         flow.wait(since=time.time())
         print(f"image updated: {flow.gaps(changed)}")
     finally:
@@ -176,7 +190,9 @@ def test_on_an_internal_network_the_proxy_is_the_way_out(
         flow = Flow(lan, inside2, inside2.made.network("--internal"))
         proxy = the_proxy()
         assert "ROSPROXY_DIRECTION=both" in inspect(proxy.name)["Config"]["Env"]
-        assert all(one.leases for one in domain(proxy).outside if one.vendor == "Fast DDS")
+        outside = [peer for peer in domain(proxy).outside if peer.vendor == "Fast DDS"]
+        assert outside
+        assert all(participant.leases for participant in outside)
         docker("kill", proxy.name)
         flow.wait(since=time.time())
     finally:
@@ -196,6 +212,6 @@ def test_rules_are_kept_from_the_start(
         for topic in ("/secret", "/hidden", "/open"):
             inside2.node(network, "jazzy", "pub", topic, labels=labels)
         heard.log.wait_for("hello", count=30)
-        assert not any("got" in one.log.read() for one in denied)
+        assert not any("got" in node.log.read() for node in denied)
     finally:
         lan.end()

@@ -17,7 +17,7 @@ from tests.docker.robot import Robot
 
 
 @pytest.fixture
-def known(named: Robot) -> Iterator[tuple[str, ...]]:
+def dns_options(named: Robot) -> Iterator[tuple[str, ...]]:
     """Options for containers that can resolve the robot's name."""
     with name_server(named.host_address, {named.name: named.address}):
         yield ("--dns", named.host_address)
@@ -32,14 +32,16 @@ def is_stray(robot: Robot, node: Container) -> bool:
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_nodes_that_were_there_first_are_adopted(
     library: str, start_controller: Callable[..., Controller], net: Inside, named: Robot,
-    known: tuple[str, ...],
+    dns_options: tuple[str, ...],
 ) -> None:  # fmt: skip
     network = net.network()
-    node = net.node(network, library, "pub", "--topic", "/out", "--word", "inside", options=known)
-    server = net.node(network, library, "serve", "--service", "/ask", options=known)
-    listener = net.node(network, library, "sub", "--topic", "/in", options=known)
-    for one in (node, server, listener):
-        wait_until(lambda: is_stray(named, one), 60, one.log.read)  # noqa: B023
+    node = net.node(
+        network, library, "pub", "--topic", "/out", "--word", "inside", options=dns_options
+    )
+    server = net.node(network, library, "serve", "--service", "/ask", options=dns_options)
+    listener = net.node(network, library, "sub", "--topic", "/in", options=dns_options)
+    for container in (node, server, listener):
+        wait_until(lambda: is_stray(named, container), 60, container.log.read)  # noqa: B023
     ear = named.node("ear", library, "sub", "--topic", "/out")
     named.node("mouth", library, "pub", "--topic", "/in", "--word", "robot")
     try:
@@ -54,10 +56,10 @@ def test_nodes_that_were_there_first_are_adopted(
         caller = named.node("caller", library, "call", "--service", "/ask", "--count", "3")
         caller.wait_for("ask", verb="reply")
         listener.log.wait_for("robot", since=time.time())
-        for one in (node, server, listener):
-            assert named.knows_proxied(one.node)
-            assert inspect(one.name)["RestartCount"] == 0
-            assert "shutdown" not in one.log.read()
+        for container in (node, server, listener):
+            assert named.knows_proxied(container.node)
+            assert inspect(container.name)["RestartCount"] == 0
+            assert "shutdown" not in container.log.read()
         docker("stop", node.name)
         wait_until(lambda: not named.uri(node.node), 5, "it is gone from the master")
     finally:
@@ -68,18 +70,20 @@ def test_nodes_that_were_there_first_are_adopted(
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_node_that_starts_faster_than_its_proxy(
     library: str, start_controller: Callable[..., Controller], net: Inside, named: Robot,
-    known: tuple[str, ...],
+    dns_options: tuple[str, ...],
 ) -> None:  # fmt: skip
     start_controller()
     network = net.network()
     ear = named.node("ear", library, "sub", "--topic", "/out")
     try:
-        for word in ("first", "second", "third"):
+        for text in ("first", "second", "third"):
             began = time.time()
-            there = bool(proxies())
-            net.node(network, library, "pub", "--topic", "/out", "--word", word, options=known)
-            heard = ear.wait_for(word) - began
+            has_proxy = bool(proxies())
+            net.node(
+                network, library, "pub", "--topic", "/out", "--word", text, options=dns_options
+            )
+            heard = ear.wait_for(text) - began
             print(f"{library}: heard {heard:.1f} s after docker run, "
-                  f"{'with' if there else 'without'} a proxy")  # fmt: skip
+                  f"{'with' if has_proxy else 'without'} a proxy")  # fmt: skip
     finally:
         named.end("ear")

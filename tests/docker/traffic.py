@@ -71,7 +71,7 @@ def traffic(
     net: Inside, robot: Robot, network: str, library: str, labels: tuple[str, ...] = (ENABLE,)
 ) -> Iterator[Traffic]:
     """Twenty messages and five calls a second, which cost a processor more."""
-    out, back, service = (f"/{unique(what).replace('-', '_')}" for what in ("out", "in", "serve"))
+    out, back, service = (f"/{unique(kind).replace('-', '_')}" for kind in ("out", "in", "serve"))
     mark = out.rsplit("_", 1)[1]
     talker = net.node(network, library, "pub", "--topic", out, "--word", "inside",
                       labels=labels)  # fmt: skip
@@ -82,10 +82,10 @@ def traffic(
     robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
     called = robot.node(names[2], library, "call", "--service", service, "--rate", "5",
                         "--count", "100000")  # fmt: skip
-    found = Traffic(talker, listener, server, outward, listener.log, called, ("inside", "outside"))
+    flow = Traffic(talker, listener, server, outward, listener.log, called, ("inside", "outside"))
     try:
-        found.wait()
-        yield found
+        flow.wait()
+        yield flow
     finally:
         for name in names:
             robot.end(name, "KILL")

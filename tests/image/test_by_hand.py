@@ -71,8 +71,8 @@ def nodes(robot: Robot) -> dict[str, str]:
 
 
 def inside_ports(robot: Robot) -> set[int]:
-    found = (re.match(rf"http://{HOST_ADDRESS}:(\d+)", uri) for uri in nodes(robot).values())
-    return {int(match[1]) for match in found if match}
+    matches = (re.match(rf"http://{HOST_ADDRESS}:(\d+)", uri) for uri in nodes(robot).values())
+    return {int(match[1]) for match in matches if match}
 
 
 def test_robot_has_no_way_around_the_proxy(robot: Robot, inside: Inside) -> None:
@@ -148,8 +148,8 @@ def counted(inside: Inside) -> int:
     def status() -> dict[str, Any]:
         text = docker("exec", inside.container("rosproxy"), "rosproxy", "status", "--json",
                       check=False)  # fmt: skip
-        found: dict[str, Any] = json.loads(text)
-        return found
+        document: dict[str, Any] = json.loads(text)
+        return document
 
     def sent() -> int:
         return sum(int(node["data_plane"]["sent"]) for node in status()["nodes"])

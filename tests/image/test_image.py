@@ -103,5 +103,5 @@ def test_ships_no_installer(proxy_image: str) -> None:
 @pytest.mark.parametrize("image", ["proxy_image", "controller_image"])
 def test_no_program_changes_its_user_or_group(image: str, request: pytest.FixtureRequest) -> None:
     search = ("--user", "0:0", "--entrypoint", "find", request.getfixturevalue(image), "/")
-    found = docker("run", "--rm", *search, "-xdev", "-perm", "/6000", "-type", "f")
-    assert found.split() == []
+    listing = docker("run", "--rm", *search, "-xdev", "-perm", "/6000", "-type", "f")
+    assert listing.split() == []

@@ -11,8 +11,8 @@ async def post(proxy: Proxy, path: str, body: bytes | str = b"", *headers: str) 
     """The response to a POST; ``headers`` are whole lines."""
     data = body.encode() if isinstance(body, str) else body
     lines = [f"POST {path} HTTP/1.1", "Host: x", *headers, f"Content-Length: {len(data)}"]
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
-    return await exchange(where, "\r\n".join([*lines, "", ""]).encode() + data)
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    return await exchange(address, "\r\n".join([*lines, "", ""]).encode() + data)
 
 
 async def tell(proxy: Proxy, path: str, **fields: Any) -> dict[str, Any]:

@@ -94,10 +94,12 @@ class FakeTools(Tools):
         if self.table is None:
             raise ToolError("nft: No such file or directory")
         objects = []
-        for name, held in self.table.items():
+        for name, content in self.table.items():
             kind = "map" if name in PAIRS else "set"
             counts = name in ("sent", "received")
-            elements = [_counter(mark, self.counted[name]) for mark in held] if counts else held
+            elements = (
+                [_counter(mark, self.counted[name]) for mark in content] if counts else content
+            )
             objects.append({kind: {"name": name, "table": self.name, "elem": elements}})
         return json.dumps({"nftables": objects})
 

@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from examples.demo.fake_http import Where, call, where
+from examples.demo.fake_http import Address, call, host_and_port
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import Header
 from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
@@ -28,7 +28,7 @@ PATIENCE = 30.0
 """Seconds after which something awaited counts as missing, on however busy a machine."""
 
 
-async def until(condition: Callable[[], Any], what: str, within: float = PATIENCE) -> None:
+async def until(condition: Callable[[], Any], expectation: str, within: float = PATIENCE) -> None:
     """Wait until ``condition`` holds; it may be a coroutine function."""
     clock = asyncio.get_running_loop().time
     end = clock() + within
@@ -36,7 +36,7 @@ async def until(condition: Callable[[], Any], what: str, within: float = PATIENC
         result = condition()
         if await result if isinstance(result, Awaitable) else result:
             return
-        assert clock() < end, f"waited {within:g} s in vain: {what}"
+        assert clock() < end, f"waited {within:g} s in vain: {expectation}"
         await asyncio.sleep(0.01)
 
 
@@ -46,7 +46,7 @@ async def looks(master: FakeMaster, count: int = 3) -> None:
     await until(lambda: len(master.named("getPid")) >= so_far + count, "the proxy looks")
 
 
-async def refuses(address: Where, source: str = OUTSIDE) -> bool:
+async def refuses(address: Address, source: str = OUTSIDE) -> bool:
     """Whether nobody listens there."""
     try:
         async with connect(address, source):
@@ -57,7 +57,7 @@ async def refuses(address: Where, source: str = OUTSIDE) -> bool:
         return True
 
 
-async def knock(address: Where, data: bytes, source: str = OUTSIDE) -> str:
+async def knock(address: Address, data: bytes, source: str = OUTSIDE) -> str:
     """What becomes of a connection and of what is sent on it, which is waited for.
 
     ``refused``, ``reset``, ``closed`` or ``answered``. That there is *no* answer is shown by
@@ -105,8 +105,8 @@ class Wire:
     @property
     def sock(self) -> socket.socket:
         """Its socket, for options."""
-        found: socket.socket = self.writer.get_extra_info("socket")
-        return found
+        sock: socket.socket = self.writer.get_extra_info("socket")
+        return sock
 
     async def send(self, data: bytes, slices: int = 0) -> None:
         """Send, in slices of so many bytes, each in a segment of its own."""
@@ -184,7 +184,7 @@ def _parse_head(raw: bytes) -> Reply:
 
 
 @asynccontextmanager
-async def connect(address: Where, source: str = OUTSIDE) -> AsyncIterator[Wire]:
+async def connect(address: Address, source: str = OUTSIDE) -> AsyncIterator[Wire]:
     """A connection from an address of this machine; closed at the end."""
     local = None if ":" in address[0] else (source, 0)
     async with asyncio.timeout(PATIENCE):
@@ -210,7 +210,9 @@ def post(body: bytes, *headers: str, path: str = "/", version: str = "1.1") -> b
     return "\r\n".join([*lines, "", ""]).encode() + body
 
 
-async def exchange(address: Where, request: bytes, source: str = OUTSIDE, slices: int = 0) -> Reply:
+async def exchange(
+    address: Address, request: bytes, source: str = OUTSIDE, slices: int = 0
+) -> Reply:
     """The response to one raw request."""
     async with connect(address, source) as wire:
         await wire.send(request, slices)
@@ -218,7 +220,7 @@ async def exchange(address: Where, request: bytes, source: str = OUTSIDE, slices
 
 
 async def rpc(
-    address: Where | str, method: str, *params: Any, source: str = OUTSIDE, host: str = ""
+    address: Address | str, method: str, *params: Any, source: str = OUTSIDE, host: str = ""
 ) -> Any:
     """The value of an XML-RPC call. Raises Fault, OSError, EOFError.
 
@@ -243,9 +245,9 @@ async def read_header(wire: Wire) -> Header:
     return decode_header(await wire.exactly(size))
 
 
-async def greet(address: Where | str, header: bytes) -> Header:
+async def greet(address: Address | str, header: bytes) -> Header:
     """What a TCPROS header is answered with."""
-    target = where(address) if isinstance(address, str) else address
+    target = host_and_port(address) if isinstance(address, str) else address
     async with connect(target) as wire:
         await wire.send(header)
         return await read_header(wire)

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-from examples.demo.fake_http import Where
+from examples.demo.fake_http import Address
 from examples.demo.proxy_process import clean_environment
 from tests.integration.net import PROXY
 from tests.integration.proxy import BY_THE_WALL, options_for
@@ -18,11 +18,11 @@ from tests.integration.proxy import BY_THE_WALL, options_for
 def command_line(options: dict[str, Any]) -> list[str]:
     """The command that runs a proxy with these options; True stands for a flag."""
     command = [sys.executable, "-m", "rosproxy", "run"]
-    for name, held in options.items():
+    for name, setting in options.items():
         option = "--" + name.replace("_", "-")
-        values = held if isinstance(held, tuple) else (held,)
-        for one in values:
-            command += [option] if one is True else [option, str(one)]
+        values = setting if isinstance(setting, tuple) else (setting,)
+        for value in values:
+            command += [option] if value is True else [option, str(value)]
     return command
 
 
@@ -36,7 +36,7 @@ class Process:
     def __init__(self, options: dict[str, Any]) -> None:
         self.prefix = options.pop("prefix", [])
         self.options = options_for(**BY_THE_WALL | options)
-        self.master: Where = (PROXY, int(self.options["master_port"]))
+        self.master: Address = (PROXY, int(self.options["master_port"]))
         self.log: list[str] = []
         self.start()
 

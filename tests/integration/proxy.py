@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from examples.demo.fake_http import Where, free_ports, where
+from examples.demo.fake_http import Address, free_ports, host_and_port
 from examples.demo.fake_node import FakeNode
 from rosproxy.app.process import App
 from rosproxy.leases.ports import PortRange
@@ -61,7 +61,7 @@ class Proxy:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.app = App(settings)
-        self.master: Where = (PROXY, settings.master_port)
+        self.master: Address = (PROXY, settings.master_port)
         self._stopped = False
 
     @property
@@ -106,10 +106,10 @@ class Proxy:
         slave = HostPort(node.address, node.slave.address[1])
         return next(e for e in self.ros1.context.registry if e.slave == slave)
 
-    def lease(self, node: FakeNode) -> Where:
+    def lease(self, node: FakeNode) -> Address:
         """Where outside reaches a node."""
         endpoint = self.endpoint(node)
-        return where(self.ros1.context.addressing.advertised_uri(endpoint))
+        return host_and_port(self.ros1.context.addressing.advertised_uri(endpoint))
 
     def uri(self, node: FakeNode) -> str:
         """A node's slave URI as outside sees it."""

@@ -41,13 +41,13 @@ def pid(name: str = "/n") -> bytes:
     return post(xml("getPid", name))
 
 
-@pytest.mark.parametrize("held", [LONG, LISTED], ids=["text", "list"])
-async def test_long_parameters_pass_unread_both_ways(proxy, master, monkeypatch, held):
+@pytest.mark.parametrize("param_value", [LONG, LISTED], ids=["text", "list"])
+async def test_long_parameters_pass_unread_both_ways(proxy, master, monkeypatch, param_value):
     monkeypatch.setattr("rosproxy.ros1.api.master.master_calls.read_request", None)
-    assert (await rpc(proxy.master, "setParam", "/n", "/p", held, source=NODE))[0] == 1
-    assert master.params["/p"] == held
+    assert (await rpc(proxy.master, "setParam", "/n", "/p", param_value, source=NODE))[0] == 1
+    assert master.params["/p"] == param_value
     monkeypatch.undo()
-    assert (await rpc(proxy.master, "getParam", "/n", "/p", source=NODE))[2] == held
+    assert (await rpc(proxy.master, "getParam", "/n", "/p", source=NODE))[2] == param_value
     assert proxy.metric("xmlrpc_calls_total", api="master", method="setParam", outcome="answered")
 
 
@@ -83,20 +83,22 @@ async def test_what_holds_no_address_passes_however_short_it_is(make_proxy, mast
 
     assert len(call("setParam", "/n", "/p")) < passing.SHORT
     assert len(MANY) > master_call(1).elements
-    found = await exchange(proxy.master, post(call("setParam", "/n", "/p")), NODE)
-    assert found.value[0] == 1
+    reply = await exchange(proxy.master, post(call("setParam", "/n", "/p")), NODE)
+    assert reply.value[0] == 1
     assert master.params["/p"] == MANY
     for method in ("paramUpdate", "of_its_own"):
-        found = await exchange(proxy.lease(node), post(call(method, "/n", "/p")), MASTER)
-        assert found.value[0] == 1, method
+        reply = await exchange(proxy.lease(node), post(call(method, "/n", "/p")), MASTER)
+        assert reply.value[0] == 1, method
         assert (method, ("/n", "/p", MANY)) in node.calls
 
 
-@pytest.mark.parametrize("held", [LONG * 2, LISTED], ids=["text", "list"])
-async def test_the_value_of_a_parameter_reaches_whoever_subscribes_to_it(proxy, master, node, held):
-    master.params["/p"] = held
-    found = await node.call(proxy.master, "subscribeParam", node.uri, "/p")
-    assert (found[0], found[2]) == (1, held)
+@pytest.mark.parametrize("param_value", [LONG * 2, LISTED], ids=["text", "list"])
+async def test_the_value_of_a_parameter_reaches_whoever_subscribes_to_it(
+    proxy, master, node, param_value
+):
+    master.params["/p"] = param_value
+    reply = await node.call(proxy.master, "subscribeParam", node.uri, "/p")
+    assert (reply[0], reply[2]) == (1, param_value)
     assert proxy.endpoint(node).names(Kind.PARAM) == ["/p"]
 
 
@@ -129,20 +131,24 @@ async def test_a_long_call_with_an_odd_head_is_bounded(proxy):
     assert (await exchange(proxy.master, post(longer), NODE)).status == 413
 
 
-def parameters(count: int, held: Any) -> list[dict[str, Any]]:
+def parameters(count: int, param_value: Any) -> list[dict[str, Any]]:
     """What roslaunch sends for its parameters."""
-    return [{"methodName": "setParam", "params": ["/n", f"/p{i}", held]} for i in range(count)]
+    return [
+        {"methodName": "setParam", "params": ["/n", f"/p{i}", param_value]} for i in range(count)
+    ]
 
 
 @pytest.mark.parametrize(
-    ("count", "held"), [(3000, [1, 2]), (2500, "x" * 2000)], ids=["many elements", "many bytes"]
+    ("count", "param_value"),
+    [(3000, [1, 2]), (2500, "x" * 2000)],
+    ids=["many elements", "many bytes"],
 )
-async def test_a_long_multicall_of_parameters_passes(proxy, master, count, held):
-    body = xml("system.multicall", parameters(count, held))
+async def test_a_long_multicall_of_parameters_passes(proxy, master, count, param_value):
+    body = xml("system.multicall", parameters(count, param_value))
     assert (await exchange(proxy.master, post(body), NODE)).value == [
         [[1, f"parameter /p{i} set", 0]] for i in range(count)
     ]
-    assert master.params[f"/p{count - 1}"] == held
+    assert master.params[f"/p{count - 1}"] == param_value
 
 
 async def test_a_long_multicall_with_a_registration_is_read_or_refused(proxy, master, node):
@@ -192,12 +198,12 @@ async def test_a_registration_whose_client_has_gone_is_not_half_noted(proxy, mas
 
 async def test_too_many_elements_are_a_fault(proxy, node):
     await node.publish(proxy.master)
-    for where, limits in ((proxy.lease(node), lease_call(1)), (proxy.master, master_call(4))):
+    for address, limits in ((proxy.lease(node), lease_call(1)), (proxy.master, master_call(4))):
         params = b"<param><value/></param>" * (limits.elements // 2)
-        method = "registerService" if where == proxy.master else "requestTopic"
+        method = "registerService" if address == proxy.master else "requestTopic"
         body = xml(method).replace(b"<params>", b"<params>" + params)
         assert passing.SHORT < len(body) < limits.size
-        assert (await exchange(where, post(body), NODE)).fault == PARSE_ERROR
+        assert (await exchange(address, post(body), NODE)).fault == PARSE_ERROR
 
 
 async def test_the_bounds_of_calls_are_options(make_proxy, node):
@@ -230,12 +236,12 @@ async def test_a_call_that_only_the_master_may_make_is_not_parsed(make_proxy, no
 async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
     proxy = await make_proxy(max_buffered=1)
     await node.publish(proxy.master)
-    held = xml("publisherUpdate", "/m", "/t", ["x" * 1000] * 400)
+    body = xml("publisherUpdate", "/m", "/t", ["x" * 1000] * 400)
     async with AsyncExitStack() as stack:
         for _ in range(2):
             wire = await stack.enter_async_context(connect(proxy.lease(node)))
-            await wire.send(post(held)[:-1])
-        reply = await exchange(proxy.lease(node), post(held))
+            await wire.send(post(body)[:-1])
+        reply = await exchange(proxy.lease(node), post(body))
         assert reply.status == 503
         assert b"more than 524288 bytes of requests and replies at once from" in reply.body
         assert (await rpc(proxy.master, "getPid", "/n", source=NODE))[0] == 1
@@ -272,9 +278,9 @@ async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, maste
     if isinstance(loop, PatientLoop):
         await pass_time(65)  # no timer of the proxy's minds how long a reply takes
     while taken < 20_000_000:
-        part = await loop.sock_recv(slow, 1_000_000)
-        assert part, f"the slow one was cut after {taken} bytes"
-        taken += len(part)
+        chunk = await loop.sock_recv(slow, 1_000_000)
+        assert chunk, f"the slow one was cut after {taken} bytes"
+        taken += len(chunk)
     idle.close()
     slow.close()
 
@@ -297,17 +303,17 @@ async def test_a_source_with_too_many_connections_is_refused_and_others_are_not(
 
 async def test_connections_to_one_port_are_bounded(make_proxy, make_node):
     proxy = await make_proxy(max_connections_per_lease=16)
-    one, other = await make_node("/one"), await make_node("/other", OTHER_NODE)
-    for node in (one, other):
+    busy, other = await make_node("/one"), await make_node("/other", OTHER_NODE)
+    for node in (busy, other):
         await node.publish(proxy.master)
     async with AsyncExitStack() as stack:
         for number in range(16):
             wire = await stack.enter_async_context(
-                connect(proxy.lease(one), f"127.0.1.{20 + number}")
+                connect(proxy.lease(busy), f"127.0.1.{20 + number}")
             )
             await wire.send(topic_header())
             assert await wire.exactly(1)
-        assert await knock(proxy.lease(one), b"") == "reset"
+        assert await knock(proxy.lease(busy), b"") == "reset"
         assert (await greet(proxy.lease(other), topic_header()))["callerid"] == "/other"
 
 
@@ -351,13 +357,13 @@ async def test_a_compressed_reply_is_not_inflated(proxy, master):
 
 async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
     monkeypatch.setattr("rosproxy.admin.admin_server.MOST_CONNECTIONS", 3)
-    where = proxy.settings.admin.host, proxy.settings.admin.port
+    address = proxy.settings.admin.host, proxy.settings.admin.port
     ask = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
-    async with connect(where) as first, connect(where) as second, connect(where) as third:
+    async with connect(address) as first, connect(address) as second, connect(address) as third:
         await second.send(ask)
         assert (await second.reply()).status == 200
-        assert (await exchange(where, ask, OTHER_NODE)).status == 200
-        assert (await exchange(where, ask)).status == 200
+        assert (await exchange(address, ask, OTHER_NODE)).status == 200
+        assert (await exchange(address, ask)).status == 200
         assert await first.outcome() == "closed"
         await third.send(ask)
         assert (await third.reply()).status == 200
@@ -365,9 +371,9 @@ async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
 
 async def test_so_are_those_that_come_in_one_moment(proxy, monkeypatch):
     monkeypatch.setattr("rosproxy.admin.admin_server.MOST_CONNECTIONS", 3)
-    where = proxy.settings.admin.host, proxy.settings.admin.port
+    address = proxy.settings.admin.host, proxy.settings.admin.port
     with ExitStack() as stack:  # all before the proxy has its turn
-        conns = [stack.enter_context(socket.create_connection(where)) for _ in range(20)]
+        conns = [stack.enter_context(socket.create_connection(address)) for _ in range(20)]
         for conn in conns:
             conn.setblocking(False)
 
@@ -383,7 +389,7 @@ async def test_so_are_those_that_come_in_one_moment(proxy, monkeypatch):
 
 async def test_a_half_sent_body_at_the_admin_endpoint_is_408(proxy, monkeypatch):
     monkeypatch.setattr("rosproxy.admin.admin_server.BODY_TIMEOUT", 0.1)
-    where = proxy.settings.admin.host, proxy.settings.admin.port
-    async with connect(where) as wire:
+    address = proxy.settings.admin.host, proxy.settings.admin.port
+    async with connect(address) as wire:
         await wire.send(post(b"{", "Content-Length: 10", path="/probe"))
         assert (await wire.reply()).status == 408

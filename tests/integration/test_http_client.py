@@ -29,7 +29,7 @@ class Peer:
 
     async def start(self) -> None:
         self._server = await asyncio.start_server(self._connected, MASTER, 0)
-        self.where = HostPort(*self._server.sockets[0].getsockname()[:2])
+        self.address = HostPort(*self._server.sockets[0].getsockname()[:2])
 
     def stop(self) -> None:
         self._server.close()
@@ -74,7 +74,7 @@ async def client(peer: Peer) -> AsyncIterator[HttpClient]:
 
 
 async def post(client: HttpClient, peer: Peer, body: bytes = b"hello", within: float = 5) -> bytes:
-    return await client.post(peer.where, "/a/b", "robot:11311", body, within)
+    return await client.post(peer.address, "/a/b", "robot:11311", body, within)
 
 
 async def test_calls_one_after_the_other_share_a_connection(client, peer):
@@ -221,9 +221,9 @@ async def test_a_reply_beyond_the_bound_is_refused(client, peer):
             writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + b"x" * size)
 
     peer.serve = long
-    assert len(await client.post(peer.where, "/", "robot", b"x", 5, longest=100_000)) == 100_000
+    assert len(await client.post(peer.address, "/", "robot", b"x", 5, longest=100_000)) == 100_000
     with pytest.raises(ValueError, match="100000 bytes"):
-        await client.post(peer.where, "/", "robot", b"x", 5, longest=100_000)
+        await client.post(peer.address, "/", "robot", b"x", 5, longest=100_000)
     await until(lambda: peer.open == 0, "the connection is closed")
 
 
@@ -255,7 +255,7 @@ class Pieces:
 
 
 async def pass_on(client: HttpClient, peer: Peer, body: bytes | Pieces) -> bytes | LongReply:
-    return await client.pass_on(peer.where, "/", "robot", body, 5)
+    return await client.pass_on(peer.address, "/", "robot", body, 5)
 
 
 async def test_a_long_reply_comes_piece_by_piece_and_keeps_its_connection(client, peer):
@@ -338,7 +338,7 @@ async def test_bodies_of_any_size_arrive(client, peer, size):
 @pytest.mark.parametrize("bad", ["/a b", "/a\r\nX: y", ""])
 async def test_nothing_else_than_a_path_gets_into_a_header(client, peer, bad):
     with pytest.raises(ValueError, match="can't be requested"):
-        await client.post(peer.where, bad, "robot", b"", 1)
+        await client.post(peer.address, bad, "robot", b"", 1)
     assert peer.accepted == 0
 
 

@@ -78,8 +78,8 @@ async def test_a_node_master_and_peers_over_ipv6(
     assert master6.holds("services", "/add") == [f"rosrpc://[::1]:{port}"]
     assert (await greet(proxy6.lease(node6), service_header()))["callerid"] == "/six"
     assert (await node6.subscribe(proxy6.master))[2] == [node6.uri]
-    found = await rpc(proxy6.master, "getUri", "/six")
-    assert found[2] == f"http://[::1]:{proxy6.settings.master_port}/"
+    reply = await rpc(proxy6.master, "getUri", "/six")
+    assert reply[2] == f"http://[::1]:{proxy6.settings.master_port}/"
 
 
 async def test_both_stacks_on_the_same_ports(proxy6: Proxy, make_node: Any) -> None:

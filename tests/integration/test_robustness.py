@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import Where
+from examples.demo.fake_http import Address
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
@@ -29,7 +29,7 @@ NAMES = ["constructor", "__proto__", "__class__", "_dispatch", "toString", "a" *
 class Door:
     """A port that speaks XML-RPC, the pid that answers behind it, and the longest body."""
 
-    address: Where
+    address: Address
     pid: int
     longest: int = master_call(4).size
 
@@ -147,7 +147,7 @@ async def test_a_client_that_expects_100_continue_gets_it(door):
 async def test_chunked_uploads(door):
     for size in (1, 50, 10000):
         parts = [CALL[i : i + size] for i in range(0, len(CALL), size)]
-        body = b"".join(b"%x\r\n%s\r\n" % (len(part), part) for part in parts) + b"0\r\n\r\n"
+        body = b"".join(b"%x\r\n%s\r\n" % (len(chunk), chunk) for chunk in parts) + b"0\r\n\r\n"
         reply = await raw(door, post(body, "Transfer-Encoding: chunked"))
         assert reply.value == [1, "", door.pid]
 

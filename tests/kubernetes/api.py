@@ -43,10 +43,10 @@ class Refused(AssertionError):
 
 def path(resource: str, namespace: str = "", name: str = "", rest: str = "") -> str:
     """The path of objects of a resource (plural, lower case)."""
-    parts = [GROUPS.get(resource, "api/v1")]
-    parts += ["namespaces", namespace] if namespace else []
-    parts += [part for part in (resource, name, rest) if part]
-    return "/" + "/".join(parts)
+    segments = [GROUPS.get(resource, "api/v1")]
+    segments += ["namespaces", namespace] if namespace else []
+    segments += [segment for segment in (resource, name, rest) if segment]
+    return "/" + "/".join(segments)
 
 
 def get(resource: str, namespace: str = "", name: str = "") -> Json:
@@ -63,18 +63,18 @@ def objects(resource: str, namespace: str = "", selector: str = "") -> list[Json
     """All objects of a resource, everywhere or in a namespace, of a label selector."""
     query = {"labelSelector": selector} if selector else {}
     try:
-        found: list[Json] = json_call("GET", path(resource, namespace), query=query)["items"]
+        items: list[Json] = json_call("GET", path(resource, namespace), query=query)["items"]
     except Refused as refused:
         if refused.status == 404:
             return []
         raise
-    return found
+    return items
 
 
 def create(body: Json) -> Json:
     """Create an object; its kind and namespace say where."""
-    where = path(PLURALS[body["kind"]], body["metadata"].get("namespace", ""))
-    return json_call("POST", where, body)
+    url_path = path(PLURALS[body["kind"]], body["metadata"].get("namespace", ""))
+    return json_call("POST", url_path, body)
 
 
 def patch(resource: str, namespace: str, name: str, change: Json) -> Json:
@@ -105,19 +105,19 @@ def logs(namespace: str, pod: str, *, previous: bool = False) -> str:
 
 def dry_run(body: Json) -> tuple[Json, str]:
     """What the API server would make of an object, and what it warns of."""
-    where = path(PLURALS[body["kind"]], body["metadata"].get("namespace", ""))
-    text, warnings = call("POST", where, body, query={"dryRun": "All"})
-    found: Json = json.loads(text)
-    return found, warnings
+    url_path = path(PLURALS[body["kind"]], body["metadata"].get("namespace", ""))
+    text, warnings = call("POST", url_path, body, query={"dryRun": "All"})
+    created: Json = json.loads(text)
+    return created, warnings
 
 
-def json_call(method: str, where: str, body: Json | None = None, **more: Any) -> Json:
-    found: Json = json.loads(call(method, where, body, **more)[0])
-    return found
+def json_call(method: str, url_path: str, body: Json | None = None, **more: Any) -> Json:
+    answer: Json = json.loads(call(method, url_path, body, **more)[0])
+    return answer
 
 
 def call(
-    method: str, where: str, body: Json | None = None, *,
+    method: str, url_path: str, body: Json | None = None, *,
     query: Mapping[str, str] | None = None, kind: str = "application/json",
 ) -> tuple[str, str]:  # fmt: skip
     """Make a call; return the body and the warnings of the answer.
@@ -128,7 +128,7 @@ def call(
     while True:
         try:
             answer = _pool().request(
-                method, API_SERVER + where + _query(query or {}),
+                method, API_SERVER + url_path + _query(query or {}),
                 body=None if body is None else json.dumps(body), headers={"Content-Type": kind},
             )  # fmt: skip
         except urllib3.exceptions.HTTPError:

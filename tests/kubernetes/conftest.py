@@ -48,7 +48,7 @@ def pytest_runtest_makereport(
 
 def _sections() -> Iterator[tuple[str, str]]:
     own = (api.objects("pods", "", label) for label in (release.OPERATORS, release.PROXIES))
-    for told in (body["metadata"] for found in own for body in found):
+    for told in (body["metadata"] for bodies in own for body in bodies):
         yield told["name"], api.logs(told["namespace"], told["name"])[-4000:]
     yield "the cluster", kubectl("get", "rosproxies,pods", "-A", "-o", "wide", check=False)
 
@@ -99,8 +99,8 @@ def _release(_cluster: None) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def robot(_cluster: None) -> Iterator[Robot]:
     """The robot with a master for the tests of one module."""
-    with robot_with_master() as found:
-        yield found
+    with robot_with_master() as started_robot:
+        yield started_robot
 
 
 @pytest.fixture

@@ -3,6 +3,6 @@
 NUMBERS: list[str] = []
 
 
-def note(what: str) -> None:
-    NUMBERS.append(what)
-    print(what)
+def note(measurement: str) -> None:
+    NUMBERS.append(measurement)
+    print(measurement)

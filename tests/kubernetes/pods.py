@@ -20,8 +20,8 @@ INJECT = "rosproxy.io/inject"
 _numbers = itertools.count(1)
 
 
-def unique(what: str) -> str:
-    return f"{what}-{os.getpid()}-{next(_numbers)}"
+def unique(prefix: str) -> str:
+    return f"{prefix}-{os.getpid()}-{next(_numbers)}"
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,10 @@ def ready(body: Json) -> bool:
 
 def environment(container: Json) -> dict[str, Any]:
     return {
-        one["name"]: one.get("value", one.get("valueFrom", {}).get("fieldRef", {}).get("fieldPath"))
-        for one in container.get("env", [])
+        variable["name"]: variable.get(
+            "value", variable.get("valueFrom", {}).get("fieldRef", {}).get("fieldPath")
+        )
+        for variable in container.get("env", [])
     }
 
 
@@ -120,7 +122,7 @@ class Namespace:
             "ports": [{"containerPort": port, "hostPort": port, "protocol": protocol}
                       for port in ports],
         }  # fmt: skip
-        where = {"nodeSelector": {"kubernetes.io/hostname": on}} if on else {}
+        placement = {"nodeSelector": {"kubernetes.io/hostname": on}} if on else {}
         return {
             "apiVersion": "v1",
             "kind": "Pod",
@@ -128,7 +130,7 @@ class Namespace:
                          "labels": dict(self.labels if labels is None else labels)},
             # roscpp, as the first process of a container, does not hear SIGTERM.
             "spec": {"containers": [container], "terminationGracePeriodSeconds": 1,
-                     "automountServiceAccountToken": False, **where, **spec},
+                     "automountServiceAccountToken": False, **placement, **spec},
         }  # fmt: skip
 
     def node(self, library: str, role: str, *options: str, **more: Any) -> Pod:

@@ -71,8 +71,8 @@ def remove() -> None:
 
 def operators() -> list[Pod]:
     """The operators' pods, those left out that are about to go."""
-    found = api.objects("pods", NAMESPACE, OPERATORS)
-    alive = [body["metadata"] for body in found if "deletionTimestamp" not in body["metadata"]]
+    bodies = api.objects("pods", NAMESPACE, OPERATORS)
+    alive = [body["metadata"] for body in bodies if "deletionTimestamp" not in body["metadata"]]
     return [Pod(NAMESPACE, metadata["name"]) for metadata in alive]
 
 
@@ -85,11 +85,11 @@ def operator() -> Pod:
     """The pod of the operator that leads."""
     leading: list[Pod] = []
 
-    def there() -> bool:
+    def has_leader() -> bool:
         leading[:] = [pod for pod in operators() if holder().startswith(f"{pod.name}_")]
         return bool(leading)
 
-    wait_until(there, 30, lambda: f"one leads: {holder()!r} of {operators()}")
+    wait_until(has_leader, 30, lambda: f"one leads: {holder()!r} of {operators()}")
     return leading[0]
 
 
@@ -110,13 +110,13 @@ def wait_operator(seconds: float = 60) -> None:
     """
     wanted = api.get("deployments", NAMESPACE, FULL_NAME)["spec"]["replicas"]
 
-    def there() -> bool:
-        found = api.objects("pods", NAMESPACE, OPERATORS)
+    def is_serving() -> bool:
+        bodies = api.objects("pods", NAMESPACE, OPERATORS)
         alive = operators()
-        ready = len(found) == len(alive) == wanted and all(pod.ready for pod in alive)
+        ready = len(bodies) == len(alive) == wanted and all(pod.ready for pod in alive)
         return ready and operator() in alive and _webhook_answers()
 
-    wait_until(there, seconds, lambda: str(api.objects("pods", NAMESPACE, OPERATORS)))
+    wait_until(is_serving, seconds, lambda: str(api.objects("pods", NAMESPACE, OPERATORS)))
 
 
 def _webhook_answers() -> bool:

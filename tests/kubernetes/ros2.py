@@ -87,21 +87,28 @@ def node(
 
 def ears(of: RosProxy) -> list[Json]:
     """The pods of a RosProxy's ears."""
-    found = api.objects("pods", of.namespace, "app.kubernetes.io/component=ear")
-    return [body for body in found if "deletionTimestamp" not in body["metadata"]]
+    bodies = api.objects("pods", of.namespace, "app.kubernetes.io/component=ear")
+    return [body for body in bodies if "deletionTimestamp" not in body["metadata"]]
 
 
 def domain(proxy: Proxy) -> DomainStatus:
     """What a proxy tells of its domain; nothing while it does not answer."""
     try:
-        (found,) = parse_status(proxy.run("rosproxy", "status", "--json", check=False)).domains
+        (status,) = parse_status(proxy.run("rosproxy", "status", "--json", check=False)).domains
     except ValueError:
         return DomainStatus()
-    return found
+    return status
+
+
+def ports_are_kept(proxy: Proxy) -> bool:
+    """Whether it has participants inside, and each has been told to keep its ports for it."""
+    participants = domain(proxy).inside
+    return bool(participants) and all(participant.kept for participant in participants)
 
 
 def leased(proxy: Proxy) -> dict[str, list[int]]:
     """The ports of the range that lead to participants inside, by their GUID prefixes."""
     return {
-        one.guid_prefix: sorted(lease.port for lease in one.leases) for one in domain(proxy).inside
+        participant.guid_prefix: sorted(lease.port for lease in participant.leases)
+        for participant in domain(proxy).inside
     }

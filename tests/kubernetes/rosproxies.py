@@ -51,8 +51,8 @@ class RosProxy:
 
     @property
     def status(self) -> Json:
-        found: Json = self.body.get("status", {})
-        return found
+        status: Json = self.body.get("status", {})
+        return status
 
     @property
     def service(self) -> Json:
@@ -62,8 +62,8 @@ class RosProxy:
     def proxies(self) -> list[Proxy]:
         """The proxies' pods, those being deleted left out."""
         selector = f"{PROXY_OF}={self.name},app.kubernetes.io/component=proxy"
-        found = api.objects("pods", self.namespace, selector)
-        return [proxy(body) for body in found if "deletionTimestamp" not in body["metadata"]]
+        bodies = api.objects("pods", self.namespace, selector)
+        return [proxy(body) for body in bodies if "deletionTimestamp" not in body["metadata"]]
 
     def proxy_on(self, node: str) -> Proxy | None:
         return next((proxy for proxy in self.proxies if proxy.on == node), None)
@@ -73,37 +73,41 @@ class RosProxy:
 
         ready: list[Proxy] = []
 
-        def there() -> bool:
-            ready[:] = [one for one in self.proxies if one.on == node and one.ready]
+        def has_ready_proxy() -> bool:
+            ready[:] = [
+                candidate for candidate in self.proxies if candidate.on == node and candidate.ready
+            ]
             return bool(ready)
 
-        wait_until(there, seconds, lambda: f"a proxy of {self} on {node}: {self.tell()}")
+        wait_until(has_ready_proxy, seconds, lambda: f"a proxy of {self} on {node}: {self.tell()}")
         return ready[0]
 
     def condition(self, kind: str) -> Json:
-        found = [c for c in self.status.get("conditions", []) if c["type"] == kind]
-        return found[0] if found else {}
+        conditions = [c for c in self.status.get("conditions", []) if c["type"] == kind]
+        return conditions[0] if conditions else {}
 
     def wait_for(
         self, kind: str, status: str = "True", reason: str = "", seconds: float = 40
     ) -> Json:
         """Wait for a condition; return it."""
 
-        def so() -> bool:
-            found = self.condition(kind)
-            return found.get("status") == status and reason in ("", found.get("reason"))
+        def is_met() -> bool:
+            condition = self.condition(kind)
+            return condition.get("status") == status and reason in ("", condition.get("reason"))
 
-        wait_until(so, seconds, lambda: f"{kind}={status} {reason} of {self.tell()}")
+        wait_until(is_met, seconds, lambda: f"{kind}={status} {reason} of {self.tell()}")
         return self.condition(kind)
 
-    def wait_status(self, true: Callable[[Json], bool], what: str, seconds: float = 40) -> Json:
-        wait_until(lambda: true(self.status), seconds, lambda: f"{what}: {self.tell()}")
+    def wait_status(
+        self, predicate: Callable[[Json], bool], message: str, seconds: float = 40
+    ) -> Json:
+        wait_until(lambda: predicate(self.status), seconds, lambda: f"{message}: {self.tell()}")
         return self.status
 
     def on(self, node: str) -> Json:
         """What its status says of a node."""
-        found = [one for one in self.status.get("perNode", []) if one["name"] == node]
-        return found[0] if found else {}
+        rows = [row for row in self.status.get("perNode", []) if row["name"] == node]
+        return rows[0] if rows else {}
 
     @property
     def events(self) -> list[Event]:
@@ -155,14 +159,14 @@ def all_proxies() -> list[Json]:
 
 def events(namespace: str, name: str, kind: str) -> list[Event]:
     """The events about an object."""
-    found = []
+    own_events = []
     for body in api.objects("events", namespace):
         about = body["involvedObject"]
         if about.get("name") == name and about.get("kind") == kind:
-            found.append(
+            own_events.append(
                 Event(body["type"], body["reason"], body["message"], body.get("count") or 1)
             )
-    return found
+    return own_events
 
 
 def wait_event(

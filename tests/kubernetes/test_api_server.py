@@ -25,9 +25,9 @@ def test_traffic_goes_on_and_the_operator_finds_back(net: Namespace, robot: Robo
         assert made.the_proxy().uid_then == before.uid_then
 
         net.idle(on="node2")
-        found = wait_until(lambda: made.proxy_on("node2") is not None, 60, made.tell)
+        took = wait_until(lambda: made.proxy_on("node2") is not None, 60, made.tell)
         note(f"API server killed: up again after {up - killed:.1f} s; {gaps}; "
-             f"a pod's proxy was made {found:.1f} s after it")  # fmt: skip
+             f"a pod's proxy was made {took:.1f} s after it")  # fmt: skip
         made.the_proxy("node2")
         assert _restarts() == restarts, "the operator needed a restart"
 

@@ -37,9 +37,9 @@ def restored(_release: None) -> Iterator[None]:
 @cache
 def every_object() -> list[Json]:
     """Each object of any combination, once."""
-    distinct = {json.dumps(one, sort_keys=True): one
-                for _, values in combinations(2) for one in objects(values)
-                if one["apiVersion"] not in FOREIGN}  # fmt: skip
+    distinct = {json.dumps(body, sort_keys=True): body
+                for _, values in combinations(2) for body in objects(values)
+                if body["apiVersion"] not in FOREIGN}  # fmt: skip
     return list(distinct.values())
 
 
@@ -53,9 +53,9 @@ def try_to_create(body: Json) -> str:
     start = f"/apis/{group}/{version}" if group else f"/api/{version}"
     place = body["metadata"].get("namespace")
     middle = f"/namespaces/{place}" if place else ""
-    where = f"{start}{middle}/{plural(body['kind'])}"
+    url_path = f"{start}{middle}/{plural(body['kind'])}"
     try:
-        _, warnings = api.call("POST", where, body,
+        _, warnings = api.call("POST", url_path, body,
                                query={"dryRun": "All", "fieldValidation": "Strict"})  # fmt: skip
     except api.Refused as refused:
         exists = refused.status == 409 and "already exists" in refused.text
@@ -64,18 +64,20 @@ def try_to_create(body: Json) -> str:
 
 
 def plural(kind: str) -> str:
-    word = kind.lower()
+    singular = kind.lower()
     return (
-        {"y": f"{word[:-1]}ies"}.get(word[-1], f"{word}s") if kind != "RosProxy" else "rosproxies"
+        {"y": f"{singular[:-1]}ies"}.get(singular[-1], f"{singular}s")
+        if kind != "RosProxy"
+        else "rosproxies"
     )
 
 
 def test_every_combination_is_accepted(namespaces: None) -> None:
-    found = every_object()
-    assert len({one["kind"] for one in found}) == 16
-    assert len(found) > 50
-    refused = {f"{one['kind']} {one['metadata']['name']}": text
-               for one in found if (text := try_to_create(one))}  # fmt: skip
+    bodies = every_object()
+    assert len({body["kind"] for body in bodies}) == 16
+    assert len(bodies) > 50
+    refused = {f"{body['kind']} {body['metadata']['name']}": text
+               for body in bodies if (text := try_to_create(body))}  # fmt: skip
     assert refused == {}
 
 

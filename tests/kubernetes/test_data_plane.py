@@ -14,25 +14,25 @@ from tests.kubernetes.traffic import Flow, flow
 def status(made: RosProxy) -> dict[str, Any]:
     """What the proxy on node1 says of itself."""
     text = made.the_proxy().run("rosproxy", "status", "--json", check=False)
-    found: dict[str, Any] = json.loads(text)
-    return found
+    document: dict[str, Any] = json.loads(text)
+    return document
 
 
 def plane_of(made: RosProxy, node: str) -> dict[str, Any]:
     nodes = status(made)["nodes"]
-    found = [one["data_plane"] for one in nodes if f"/{node}" in one["nodes"]]
-    return dict(found[0]) if found else {}
+    planes = [row["data_plane"] for row in nodes if f"/{node}" in row["nodes"]]
+    return dict(planes[0]) if planes else {}
 
 
 def wait_forwarded(made: RosProxy, moving: Flow) -> None:
     """Wait until the kernel forwards the talker's topic and counts its bytes."""
     talker = moving.talker.node
 
-    def so() -> bool:
-        found = plane_of(made, talker)
-        return found.get("plane") == "kernel" and found["connections"] > 0 and found["sent"] > 0
+    def is_forwarded() -> bool:
+        plane = plane_of(made, talker)
+        return plane.get("plane") == "kernel" and plane["connections"] > 0 and plane["sent"] > 0
 
-    wait_until(so, 60, lambda: f"the kernel forwards: {status(made)}")
+    wait_until(is_forwarded, 60, lambda: f"the kernel forwards: {status(made)}")
     before = plane_of(made, talker)["sent"]
     wait_until(lambda: plane_of(made, talker)["sent"] > before, 60, "bytes are counted")
 
@@ -63,8 +63,8 @@ def test_another_plane_makes_the_proxy_anew(net: Namespace, robot: Robot) -> Non
         made.change(dataPlane="Kernel")
 
         def anew() -> bool:
-            found = made.proxy_on("node1")
-            return found is not None and found.uid_then != before.uid_then and found.ready
+            proxy = made.proxy_on("node1")
+            return proxy is not None and proxy.uid_then != before.uid_then and proxy.ready
 
         wait_until(anew, 40, made.tell)
         assert made.the_proxy().ports == before.ports

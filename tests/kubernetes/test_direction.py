@@ -45,9 +45,11 @@ def selected(made: RosProxy) -> set[str]:
     spec = api.get("networkpolicies", made.namespace, name)["spec"]
     assert spec["policyTypes"] == ["Egress"]
     assert not [to for rule in spec["egress"] for to in rule.get("to", ()) if "ipBlock" in to]
-    (one,) = spec["podSelector"]["matchExpressions"]
-    found = api.objects("pods", made.namespace, f"{one['key']} in ({','.join(one['values'])})")
-    return {body["metadata"]["name"] for body in found}
+    (expression,) = spec["podSelector"]["matchExpressions"]
+    bodies = api.objects(
+        "pods", made.namespace, f"{expression['key']} in ({','.join(expression['values'])})"
+    )
+    return {body["metadata"]["name"] for body in bodies}
 
 
 def caller(net: Namespace, robot: Robot, library: str) -> Pod:

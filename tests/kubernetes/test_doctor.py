@@ -29,8 +29,8 @@ def doctor(namespace: str) -> tuple[int, list[dict[str, Any]]]:
         env={**os.environ, "KUBECONFIG": str(KUBECONFIG)},
     )
     assert "Traceback" not in ended.stderr
-    found: list[dict[str, Any]] = json.loads(ended.stdout)["findings"]
-    return ended.returncode, found
+    findings: list[dict[str, Any]] = json.loads(ended.stdout)["findings"]
+    return ended.returncode, findings
 
 
 def test_it_asks_the_doctor_in_each_proxys_pod(net: Namespace, robot: Robot) -> None:
@@ -42,19 +42,19 @@ def test_it_asks_the_doctor_in_each_proxys_pod(net: Namespace, robot: Robot) -> 
 
     def masters() -> list[str]:
         name = f"proxy {net.name}/{made.the_proxy('node1').name}: master"
-        return [one["text"] for one in doctor(net.name)[1] if one["subject"] == name]
+        return [finding["text"] for finding in doctor(net.name)[1] if finding["subject"] == name]
 
     wait_until(lambda: bool(masters()), 60, lambda: str(doctor(net.name)))
     assert masters()[0].startswith(f"{robot.master_uri} answers in")
-    (own,) = [one for one in doctor(net.name)[1] if one["check"] == "rosproxy"]
+    (own,) = [finding for finding in doctor(net.name)[1] if finding["check"] == "rosproxy"]
     assert own["severity"] == "ok"
 
 
 def page() -> dict[str, Any]:
     """What the operator's live page shows of all proxies, as its pod's loopback sees it."""
     code = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:11313/graph').read().decode())"
-    found: dict[str, Any] = json.loads(release.operator().run("python3", "-c", code))
-    return found
+    graph: dict[str, Any] = json.loads(release.operator().run("python3", "-c", code))
+    return graph
 
 
 def test_the_operators_page_shows_the_nodes_of_each_pod(net: Namespace, robot: Robot) -> None:
@@ -72,7 +72,7 @@ def test_a_master_that_is_not_there_is_the_first_cause(net: Namespace) -> None:
     made = rosproxy(net.name, master={"uri": "http://10.88.0.50:1"}, ports=4)
     net.idle(on="node1")
     made.wait_for("MasterReachable", "False")
-    code, found = doctor(net.name)
+    code, findings = doctor(net.name)
     assert code == 1
-    assert found[0]["text"].startswith("MasterReachable is False: ")
-    assert "describe rosproxy" in found[0]["fix"]
+    assert findings[0]["text"].startswith("MasterReachable is False: ")
+    assert "describe rosproxy" in findings[0]["fix"]

@@ -23,11 +23,11 @@ REMAKE = "rosproxy.io/remake-unwired"
 def made(net: Namespace) -> RosProxy:
     """A RosProxy with a proxy on each node, which wait for their master."""
     release.wait_operator()
-    found = rosproxy(net.name, master=NOWHERE, ports=4)
+    created = rosproxy(net.name, master=NOWHERE, ports=4)
     for node in ("node1", "node2"):
         net.idle(on=node)
-    wait_until(lambda: len(found.proxies) == 2, 60, found.tell)
-    return found
+    wait_until(lambda: len(created.proxies) == 2, 60, created.tell)
+    return created
 
 
 @contextmanager

@@ -20,7 +20,7 @@ def test_it_is_made_mended_and_gone_with_its_rosproxy(net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE, ports=4)
     spec = wait_policy(made)["spec"]
     everybody, pods, operator = spec["ingress"]
-    assert [one["port"] for one in everybody["ports"]] == [11412]
+    assert [port["port"] for port in everybody["ports"]] == [11412]
     assert "from" not in everybody
     assert (pods["ports"][0]["port"], len(pods["from"])) == (11311, 1)
     assert (operator["ports"][0]["port"], len(operator["from"])) == (11312, 1)

@@ -25,17 +25,17 @@ def talker(net: Namespace, library: str, topic: str, on: str = "node1", **more: 
 
 @pytest.fixture
 def made(net: Namespace, robot: Robot) -> RosProxy:
-    found = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    created = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     wait_for_service(net)
-    return found
+    return created
 
 
-@pytest.mark.parametrize("there", [True, False], ids=["proxy there", "proxy not there"])
+@pytest.mark.parametrize("has_proxy", [True, False], ids=["proxy there", "proxy not there"])
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_how_long_the_first_message_takes(
-    library: str, there: bool, made: RosProxy, net: Namespace, robot: Robot
+    library: str, has_proxy: bool, made: RosProxy, net: Namespace, robot: Robot
 ) -> None:
-    if there:
+    if has_proxy:
         net.idle(on="node1")
         made.the_proxy()
     name = new_topic()
@@ -45,7 +45,7 @@ def test_how_long_the_first_message_takes(
     pod.wait_ready()
     ready = time.time()
     heard = ear.wait_for("inside", seconds=START)
-    proxy = "there" if there else "not there"
+    proxy = "there" if has_proxy else "not there"
     note(f"first message, {library}, proxy {proxy}: {heard - ready:.1f} s after the pod is Ready, "
          f"{heard - created:.1f} s after it is created")  # fmt: skip
 

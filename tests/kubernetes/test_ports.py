@@ -27,9 +27,9 @@ def ports_on(made: RosProxy, node: str) -> str:
 
 def _range(made: RosProxy, node: str) -> str:
     """The range of the proxy that runs on a node; empty if none does."""
-    found = made.proxy_on(node)
-    running = found is not None and found.body.get("status", {}).get("phase") == "Running"
-    return found.ports if found and running else ""
+    proxy = made.proxy_on(node)
+    running = proxy is not None and proxy.body.get("status", {}).get("phase") == "Running"
+    return proxy.ports if proxy and running else ""
 
 
 def test_ports_of_another_pod_are_left_alone(net: Namespace) -> None:
@@ -49,8 +49,8 @@ def test_two_rosproxies_share_a_node(net: Namespace) -> None:
     )
     net.idle(on="node1", labels={"rosproxy.io/inject": "first"})
     net.idle(on="node1", labels={"rosproxy.io/inject": "second"})
-    found = {ports_on(first, "node1"), ports_on(second, "node1")}
-    assert found == {"12100-12107", "12108-12115"}
+    ranges = {ports_on(first, "node1"), ports_on(second, "node1")}
+    assert ranges == {"12100-12107", "12108-12115"}
 
 
 @pytest.mark.parametrize("excluded", [(29990, 32775), (32760, 61020)])

@@ -15,7 +15,14 @@ from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.conftest import cluster
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace, Pod, namespace
-from tests.kubernetes.ros2 import Robot2, domain, ears, leased, node, robot_with_ros2
+from tests.kubernetes.ros2 import (
+    Robot2,
+    ears,
+    leased,
+    node,
+    ports_are_kept,
+    robot_with_ros2,
+)
 from tests.kubernetes.rosproxies import Proxy, RosProxy, rosproxy, wait_event
 from tests.kubernetes.traffic import wait_for_service
 
@@ -26,8 +33,8 @@ START = 120
 
 @pytest.fixture(scope="module")
 def robot2(_release: None) -> Iterator[Robot2]:
-    with robot_with_ros2() as found:
-        yield found
+    with robot_with_ros2() as started_robot:
+        yield started_robot
 
 
 @dataclass
@@ -57,8 +64,8 @@ class World:
     def gaps(self, since: float) -> str:
         """The longest times without messages, and how many were lost."""
         return ", ".join(
-            f"{way} {log.longest_gap(word, since, time.time()):.1f}, lost {log.lost(word, since)}"
-            for way, (log, word) in self.flows.items()
+            f"{way} {log.longest_gap(text, since, time.time()):.1f}, lost {log.lost(text, since)}"
+            for way, (log, text) in self.flows.items()
         )
 
 
@@ -104,9 +111,9 @@ def _fill(made: World, robot2: Robot2) -> None:
 
 def test_everybody_hears_everybody(world: World) -> None:
     """Pods of one node, of both, and a robot; Fast DDS of two releases, and Cyclone DDS."""
-    for who, (log, word) in world.heard.items():
-        print(who)
-        log.wait_for(word, seconds=START)
+    for listener, (log, text) in world.heard.items():
+        print(listener)
+        log.wait_for(text, seconds=START)
 
 
 def test_services(world: World) -> None:
@@ -131,12 +138,16 @@ def test_what_users_are_told(world: World) -> None:
     assert (status["domain"], status["proxies"]) == (0, "2/2")
     assert {"master", "masterURI"}.isdisjoint(status)
     assert status["staticPeers"] == of.service["spec"]["clusterIP"]
-    assert {one["type"] for one in status["conditions"]} == {"Ready", "PortsAllocated", "Degraded"}
+    assert {condition["type"] for condition in status["conditions"]} == {
+        "Ready",
+        "PortsAllocated",
+        "Degraded",
+    }
     assert "participants of domain 0" in of.condition("Ready")["message"]
     assert sum(line["participants"] for line in status["perNode"]) == count
     assert "Domain" in kubectl("-n", of.namespace, "describe", "rosproxy", of.name)
-    (one, *_), port = world.pods, of.service["spec"]["ports"][0]
-    assert one.environment["ROS_STATIC_PEERS"] == status["staticPeers"]
+    (pod, *_), port = world.pods, of.service["spec"]["ports"][0]
+    assert pod.environment["ROS_STATIC_PEERS"] == status["staticPeers"]
     assert (port["protocol"], port["port"]) == ("UDP", 7410)
     assert len(ears(of)) == len(NODES)
 
@@ -196,9 +207,9 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
     """On the same ports, for the same participants; outside and inside hear on."""
     of, flows = world.rosproxy, world.flows
     proxy = of.the_proxy("node1")
-    for log, word in flows.values():
-        log.wait_for(word, since=time.time())
-    wait_until(lambda: all(one.kept for one in domain(proxy).inside), 30, "ports are kept")
+    for log, text in flows.values():
+        log.wait_for(text, since=time.time())
+    wait_until(lambda: ports_are_kept(proxy), 30, "ports are kept")
     before, lost = leased(proxy), time.time()
 
     LOSSES[how](of, proxy)
@@ -209,8 +220,8 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
     _ear_of(of).wait_ready(60)
     release.wait_operator()
     end = time.time()
-    for log, word in flows.values():
-        log.wait_for(word, count=10, since=end)
+    for log, text in flows.values():
+        log.wait_for(text, count=10, since=end)
     note(f"ROS 2, {how}: seconds without messages {world.gaps(lost)}")
     assert (now.ports, now.name) == (proxy.ports, proxy.name)
     late = robot2.node("jazzy", "sub", "/one", name="late")
@@ -226,8 +237,8 @@ def test_on_other_ports_participants_meet_anew(world: World) -> None:
 
     wait_until(lambda: all(of.the_proxy(on).first_port >= 13000 for on in NODES), 60, of.tell)
     end = time.time()
-    for log, word in world.flows.values():
-        log.wait_for(word, count=10, since=end)
+    for log, text in world.flows.values():
+        log.wait_for(text, count=10, since=end)
     note(f"ROS 2, other ports: seconds without messages {world.gaps(changed)}")
 
 
@@ -238,7 +249,7 @@ def _all_leased(of: RosProxy) -> list[dict[str, list[int]]]:
 def test_another_image_of_the_proxies(world: World) -> None:
     """It is changed in place: the same pods, the same ports; one proxy after the other."""
     of = world.rosproxy
-    wait_until(lambda: all(one.kept for one in domain(of.the_proxy()).inside), 30, "kept ports")
+    wait_until(lambda: all(ports_are_kept(of.the_proxy(on)) for on in NODES), 30, "ports are kept")
     before, started = _all_leased(of), time.time()
 
     release.upgrade(proxy={"image": {"tag": release.other_image()}})
@@ -246,8 +257,8 @@ def test_another_image_of_the_proxies(world: World) -> None:
 
     wait_until(lambda: _all_leased(of) == before, 60, of.tell)
     end = time.time()
-    for log, word in world.flows.values():
-        log.wait_for(word, count=10, since=end)
+    for log, text in world.flows.values():
+        log.wait_for(text, count=10, since=end)
     note(f"ROS 2, another image: seconds without messages {world.gaps(started)}")
     release.upgrade()
     release.wait_operator()
@@ -263,12 +274,12 @@ def test_a_node_is_stopped_and_comes_back(world: World) -> None:
     try:
         of.wait_status(lambda told: not of.on(lost_node).get("ready"), "it is told", 60)
         outward, inward = world.flows["outward"], world.flows["inward"]
-        outside = max(log.longest_gap(word, lost, time.time()) for log, word in (outward, inward))
+        outside = max(log.longest_gap(text, lost, time.time()) for log, text in (outward, inward))
         assert outside < UNNOTICED, outside
     finally:
         cluster("start-node", lost_node)
     up = time.time()
-    took = [log.wait_for(word, since=up, seconds=120) - up for log, word in back]
+    took = [log.wait_for(text, since=up, seconds=120) - up for log, text in back]
     assert of.the_proxy(lost_node, seconds=60).ports == ports
     note(f"ROS 2, node stopped: messages of its pods again {took[0]:.1f} s, and for them "
          f"{took[1]:.1f} s after it is ready")  # fmt: skip
@@ -291,7 +302,7 @@ def test_two_rosproxies_two_domains_without_multicast(robot2: Robot2) -> None:
         taken.wait_ready()
         window = {"first": 12000, "last": 12063}
         peers = ["10.88.0.51"]
-        found = [
+        rosproxies = [
             rosproxy(net.name, f"domain-{number}", ros=2, domain=number, peers=peers,
                      portWindow=window, ports=10)
             for number in (5, 6)
@@ -312,9 +323,9 @@ def test_two_rosproxies_two_domains_without_multicast(robot2: Robot2) -> None:
             assert robot_ears[number].got(f"pod{other}") == []
             assert pods[number].log.got(f"robot{other}") == []
             assert pods[number].environment["ROS_DOMAIN_ID"] == str(number)
-        ranges = [of.the_proxy("node1").ports for of in found]
+        ranges = [of.the_proxy("node1").ports for of in rosproxies]
         assert ranges == ["12009-12018", "12019-12028"]
-        assert all(of.status["domain"] == n for of, n in zip(found, (5, 6), strict=True))
+        assert all(of.status["domain"] == n for of, n in zip(rosproxies, (5, 6), strict=True))
         robot2.end_all()
 
 

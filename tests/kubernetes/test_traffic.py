@@ -70,11 +70,11 @@ def test_robot_hears_a_pod(library: str, on: str, world: World) -> None:
     world.heard[library, on].wait_for("inside", seconds=START)
 
 
-@pytest.mark.parametrize("word", ["robot", "far", "near"])
+@pytest.mark.parametrize("speaker", ["robot", "far", "near"])
 @pytest.mark.parametrize(("library", "on"), PLACES)
-def test_pod_hears(word: str, library: str, on: str, world: World) -> None:
+def test_pod_hears(speaker: str, library: str, on: str, world: World) -> None:
     """The robot, a pod of the other node, a pod of its own node."""
-    world.ears[library, on].log.wait_for(word, seconds=START)
+    world.ears[library, on].log.wait_for(speaker, seconds=START)
 
 
 @pytest.mark.parametrize(("library", "on"), PLACES)

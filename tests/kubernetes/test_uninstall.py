@@ -18,14 +18,14 @@ NAMESPACED = ("pods", "services", "secrets", "serviceaccounts", "roles", "rolebi
 
 def left() -> list[str]:
     """What there is of it in the cluster, as resource and name."""
-    found = []
+    leftovers = []
     for resource in CLUSTER_WIDE + NAMESPACED:
         for body in api.objects(resource):
             name = body["metadata"]["name"]
             own = body["metadata"].get("labels", {}).get("app.kubernetes.io/name") in NAMES
             if own or ("rosproxy" in name and body["metadata"].get("namespace") != "default"):
-                found.append(f"{resource} {body['metadata'].get('namespace', '')}/{name}")
-    return found
+                leftovers.append(f"{resource} {body['metadata'].get('namespace', '')}/{name}")
+    return leftovers
 
 
 def test_nothing_is_left(net: Namespace, robot: Robot) -> None:

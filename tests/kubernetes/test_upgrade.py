@@ -52,23 +52,24 @@ def test_another_key_of_the_tokens(net: Namespace, robot: Robot) -> None:
         net.idle(on=node)
     with flow(net, robot, "roscpp") as traffic:
         before = {node: made.the_proxy(node) for node in ("node1", "node2")}
-        hashes = {node: _hash(one) for node, one in before.items()}
-        there: list[int] = []
+        hashes = {node: _hash(proxy) for node, proxy in before.items()}
+        counts: list[int] = []
 
         def anew() -> bool:
-            now = {one.on: one for one in made.proxies}
-            there.append(len(now))
+            now = {proxy.on: proxy for proxy in made.proxies}
+            counts.append(len(now))
             return now.keys() == before.keys() and not (
-                {one.uid_then for one in now.values()} & {one.uid_then for one in before.values()}
+                {proxy.uid_then for proxy in now.values()}
+                & {proxy.uid_then for proxy in before.values()}
             )
 
         started = time.time()
         api.patch("secrets", release.NAMESPACE, f"{release.FULL_NAME}-key", {"data": None})
         wait_until(anew, 90, made.tell)
-        assert min(there) == 1
-        for node, one in before.items():
+        assert min(counts) == 1
+        for node, proxy in before.items():
             after = made.the_proxy(node)
-            assert after.ports == one.ports
+            assert after.ports == proxy.ports
             assert _hash(after) not in ("", hashes[node])
         traffic.wait(since=time.time(), seconds=60)
         note(f"another key, two proxies made anew: {traffic.gaps(started)}")

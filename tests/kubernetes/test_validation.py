@@ -95,8 +95,8 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
      {"ros": "1,2", "master": GOOD, "multicast": True}, {"ros": 1, "master": GOOD}],
 )  # fmt: skip
 def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:
-    found = rosproxy(net.name, **spec).body["spec"]
-    assert spec.items() <= found.items()
+    stored = rosproxy(net.name, **spec).body["spec"]
+    assert spec.items() <= stored.items()
 
 
 def test_defaults_are_filled_in(net: Namespace) -> None:

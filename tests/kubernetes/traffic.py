@@ -74,9 +74,9 @@ def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Itera
             "--patience", str(START))  # fmt: skip
     replies = robot.node(names[2], library, *call)
     try:
-        found = Flow(talker, listener, server, outward, replies)
-        found.wait(seconds=START)
-        yield found
+        traffic = Flow(talker, listener, server, outward, replies)
+        traffic.wait(seconds=START)
+        yield traffic
     finally:
         for name in names:
             robot.end(name)
@@ -96,5 +96,5 @@ def _is_known(namespace: str) -> bool:
     services = api.objects("services", namespace, PROXY_OF)
     rules = [inside(node, "iptables-save") for node in NODES]
     return bool(services) and all(
-        one["spec"]["clusterIP"] in text for one in services for text in rules
+        service["spec"]["clusterIP"] in text for service in services for text in rules
     )

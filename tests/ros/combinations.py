@@ -27,7 +27,7 @@ VIEWS = {
 }
 """Where a tool runs, and where the node is that it is asked about."""
 
-each_view = pytest.mark.parametrize(("side", "where"), VIEWS.values(), ids=VIEWS.keys())
+each_view = pytest.mark.parametrize(("side", "machine"), VIEWS.values(), ids=VIEWS.keys())
 
 _LIBRARIES_SEEN = {
     "inside-about-itself": ("rospy",),
@@ -36,9 +36,15 @@ _LIBRARIES_SEEN = {
     "outside-about-inside": LIBRARIES,
 }
 each_view_of_a_library = pytest.mark.parametrize(
-    ("library", "side", "where"),
-    [(library, *VIEWS[view]) for view, found in _LIBRARIES_SEEN.items() for library in found],
-    ids=[f"{library}-{view}" for view, found in _LIBRARIES_SEEN.items() for library in found],
+    ("library", "side", "machine"),
+    [
+        (library, *VIEWS[view])
+        for view, libraries in _LIBRARIES_SEEN.items()
+        for library in libraries
+    ],
+    ids=[
+        f"{library}-{view}" for view, libraries in _LIBRARIES_SEEN.items() for library in libraries
+    ],
 )
 """Each view, and where a tool of outside asks through the proxy each library; else in turn."""
 

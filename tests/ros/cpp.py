@@ -49,17 +49,17 @@ def _compile(binary: Path) -> None:
         for source in NODES.glob("*.cpp")
     }
     compilers = [
-        subprocess.Popen(["g++", *flags, "-c", str(source), "-o", str(part)])
-        for source, part in parts.items()
+        subprocess.Popen(["g++", *flags, "-c", str(source), "-o", str(object_file)])
+        for source, object_file in parts.items()
     ]
     codes = [compiler.wait() for compiler in compilers]
     if any(codes):
         raise RuntimeError("the C++ test nodes do not compile: see above")
     unfinished = binary.with_suffix(f".{os.getpid()}")
-    objects = [str(part) for part in parts.values()]
+    objects = [str(object_file) for object_file in parts.values()]
     subprocess.run(["g++", *objects, "-o", str(unfinished), *_pkg_config("--libs")], check=True)
-    for part in parts.values():
-        part.unlink()
+    for object_file in parts.values():
+        object_file.unlink()
     unfinished.rename(binary)
 
 

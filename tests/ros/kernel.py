@@ -36,8 +36,8 @@ def status(lab: Lab) -> dict[str, Any]:
 
 def node_status(lab: Lab, name: str) -> dict[str, Any]:
     """What the status says of one node."""
-    found = (node for node in status(lab)["nodes"] if f"/{name}" in node["nodes"])
-    return next(found, {"data_plane": {}, "connections": []})
+    matching_nodes = (node for node in status(lab)["nodes"] if f"/{name}" in node["nodes"])
+    return next(matching_nodes, {"data_plane": {}, "connections": []})
 
 
 def in_table(lab: Lab, name: str) -> bool:

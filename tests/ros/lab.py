@@ -70,9 +70,9 @@ class Lab:
     def place(self, role: str) -> Place:
         return self.topology.places[role]
 
-    def unique(self, word: str) -> str:
+    def unique(self, prefix: str) -> str:
         """A name that no other test uses."""
-        return f"{word}_{next(self._numbers)}"
+        return f"{prefix}_{next(self._numbers)}"
 
     # roscore and proxy
 
@@ -227,10 +227,10 @@ class Lab:
 
         def is_so() -> bool:
             shown[:] = self.links(topic)
-            return any(wanted.items() <= one.items() and one.get("hz") for one in shown)
+            return any(wanted.items() <= link.items() and link.get("hz") for link in shown)
 
         wait_until(f"the page shows {topic}: {wanted}", is_so)
-        return next(one for one in shown if one.get("hz"))
+        return next(link for link in shown if link.get("hz"))
 
     def environment(self, role: str) -> dict[str, str]:
         """All that a ROS program on this machine gets: no ROS_IP, no ROS_HOSTNAME."""
@@ -295,7 +295,7 @@ class Lab:
     def registered(self, name: str) -> bool:
         """Whether any publication, subscription or service of this node is registered."""
         state = self.ask_master("getSystemState")
-        return any(_absolute(name) in names for part in state for _, names in part)
+        return any(_absolute(name) in names for table in state for _, names in table)
 
     def users(self, topic: str) -> tuple[list[str], list[str]]:
         """The names of the publishers and of the subscribers of a topic."""

@@ -60,17 +60,17 @@ class Process:
         deadline = time.monotonic() + timeout
         while True:
             ended = self.returncode is not None
-            found = list(compiled.finditer(self.output(since)))
-            if len(found) >= count:
-                return found
+            matches = list(compiled.finditer(self.output(since)))
+            if len(matches) >= count:
+                return matches
             if ended or time.monotonic() > deadline:
-                raise AssertionError(self._missed(pattern, count, len(found), timeout))
+                raise AssertionError(self._missed(pattern, count, len(matches), timeout))
             time.sleep(_POLL)
 
-    def _missed(self, pattern: str, count: int, found: int, timeout: float) -> str:
+    def _missed(self, pattern: str, count: int, matched: int, timeout: float) -> str:
         state = f"within {timeout:g} s" if self.returncode is None else "before it ended"
         return (
-            f"{self.title} printed {pattern!r} {found} of {count} times {state}; "
+            f"{self.title} printed {pattern!r} {matched} of {count} times {state}; "
             f"its output:\n{self.output()[-3000:]}"
         )
 
@@ -140,12 +140,12 @@ def _execute(
 
 def descendants(pid: int) -> list[int]:
     """The children of a process, their children, and so on."""
-    found = []
+    pids = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         with contextlib.suppress(OSError):
             for child in map(int, task.read_text().split()):
-                found += [child, *descendants(child)]
-    return found
+                pids += [child, *descendants(child)]
+    return pids
 
 
 def stop_all(processes: Sequence[Process], patience: float = STOP_PATIENCE) -> None:

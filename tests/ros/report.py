@@ -38,8 +38,8 @@ class Report:
 
     def lines(self) -> list[str]:
         passed = sum(self.outcomes.values())
-        where = "no boundary, no proxy" if self.flat else "through the proxy"
-        lines = [f"real ROS nodes, {where}: {passed} of {self.run} cases passed"]
+        route = "no boundary, no proxy" if self.flat else "through the proxy"
+        lines = [f"real ROS nodes, {route}: {passed} of {self.run} cases passed"]
         lines += [f"  {name}: {good} of {run}" for name, (good, run) in self.by_file().items()]
         for name, times in sorted(self.times.items()):
             lines.append(f"  {name}: {', '.join(f'{seconds:.2f}' for seconds in times)} s")

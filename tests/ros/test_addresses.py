@@ -19,21 +19,21 @@ NOWHERE = {"ROS_HOSTNAME": "a-name-that-resolves-nowhere"}
 
 def exchange_messages(lab: Lab, library: str, sink: str, **options: Any) -> None:
     """A publisher in c1, started with `options`, is heard in `sink`; and the other way."""
-    there, back = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
-    lab.node(library, "c1", "pub", topic=there, **options)
-    receiver = lab.node(library, "c1", "sub", topic=back, **options)
-    lab.node("roscpp", sink, "sub", topic=there).wait_for_count("^got hello ", 3)
-    lab.node("rospy", sink, "pub", topic=back)
+    forward_topic, back_topic = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
+    lab.node(library, "c1", "pub", topic=forward_topic, **options)
+    receiver = lab.node(library, "c1", "sub", topic=back_topic, **options)
+    lab.node("roscpp", sink, "sub", topic=forward_topic).wait_for_count("^got hello ", 3)
+    lab.node("rospy", sink, "pub", topic=back_topic)
     receiver.wait_for_count("^got hello ", 3)
 
 
 def call_both_ways(lab: Lab, library: str, sink: str, **options: Any) -> None:
     """A server in c1, started with `options`, is called from `sink`; and the other way."""
-    there, back = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
-    lab.node(library, "c1", "serve", service=there, **options)
-    lab.node("roscpp", sink, "call", service=there).wait_for("^reply ask 0 ")
-    lab.node("rospy", sink, "serve", service=back)
-    lab.node(library, "c1", "call", service=back, **options).wait_for("^reply ask 0 ")
+    forward_service, back_service = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
+    lab.node(library, "c1", "serve", service=forward_service, **options)
+    lab.node("roscpp", sink, "call", service=forward_service).wait_for("^reply ask 0 ")
+    lab.node("rospy", sink, "serve", service=back_service)
+    lab.node(library, "c1", "call", service=back_service, **options).wait_for("^reply ask 0 ")
 
 
 @pytest.mark.boundary
@@ -91,14 +91,14 @@ def test_nodes_in_a_namespace(lab: Lab, first: str, second: str, source: str, si
 @each_library
 def test_two_containers_with_the_same_ports(lab: Lab, library: str) -> None:
     """Both nodes have the same port numbers, each on its own address."""
-    nodes = {where: lab.unique("twin") for where in ("c1", "c2")}
+    nodes = {role: lab.unique("twin") for role in ("c1", "c2")}
     fixed = (
         {"xmlrpc_port": 20001, "tcpros_port": 20002}
         if library == "rospy"
         else {"remap": ["__tcpros_server_port:=20003"]}
     )
-    for where, name in nodes.items():
-        lab.node(library, where, "pub", name=name, topic=f"/{name}", word=name, **fixed)
+    for role, name in nodes.items():
+        lab.node(library, role, "pub", name=name, topic=f"/{name}", word=name, **fixed)
     for name in nodes.values():
         for listener in LIBRARIES:
             receiver = lab.node(listener, "out", "sub", topic=f"/{name}")

@@ -147,8 +147,8 @@ def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) 
     """Heard outside and inside, by those who listened before and after; it lives on."""
     name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
     before = {
-        (where, peer): lab.node(peer, where, "sub", topic=topic)
-        for where in ("out", "c2")
+        (role, peer): lab.node(peer, role, "sub", topic=topic)
+        for role in ("out", "c2")
         for peer in LIBRARIES
     }
     node = stray(lab, library, "pub", name=name, topic=topic)
@@ -161,9 +161,9 @@ def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) 
     for peer in LIBRARIES:
         before["out", peer].wait_for_count("^got ", 3)
     measure("adopted: heard outside", time.time() - started)
-    for where in ("out", "c2", "c1"):
+    for role in ("out", "c2", "c1"):
         for peer in LIBRARIES:
-            lab.node(peer, where, "sub", topic=topic).wait_for_count("^got ", 3)
+            lab.node(peer, role, "sub", topic=topic).wait_for_count("^got ", 3)
     assert node.returncode is None
     assert_no_gap(before["c2", "roscpp"])
     assert_no_gap(before["c2", "rospy"])
@@ -189,9 +189,9 @@ def test_a_stray_subscriber_is_adopted(lab: Lab, library: str) -> None:
     assert_no_gap(node)
     for role in ("out", "c2", "c1"):
         for peer in LIBRARIES:
-            word = lab.unique("word")
-            lab.node(peer, role, "pub", topic=topic, word=word)
-            node.wait_for_count(f"^got {word} ", 3)
+            text = lab.unique("word")
+            lab.node(peer, role, "pub", topic=topic, word=text)
+            node.wait_for_count(f"^got {text} ", 3)
 
 
 @pytest.mark.direct
@@ -296,8 +296,8 @@ def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> N
         for name in names:
             lab.node(library, "out", "sub", topic=f"/{name}/t").wait_for_count("^got ", 3)
         for service in (f"/{name}/get_loggers" for name in names):
-            found = f"the service {service} is behind the proxy"
-            wait_until(found, lambda s=service: ":115" in provider(lab, s))
+            expectation = f"the service {service} is behind the proxy"
+            wait_until(expectation, lambda s=service: ":115" in provider(lab, s))
         assert [node.returncode for node in nodes] == [None] * 4
         assert all(is_leased(lab, name) for name in names)
 
@@ -373,8 +373,8 @@ def test_a_container_that_has_moved(
     node = lab.node(library, "c3", "more", name=name, env=env, **options)
     server = lab.node(library, "c3", "serve", name=f"{name}_s", service=f"/{name}/s", env=env)
     receiver = lab.node(library, "c3", "sub", name=f"{name}_r", topic=f"/{name}/c", env=env)
-    for one in (node, server, receiver):
-        one.wait_for("^ready")
+    for process in (node, server, receiver):
+        process.wait_for("^ready")
     peers = [lab.node(p, r, "sub", topic=f"/{name}/a") for r in ("out", "c2") for p in LIBRARIES]
     for peer in peers:
         peer.wait_for_count("^got ", 3)
@@ -394,9 +394,9 @@ def test_a_container_that_has_moved(
         for role in ("out", "c2"):
             lab.node(library, role, "sub", topic=f"/{name}/b").wait_for_count("^got ", 3)
             lab.node(library, role, "call", service=f"/{name}/s").wait_for("^reply ask 0 ")
-            word = lab.unique("word")
-            lab.node(library, role, "pub", topic=f"/{name}/c", word=word)
-            receiver.wait_for_count(f"^got {word} ", 3)
+            text = lab.unique("word")
+            lab.node(library, role, "pub", topic=f"/{name}/c", word=text)
+            receiver.wait_for_count(f"^got {text} ", 3)
         assert lab.node_uri(name) == before
         assert lab.tell("/containers", moved={old: place.address})["moved"] == 0
         assert node.stop() == 0

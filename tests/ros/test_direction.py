@@ -34,8 +34,8 @@ def test_inside_is_heard_and_hears_nobody(lab: Lab, library: str) -> None:
     caller = lab.node(library, "c1", "call", service=service)
     lab.node(library, "c1", "pub", topic=f"{topic}/out")
     lab.node(library, "out", "sub", topic=f"{topic}/out").wait_for_count("^got ", 20)
-    found = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
-    assert "--direction both" in found, found
+    report = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
+    assert "--direction both" in report, report
     assert "got " not in deaf.output()
     assert "reply " not in caller.output()
 
@@ -58,17 +58,19 @@ def beside(lab: Lab) -> Iterator[dict[str, str]]:
     stop_all([proxy])
 
 
-@pytest.mark.parametrize(("one", "other"), [LIBRARIES, LIBRARIES[::-1]], ids=str)
+@pytest.mark.parametrize(
+    ("outside_library", "inside_library"), [LIBRARIES, LIBRARIES[::-1]], ids=str
+)
 def test_nodes_of_outside_may_run_beside_the_proxy(
-    lab: Lab, beside: dict[str, str], one: str, other: str
+    lab: Lab, beside: dict[str, str], outside_library: str, inside_library: str
 ) -> None:
     """On its machine, by an address that is the proxy's own as well."""
     topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
-    there = {"ROS_IP": OUT_HOST}
-    lab.node(one, "host", "pub", topic=topic, env=there)
-    lab.node(one, "host", "serve", service=service, env=there)
-    back = lab.node(one, "host", "sub", topic=f"{topic}/back", env=there)
-    lab.node(other, "c1", "sub", topic=topic, env=beside).wait_for_count("^got hello ", 5)
-    lab.node(other, "c1", "call", service=service, env=beside).wait_for("^reply ask 0 ")
-    lab.node(other, "c1", "pub", topic=f"{topic}/back", env=beside)
+    host_env = {"ROS_IP": OUT_HOST}
+    lab.node(outside_library, "host", "pub", topic=topic, env=host_env)
+    lab.node(outside_library, "host", "serve", service=service, env=host_env)
+    back = lab.node(outside_library, "host", "sub", topic=f"{topic}/back", env=host_env)
+    lab.node(inside_library, "c1", "sub", topic=topic, env=beside).wait_for_count("^got hello ", 5)
+    lab.node(inside_library, "c1", "call", service=service, env=beside).wait_for("^reply ask 0 ")
+    lab.node(inside_library, "c1", "pub", topic=f"{topic}/back", env=beside)
     back.wait_for_count("^got hello ", 5)

@@ -26,31 +26,33 @@ PLAN = replace(SHARED, name="p", isolated=True)
 
 def told(lab: Lab, method: str, name: str, role: str = "c1") -> tuple[str, int]:
     """Where the master has a node or service, as it is told to a machine."""
-    where = urlsplit(lab.ask_master(method, name, role=role))
-    assert where.hostname
-    assert where.port
-    return where.hostname, where.port
+    parts = urlsplit(lab.ask_master(method, name, role=role))
+    assert parts.hostname
+    assert parts.port
+    return parts.hostname, parts.port
 
 
-def greet(lab: Lab, where: tuple[str, int], **fields: str) -> dict[str, str]:
+def greet(lab: Lab, address: tuple[str, int], **fields: str) -> dict[str, str]:
     """What a TCPROS header is answered with that comes from inside."""
     header = {"callerid": "/spy", "md5sum": "*", "type": "*", **fields}
-    with lab.place("c1").entered(), socket.create_connection(where, timeout=20) as conn:
+    with lab.place("c1").entered(), socket.create_connection(address, timeout=20) as conn:
         conn.sendall(encode_header(header))
         stream = conn.makefile("rb")
         return decode_header(stream.read(int.from_bytes(stream.read(4), "little")))
 
 
-@pytest.mark.parametrize(("one", "other"), [LIBRARIES, LIBRARIES[::-1]], ids=LIBRARIES)
+@pytest.mark.parametrize(
+    ("outside_library", "inside_library"), [LIBRARIES, LIBRARIES[::-1]], ids=LIBRARIES
+)
 def test_what_is_denied_is_not_reached_by_a_known_address_either(
-    lab: Lab, one: str, other: str
+    lab: Lab, outside_library: str, inside_library: str
 ) -> None:
     topic, service, name = f"/{lab.unique('t')}", f"/{lab.unique('s')}", lab.unique("talker")
-    lab.node(one, "out", "pub", name=name, topic=topic, rate=20)
-    lab.node(one, "out", "serve", service=service).wait_for("^ready")
-    receiver = lab.node(other, "c1", "sub", topic=topic)
+    lab.node(outside_library, "out", "pub", name=name, topic=topic, rate=20)
+    lab.node(outside_library, "out", "serve", service=service).wait_for("^ready")
+    receiver = lab.node(inside_library, "c1", "sub", topic=topic)
     receiver.wait_for_count("^got ", 5)
-    lab.node(other, "c2", "call", service=service, count=3).wait_for("^done")
+    lab.node(inside_library, "c2", "call", service=service, count=3).wait_for("^done")
     talker, server = told(lab, "lookupNode", f"/{name}"), told(lab, "lookupService", service)
     assert "error" not in greet(lab, talker, topic=topic)
     assert "error" not in greet(lab, server, service=service)
@@ -77,8 +79,8 @@ def test_who_wants_datagrams_alone_is_told_what_that_needs(lab: Lab) -> None:
     lab.node("roscpp", "out", "pub", topic=topic)
     deaf = lab.node("roscpp", "c1", "sub", topic=topic, udp=1)
     deaf.wait_for("^ready")
-    found = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
-    assert "if it wants UDP alone: --udp" in found, found
+    report = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
+    assert "if it wants UDP alone: --udp" in report, report
     assert "got " not in deaf.output()
 
 
@@ -89,5 +91,5 @@ def test_the_live_page_shows_what_comes_in_by_the_proxy(lab: Lab, library: str) 
     lab.node(library, "c1", "sub", topic=topic).wait_for_count("^got ", 5)
     shown = lab.wait_shown(topic, carried="splice", state="ok", flows=True)
     status = json.loads(lab.rosproxy("status", "--json").output)
-    ports = {one["uri"]: one["port"] for one in status["stand_ins"]}
+    ports = {stand_in["uri"]: stand_in["port"] for stand_in in status["stand_ins"]}
     assert shown["port"] == ports[lab.node_uri(name)]

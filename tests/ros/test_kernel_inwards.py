@@ -32,7 +32,7 @@ def talk(lab: Lab, library: str, sink: str) -> tuple[str, Process, Process]:
 def stand_in(lab: Lab, name: str) -> dict[str, Any]:
     """What the status says of the port that stands in for a node outside."""
     uri = lab.node_uri(name)
-    return next(one for one in kernel.status(lab)["stand_ins"] if one["uri"] == uri)
+    return next(row for row in kernel.status(lab)["stand_ins"] if row["uri"] == uri)
 
 
 def wait_forwarded(lab: Lab, name: str) -> dict[str, Any]:
@@ -102,20 +102,20 @@ def test_who_is_not_selected_gets_nothing(lab: Lab) -> None:
     """The kernel sends on what comes from those alone who may use the proxy as their master."""
     topic, _, receiver = talk(lab, "rospy", "roscpp")
     port = wait_forwarded(lab, name_of(lab, topic))["port"]
-    there, other = lab.place("c1").address, lab.place("c2").address
+    c1_address, c2_address = lab.place("c1").address, lab.place("c2").address
     code = f"import socket, time; socket.create_connection(('{lab.place('px').address}', {port}), "
     code += "2); time.sleep(1)"
 
     def forwarded() -> bool:
-        before = kernel.flows(lab).count(f"src={other}")
+        before = kernel.flows(lab).count(f"src={c2_address}")
         lab.run("c2", "python3", "-c", code)
-        return kernel.flows(lab).count(f"src={other}") > before
+        return kernel.flows(lab).count(f"src={c2_address}") > before
 
     assert forwarded()
-    lab.tell("/containers", selected=[there])
+    lab.tell("/containers", selected=[c1_address])
     wait_until("the other one is not forwarded", lambda: not forwarded(), LIMIT)
     kernel.wait_more(receiver)
-    lab.tell("/containers", selected=[there, other])
+    lab.tell("/containers", selected=[c1_address, c2_address])
     wait_until("it is forwarded again", forwarded, LIMIT)
 
 
@@ -123,8 +123,8 @@ def test_a_rule_takes_it_back(lab: Lab) -> None:
     """What the kernel forwards nobody looks at: with a rule for it, topics go through the proxy."""
     topic, _, receiver = talk(lab, "rospy", "rospy")
     other, _, deaf = talk(lab, "rospy", "roscpp")
-    for one in (topic, other):
-        wait_forwarded(lab, name_of(lab, one))
+    for forwarded_topic in (topic, other):
+        wait_forwarded(lab, name_of(lab, forwarded_topic))
     rules = [f"deny subscribe {other}"]
     assert lab.tell("/policy", layers=[{"name": "test", "rules": rules}])["cut"] >= 2
     kernel.wait_more(receiver)

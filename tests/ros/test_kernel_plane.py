@@ -30,7 +30,11 @@ PRIVILEGE = "net_admin"
 def test_the_kernel_forwards_a_topic(lab: Lab, publisher: str, subscriber: str) -> None:
     name, _, receiver = talk(lab, publisher, subscriber)
     plane = kernel.wait_forwarded(lab, name)
-    topic = next(one for one in kernel.node_status(lab, name)["publishes"] if one != "/rosout")
+    topic = next(
+        published
+        for published in kernel.node_status(lab, name)["publishes"]
+        if published != "/rosout"
+    )
     lab.wait_shown(topic, carried="kernel", port=plane["port"], state="ok", flows=True)
     assert plane["reason"] == ""
     assert plane["received"] > 0

@@ -36,12 +36,12 @@ each_role = pytest.mark.parametrize("role", ROLES.values(), ids=ROLES.keys())
 
 
 def start(
-    lab: Lab, library: str, role: str, where: str = "c1", name: str = ""
+    lab: Lab, library: str, role: str, machine: str = "c1", name: str = ""
 ) -> tuple[Process, str]:
     """A registered node of that role, and its name."""
     name = name or lab.unique("mortal")
     names = {"serve": {"service": f"/{name}/service"}}.get(role, {"topic": f"/{name}/topic"})
-    node = lab.node(library, where, role, name=name, **names)
+    node = lab.node(library, machine, role, name=name, **names)
     node.wait_for("^ready")
     lab.wait_registered(name)
     return node, name
@@ -98,30 +98,30 @@ def test_a_node_answers_over_one_connection_until_it_ends(lab: Lab, library: str
     """As it is asked by the proxy while it is well."""
     node, name = start(lab, library, "pub")
     own = lab.ask_master("lookupNode", f"/{name}", role="c1")
-    where = HostPort(lab.place("c1").address, urlsplit(own).port)
+    address = HostPort(lab.place("c1").address, urlsplit(own).port)
     with lab.place("host").entered():
-        asyncio.run(asked_until_it_ends(where, node))
+        asyncio.run(asked_until_it_ends(address, node))
 
 
-async def asked_until_it_ends(where: HostPort, node: Process) -> None:
+async def asked_until_it_ends(address: HostPort, node: Process) -> None:
     upstream = MasterClient("http://127.0.0.1:1", "test", Metrics([]))
     nodes = NodeClient(upstream, 5.0)
-    kept = KeptConnections[str](nodes, within=60.0)
-    kept.most = 1
-    pid = (await nodes.probe(where)).pid
+    connections = KeptConnections[str](nodes, within=60.0)
+    connections.most = 1
+    pid = (await nodes.probe(address)).pid
     assert pid is not None
 
     def told() -> list[ProbeResult | None]:
-        return list(kept.collect(0.0).values())
+        return list(connections.collect(0.0).values())
 
-    assert kept.ask("first", where, pid, 0.0)
+    assert connections.ask("first", address, pid, 0.0)
     for _ in range(3):
-        assert kept.ask("first", where, pid, 0.0)
-        assert not kept.ask("second", where, pid, 0.0)  # that would be another connection
+        assert connections.ask("first", address, pid, 0.0)
+        assert not connections.ask("second", address, pid, 0.0)  # that would be another connection
         wait_until("it answers", lambda: told() == [ProbeResult.ANSWERED])
     node.kill()
     wait_until("its end is noticed", lambda: told() == [None])
-    kept.close_all()
+    connections.close_all()
     await upstream.close()
 
 
@@ -170,10 +170,10 @@ WAYS_TO_END = {
 
 
 @pytest.mark.parametrize("way", WAYS_TO_END.values(), ids=WAYS_TO_END.keys())
-@pytest.mark.parametrize("where", ["c1", "c2"], ids=["same-address", "another-address"])
+@pytest.mark.parametrize("machine", ["c1", "c2"], ids=["same-address", "another-address"])
 @each_library
 def test_a_restart_under_the_same_name(
-    lab: Lab, library: str, where: str, way: signal.Signals | None
+    lab: Lab, library: str, machine: str, way: signal.Signals | None
 ) -> None:
     """Subscribers that heard the old node hear the new one, without being told."""
     name = lab.unique("phoenix")
@@ -186,7 +186,7 @@ def test_a_restart_under_the_same_name(
         assert old.stop() == 0
     elif way is signal.SIGKILL:
         old.kill()
-    new = lab.node(library, where, "pub", name=name, topic=topic, word="new")
+    new = lab.node(library, machine, "pub", name=name, topic=topic, word="new")
     for receiver in receivers:
         receiver.wait_for_count("^got new ", 3)
     if way is None:
@@ -195,14 +195,14 @@ def test_a_restart_under_the_same_name(
 
 
 @each_library
-@pytest.mark.parametrize("where", ["c1", "c2"], ids=["same-address", "another-address"])
+@pytest.mark.parametrize("machine", ["c1", "c2"], ids=["same-address", "another-address"])
 def test_a_server_killed_and_restarted_under_the_same_name(
-    lab: Lab, library: str, where: str
+    lab: Lab, library: str, machine: str
 ) -> None:
     old, name = start(lab, library, "serve")
     lab.node("roscpp", "out", "call", service=f"/{name}/service").wait_for("^reply ask 0 ")
     old.kill()
-    new, _ = start(lab, library, "serve", where, name)
+    new, _ = start(lab, library, "serve", machine, name)
     for caller in ("out", "c2"):
         client = lab.node(library, caller, "call", service=f"/{name}/service", size=999)
         client.wait_for("^reply ask 0 size 999 ")

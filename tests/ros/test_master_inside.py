@@ -18,7 +18,7 @@ ADVERTISE_HOST = ADVERTISED_NAME
 PROXY_OPTIONS = ("--publish-master", str(PUBLISHED_MASTER_PORT))
 
 each_mixed_pair = pytest.mark.parametrize(
-    ("first", "second"), [("rospy", "roscpp"), ("roscpp", "rospy")], ids=lambda word: word
+    ("first", "second"), [("rospy", "roscpp"), ("roscpp", "rospy")], ids=lambda library: library
 )
 
 

@@ -114,10 +114,10 @@ def test_uris_are_the_same_inside_and_outside(lab: Lab, library: str) -> None:
     _, name = test_rosnode.talker(lab, library, "out")
     uris = {lab.run(side, "rosnode", "list", "-a", name).output for side in ("c1", "out")}
     assert len(uris) == 1
-    found = re.match(r"http://robot:(\d+)/ ", uris.pop())
-    assert found
-    assert int(found[1]) in stand_ins(lab)
-    assert f" {found[1]}" in lab.rosproxy("status").output
+    match = re.match(r"http://robot:(\d+)/ ", uris.pop())
+    assert match
+    assert int(match[1]) in stand_ins(lab)
+    assert f" {match[1]}" in lab.rosproxy("status").output
     assert "Nothing wrong was found." in lab.rosproxy("doctor", name).output
 
 
@@ -173,11 +173,11 @@ def test_a_killed_service_is_missed_and_its_successor_found(
 def test_a_publisher_that_comes_back_at_the_same_port_is_heard(lab: Lab, library: str) -> None:
     name, ports = lab.unique("phoenix"), {"xmlrpc_port": 40001, "tcpros_port": 40002}
     topic = f"/{name}/topic"
-    for word in ("first", "second"):
-        node = lab.node("rospy", "out", "pub", name=name, topic=topic, word=word, **ports)
+    for text in ("first", "second"):
+        node = lab.node("rospy", "out", "pub", name=name, topic=topic, word=text, **ports)
         node.wait_for("^sent ")
         receiver = lab.node(library, "c1", "sub", topic=topic)
-        receiver.wait_for_count(f"^got {word} ", 3)
+        receiver.wait_for_count(f"^got {text} ", 3)
         assert 40001 in stand_ins(lab)
         node.kill()
         lab.run("c1", "rosnode", "ping", "-c", "1", name, check=False)

@@ -51,10 +51,10 @@ def tell(lab: Lab, *rules: str, mode: str = "enforce") -> dict[str, Any]:
 
 def lease(lab: Lab, name: str) -> tuple[str, int]:
     """Where outside reaches a node."""
-    where = urlsplit(lab.node_uri(name) or "")
-    assert where.hostname
-    assert where.port
-    return where.hostname, where.port
+    parts = urlsplit(lab.node_uri(name) or "")
+    assert parts.hostname
+    assert parts.port
+    return parts.hostname, parts.port
 
 
 def greet(lab: Lab, name: str, **fields: str) -> dict[str, str]:
@@ -172,8 +172,8 @@ def test_what_is_denied_of_outside_is_hidden_inside(lab: Lab, first: str, second
     lab.node(first, "c2", "pub", topic=topic, word="near", rate=20)
     receiver.wait_for_count("^got near ", 5)
     assert "got far " not in receiver.output()
-    found = lab.run("c1", "rosservice", "call", service, "{}", check=False)
-    assert found.returncode != 0
+    called = lab.run("c1", "rosservice", "call", service, "{}", check=False)
+    assert called.returncode != 0
     lab.run("out", "rosparam", "set", "/secret/key", "1")
     refused = lab.run("c1", "rosparam", "get", "/secret/key", check=False)
     assert (refused.returncode, "deny get-param" in refused.output) == (1, True)

@@ -113,8 +113,8 @@ def test_subscribers_from_before_hear_publishers_from_after(
 def test_nodes_keep_their_ports_and_can_be_ended_after_a_restart(lab: Lab, library: str) -> None:
     names = [lab.unique("kept") for _ in range(4)]
     nodes = [
-        lab.node(library, where, "pub", name=name, topic=f"/{name}/topic")
-        for name, where in zip(names, ("c1", "c1", "c2", "c2"), strict=True)
+        lab.node(library, role, "pub", name=name, topic=f"/{name}/topic")
+        for name, role in zip(names, ("c1", "c1", "c2", "c2"), strict=True)
     ]
     for name in names:
         lab.wait_registered(name)
@@ -196,11 +196,11 @@ def test_a_proxy_ended_by_sigterm_is_followed_by_another(lab: Lab, library: str)
 def test_inside_nodes_are_registered_again_after_roscore_was_killed(
     lab: Lab, library: str, measure: Measure
 ) -> None:
-    word = lab.unique("again")
-    names = {role: f"{word}_{role}" for role in ("pub", "sub", "serve")}
-    lab.node(library, "c1", "pub", name=names["pub"], topic=f"/{word}/from")
-    receiver = lab.node(library, "c1", "sub", name=names["sub"], topic=f"/{word}/to")
-    lab.node(library, "c2", "serve", name=names["serve"], service=f"/{word}/s")
+    stem = lab.unique("again")
+    names = {role: f"{stem}_{role}" for role in ("pub", "sub", "serve")}
+    lab.node(library, "c1", "pub", name=names["pub"], topic=f"/{stem}/from")
+    receiver = lab.node(library, "c1", "sub", name=names["sub"], topic=f"/{stem}/to")
+    lab.node(library, "c2", "serve", name=names["serve"], service=f"/{stem}/s")
     for name in names.values():
         lab.wait_registered(name)
     before = {name: lab.node_uri(name) for name in names.values()}
@@ -210,9 +210,9 @@ def test_inside_nodes_are_registered_again_after_roscore_was_killed(
     measure("registered again, roscore restarted", time.time() - answered)
     assert {name: lab.node_uri(name) for name in names.values()} == before
     for peer in LIBRARIES:
-        lab.node(peer, "out", "sub", topic=f"/{word}/from").wait_for_count("^got ", 3)
-        lab.node(peer, "out", "call", service=f"/{word}/s").wait_for("^reply ")
-        lab.node(peer, "out", "pub", topic=f"/{word}/to", word=f"new-{peer}")
+        lab.node(peer, "out", "sub", topic=f"/{stem}/from").wait_for_count("^got ", 3)
+        lab.node(peer, "out", "call", service=f"/{stem}/s").wait_for("^reply ")
+        lab.node(peer, "out", "pub", topic=f"/{stem}/to", word=f"new-{peer}")
         receiver.wait_for_count(f"^got new-{peer} ", 3)
 
 

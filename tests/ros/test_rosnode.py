@@ -9,17 +9,17 @@ from tests.ros.lab import Lab
 from tests.ros.processes import Process
 
 
-def talker(lab: Lab, library: str, where: str) -> tuple[Process, str]:
+def talker(lab: Lab, library: str, machine: str) -> tuple[Process, str]:
     """A publishing node that is registered, and its name."""
     name = lab.unique("talker")
-    node = lab.node(library, where, "pub", name=name, topic=f"/{name}_topic", rate=5)
+    node = lab.node(library, machine, "pub", name=name, topic=f"/{name}_topic", rate=5)
     node.wait_for("^sent ")
     return node, f"/{name}"
 
 
 @each_side
 def test_list_names_the_nodes_of_both_sides(lab: Lab, side: str) -> None:
-    names = {talker(lab, "roscpp", where)[1] for where in ("c1", "out")}
+    names = {talker(lab, "roscpp", machine)[1] for machine in ("c1", "out")}
     assert names <= set(lab.run(side, "rosnode", "list").output.split())
     with_uris = lab.run(side, "rosnode", "list", "-a").output
     for name in names:
@@ -27,8 +27,8 @@ def test_list_names_the_nodes_of_both_sides(lab: Lab, side: str) -> None:
 
 
 @each_view_of_a_library
-def test_info_reaches_the_node(lab: Lab, library: str, side: str, where: str) -> None:
-    node, name = talker(lab, library, where)
+def test_info_reaches_the_node(lab: Lab, library: str, side: str, machine: str) -> None:
+    node, name = talker(lab, library, machine)
     output = lab.run(side, "rosnode", "info", name).output
     assert f"Pid: {node.pid}" in output
     assert f"* {name}_topic [std_msgs/String]" in output
@@ -48,15 +48,15 @@ def test_info_shows_connections_across_the_boundary(lab: Lab, library: str, side
 
 
 @each_view_of_a_library
-def test_ping_is_answered(lab: Lab, library: str, side: str, where: str) -> None:
-    _, name = talker(lab, library, where)
+def test_ping_is_answered(lab: Lab, library: str, side: str, machine: str) -> None:
+    _, name = talker(lab, library, machine)
     output = lab.run(side, "rosnode", "ping", "-c", "2", name).output
     assert len(re.findall(r"^xmlrpc reply from http://\S+\s+time=", output, re.MULTILINE)) == 2
 
 
 @each_side
 def test_ping_all_reaches_every_node(lab: Lab, side: str) -> None:
-    names = [talker(lab, "roscpp", where)[1] for where in ("c1", "c2", "out")]
+    names = [talker(lab, "roscpp", machine)[1] for machine in ("c1", "c2", "out")]
     output = lab.run(side, "rosnode", "ping", "--all").output
     for name in names:
         assert re.search(rf"pinging {name} with", output) or name in output
@@ -65,8 +65,8 @@ def test_ping_all_reaches_every_node(lab: Lab, side: str) -> None:
 
 
 @each_view_of_a_library
-def test_kill_ends_the_node(lab: Lab, library: str, side: str, where: str) -> None:
-    node, name = talker(lab, library, where)
+def test_kill_ends_the_node(lab: Lab, library: str, side: str, machine: str) -> None:
+    node, name = talker(lab, library, machine)
     output = lab.run(side, "rosnode", "kill", name).output
     assert f"killing {name}" in output
     assert "killed" in output
@@ -76,16 +76,16 @@ def test_kill_ends_the_node(lab: Lab, library: str, side: str, where: str) -> No
 
 @each_side
 def test_machine_lists_the_hosts_and_their_nodes(lab: Lab, side: str) -> None:
-    names = {where: talker(lab, "roscpp", where)[1] for where in ("c1", "out")}
+    names = {machine: talker(lab, "roscpp", machine)[1] for machine in ("c1", "out")}
     machines = lab.run(side, "rosnode", "machine").output.split()
-    found = {m: lab.run(side, "rosnode", "machine", m).output.split() for m in machines}
+    nodes_by_machine = {m: lab.run(side, "rosnode", "machine", m).output.split() for m in machines}
     for name in names.values():
-        assert any(name in nodes for nodes in found.values()), found
+        assert any(name in nodes for nodes in nodes_by_machine.values()), nodes_by_machine
 
 
 @each_view_of_a_library
-def test_cleanup_removes_a_killed_node(lab: Lab, library: str, side: str, where: str) -> None:
-    node, name = talker(lab, library, where)
+def test_cleanup_removes_a_killed_node(lab: Lab, library: str, side: str, machine: str) -> None:
+    node, name = talker(lab, library, machine)
     _, living = talker(lab, "roscpp", "c1")
     node.kill()
     output = lab.run(side, "sh", "-c", "yes | rosnode cleanup").output

@@ -12,17 +12,17 @@ from tests.ros.lab import Lab
 STAMPED = ("geometry_msgs/PointStamped", "{header: auto, point: {x: 1.0, y: 2.0, z: 3.0}}")
 
 
-def talker(lab: Lab, where: str, library: str = "roscpp", **options: int) -> tuple[str, str]:
+def talker(lab: Lab, machine: str, library: str = "roscpp", **options: int) -> tuple[str, str]:
     """Starts a publisher that runs at 20 Hz; gives its name and its topic."""
     name = lab.unique("talker")
     topic = f"/{name}/chatter"
-    lab.node(library, where, "pub", name=name, topic=topic, **options).wait_for("^sent ")
+    lab.node(library, machine, "pub", name=name, topic=topic, **options).wait_for("^sent ")
     return f"/{name}", topic
 
 
 @each_side
 def test_list_names_the_topics_of_both_sides(lab: Lab, side: str) -> None:
-    topics = {talker(lab, where)[1] for where in ("c1", "out")}
+    topics = {talker(lab, machine)[1] for machine in ("c1", "out")}
     assert topics <= set(lab.run(side, "rostopic", "list").output.split())
     published = lab.run(side, "rostopic", "list", "-p", "-v").output
     for topic in topics:
@@ -38,9 +38,9 @@ def test_list_by_host(lab: Lab, side: str) -> None:
 
 @each_view_of_a_library
 def test_info_names_publishers_with_their_address(
-    lab: Lab, library: str, side: str, where: str
+    lab: Lab, library: str, side: str, machine: str
 ) -> None:
-    name, topic = talker(lab, where, library)
+    name, topic = talker(lab, machine, library)
     output = lab.run(side, "rostopic", "info", topic).output
     assert "Type: std_msgs/String" in output
     assert re.search(rf"^ \* {name} \(http://\S+:\d+/\S*\)$", output, re.MULTILINE), output
@@ -54,8 +54,8 @@ def test_type_and_find(lab: Lab, side: str) -> None:
 
 
 @each_view_of_a_library
-def test_echo_prints_messages(lab: Lab, library: str, side: str, where: str) -> None:
-    _, topic = talker(lab, where, library)
+def test_echo_prints_messages(lab: Lab, library: str, side: str, machine: str) -> None:
+    _, topic = talker(lab, machine, library)
     output = lab.run(side, "rostopic", "echo", "-n", "3", topic).output
     assert len(re.findall(r'^data: "hello \d+ "$', output, re.MULTILINE)) == 3
 
@@ -72,16 +72,16 @@ def test_pub_once_and_at_a_rate(lab: Lab, source: str, sink: str) -> None:
 
 
 @each_view
-def test_hz_measures_the_rate(lab: Lab, side: str, where: str) -> None:
-    _, topic = talker(lab, where)
+def test_hz_measures_the_rate(lab: Lab, side: str, machine: str) -> None:
+    _, topic = talker(lab, machine)
     tool = lab.start(side, "rostopic", "hz", topic)
     rates = [float(match[1]) for match in tool.wait_for_count(r"average rate: ([\d.]+)", 2)]
     assert rates[-1] == pytest.approx(20, rel=0.25)
 
 
 @each_view
-def test_bw_measures_the_bandwidth(lab: Lab, side: str, where: str) -> None:
-    _, topic = talker(lab, where, size=10_000)
+def test_bw_measures_the_bandwidth(lab: Lab, side: str, machine: str) -> None:
+    _, topic = talker(lab, machine, size=10_000)
     tool = lab.start(side, "rostopic", "bw", topic)
     tool.wait_for_count(r"average: [\d.]+KB/s", 2)
     assert re.search(r"mean: 10\.00KB min: 10\.00KB max: 10\.00KB", tool.output()), tool.output()

@@ -45,8 +45,8 @@ def test_status_shows_a_node_with_its_addresses_and_connections(lab: Lab, librar
 
 def test_doctor_finds_nothing_wrong_with_healthy_nodes(lab: Lab) -> None:
     for library in ("rospy", "roscpp"):
-        for where in ("c1", "c2", "out"):
-            lab.node(library, where, "pub", topic="/healthy").wait_for("^sent ")
+        for role in ("c1", "c2", "out"):
+            lab.node(library, role, "pub", topic="/healthy").wait_for("^sent ")
     report = lab.rosproxy("doctor")
     assert "Nothing wrong was found." in report.output
 

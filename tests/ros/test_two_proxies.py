@@ -87,7 +87,7 @@ def second(lab: Lab) -> Iterator[Second]:
 
 
 mixed = pytest.mark.parametrize(
-    ("one", "other"), [LIBRARIES, LIBRARIES[::-1]], ids=["rospy-to-roscpp", "roscpp-to-rospy"]
+    ("library", "peer"), [LIBRARIES, LIBRARIES[::-1]], ids=["rospy-to-roscpp", "roscpp-to-rospy"]
 )
 ways = pytest.mark.parametrize(
     ("source", "sink"),
@@ -98,19 +98,21 @@ ways = pytest.mark.parametrize(
 
 @ways
 @mixed
-def test_topics(lab: Lab, second: Second, one: str, other: str, source: str, sink: str) -> None:
+def test_topics(lab: Lab, second: Second, library: str, peer: str, source: str, sink: str) -> None:
     topic = f"/{lab.unique('topic')}"
-    lab.node(one, source, "pub", topic=topic)
-    receiver = lab.node(other, sink, "sub", topic=topic)
+    lab.node(library, source, "pub", topic=topic)
+    receiver = lab.node(peer, sink, "sub", topic=topic)
     receiver.wait_for_count("^got hello ", 5)
 
 
 @ways
 @mixed
-def test_services(lab: Lab, second: Second, one: str, other: str, source: str, sink: str) -> None:
+def test_services(
+    lab: Lab, second: Second, library: str, peer: str, source: str, sink: str
+) -> None:
     service = f"/{lab.unique('service')}"
-    caller = lab.node(one, sink, "call", service=service)
-    lab.node(other, source, "serve", service=service)
+    caller = lab.node(library, sink, "call", service=service)
+    lab.node(peer, source, "serve", service=service)
     caller.wait_for("^reply ask 0 ")
 
 

@@ -24,7 +24,7 @@ PAIRS = [("c1", "c2"), ("c1", "out"), ("out", "c1"), ("out", "out")]
 RELAYED = [pair for pair in PAIRS if SIDES[pair[0]] != SIDES[pair[1]]]
 
 
-def each(pairs: list[tuple[str, str]]) -> pytest.MarkDecorator:
+def in_directions(pairs: list[tuple[str, str]]) -> pytest.MarkDecorator:
     """From where to where: publisher and subscriber."""
     ids = [f"{SIDES[source]}-to-{SIDES[sink]}" for source, sink in pairs]
     return pytest.mark.parametrize(("source", "sink"), pairs, ids=ids)
@@ -40,10 +40,10 @@ def relays(lab: Lab, topic: str) -> list[dict[str, Any]]:
     if lab.flat:
         return []
     document = json.loads(lab.rosproxy("status", "--json").output)
-    return [one for one in document["udpros"] if one["topic"] == topic]
+    return [relay for relay in document["udpros"] if relay["topic"] == topic]
 
 
-@each(PAIRS)
+@in_directions(PAIRS)
 @pytest.mark.parametrize("size", [0, 10000], ids=["small", "in-several-datagrams"])
 @pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
 def test_messages_come_by_udp(lab: Lab, first: str, size: int, source: str, sink: str) -> None:
@@ -63,7 +63,7 @@ def test_messages_come_by_udp(lab: Lab, first: str, size: int, source: str, sink
 
 
 @pytest.mark.boundary
-@each(RELAYED)
+@in_directions(RELAYED)
 def test_a_relay_ends_with_its_subscriber(lab: Lab, source: str, sink: str) -> None:
     topic = f"/{lab.unique('udp')}"
     lab.node("roscpp", source, "pub", topic=topic, rate=50)
@@ -72,14 +72,14 @@ def test_a_relay_ends_with_its_subscriber(lab: Lab, source: str, sink: str) -> N
         receiver.wait_for("^got hello ")
     assert len(relays(lab, topic)) == 2
     shown = lab.wait_shown(topic, carried="UDPROS", state="ok", flows=True)
-    assert shown["port"] in {one["port"] for one in relays(lab, topic)}
+    assert shown["port"] in {relay["port"] for relay in relays(lab, topic)}
     assert receivers[0].stop() == 0
     receivers[1].kill()
     wait_until("no relay is left", lambda: not relays(lab, topic))
 
 
 @pytest.mark.boundary
-@each(RELAYED)
+@in_directions(RELAYED)
 def test_messages_come_again_after_the_proxy_was_killed(lab: Lab, source: str, sink: str) -> None:
     """The subscriber's node is told of its publishers anew, and asks again."""
     topic = f"/{lab.unique('udp')}"

@@ -263,8 +263,8 @@ class Topology:
     def _proxy_address(self, place: Place) -> str:
         subnet = place.address.rpartition(".")[0]
         proxies = [self.places[role] for role in ("px", "px2") if role in self.places]
-        found = (a for proxy in proxies for a in proxy.addresses if a.startswith(f"{subnet}."))
-        return next(found)
+        addresses = (a for proxy in proxies for a in proxy.addresses if a.startswith(f"{subnet}."))
+        return next(addresses)
 
 
 def _rules(plan: Plan, proxies: list[str]) -> str:

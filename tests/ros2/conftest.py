@@ -47,7 +47,7 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Shows with a failure what the proxy and the nodes of that test have printed."""
     result = yield
-    labs = [one for one in getattr(item, "funcargs", {}).values() if isinstance(one, Lab)]
+    labs = [value for value in getattr(item, "funcargs", {}).values() if isinstance(value, Lab)]
     if result.failed:
         for lab in labs:
             result.sections += lab.transcripts()

@@ -82,5 +82,7 @@ class Topology6(Topology):
     def _known_names(self, place: Place) -> Iterator[tuple[str, str]]:
         yield place.address, place.hostname
         if place.role == "px":
-            yield from ((one, ADVERTISED_NAME) for one in _ADDRESSES["host"][: self._families])
-            yield from ((one, "robot") for one in _ADDRESSES["out"][: self._families])
+            yield from (
+                (address, ADVERTISED_NAME) for address in _ADDRESSES["host"][: self._families]
+            )
+            yield from ((address, "robot") for address in _ADDRESSES["out"][: self._families])

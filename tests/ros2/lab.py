@@ -56,9 +56,9 @@ class Lab:
     def place(self, role: str) -> Place:
         return self.topology.places[role]
 
-    def unique(self, word: str) -> str:
+    def unique(self, stem: str) -> str:
         """A name that nobody else has."""
-        return f"{word}_{next(self._numbers)}"
+        return f"{stem}_{next(self._numbers)}"
 
     def start_proxy(self) -> None:
         """Start the proxy and wait until it listens."""
@@ -92,15 +92,13 @@ class Lab:
     ) -> Process:
         """Start a node on a machine; options are those of its program."""
         name = name or self.unique(kind.replace(",", "_"))
-        words = [str(ENVIRONMENTS / vendor / "bin/python"), str(NODES / PROGRAMS[vendor]), kind]
-        words += ["--name", name]
+        argv = [str(ENVIRONMENTS / vendor / "bin/python"), str(NODES / PROGRAMS[vendor]), kind]
+        argv += ["--name", name]
         for option, value in options.items():
-            words.append(f"--{option.replace('_', '-')}")
-            words += [] if value is True else [str(value)]
+            argv.append(f"--{option.replace('_', '-')}")
+            argv += [] if value is True else [str(value)]
         usual = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": str(self.folder)}
-        node = self._spawn(
-            f"{vendor} {kind} {name} ({role})", role, words, {**usual, **(env or {})}
-        )
+        node = self._spawn(f"{vendor} {kind} {name} ({role})", role, argv, {**usual, **(env or {})})
         self.nodes.append(node)
         return node
 
@@ -139,18 +137,20 @@ class Lab:
     def ports(self) -> dict[str, list[tuple[int, str]]]:
         """The ports of the range with their locators, by participant inside."""
         return {
-            one.guid_prefix: sorted((lease.port, lease.where) for lease in one.leases)
-            for one in self.domain().inside
+            participant.guid_prefix: sorted(
+                (lease.port, lease.where) for lease in participant.leases
+            )
+            for participant in self.domain().inside
         }
 
     def wait_for_participants(self, inside: int, outside: int, timeout: float = 60.0) -> None:
         """Wait until the proxy knows so many on each side."""
 
-        def there() -> bool:
+        def counts_match() -> bool:
             domain = self.domain()
             return (len(domain.inside), len(domain.outside)) == (inside, outside)
 
-        wait_until(f"{inside} participants inside and {outside} outside", there, timeout)
+        wait_until(f"{inside} participants inside and {outside} outside", counts_match, timeout)
 
     def stop_nodes(self) -> None:
         """End all nodes."""
@@ -159,7 +159,7 @@ class Lab:
 
     def stop(self) -> None:
         """End everything."""
-        stop_all([one for one in (self.proxy, self.ear) if one])
+        stop_all([process for process in (self.proxy, self.ear) if process])
 
     @contextmanager
     def used(self) -> Iterator[None]:
@@ -173,15 +173,15 @@ class Lab:
 
     def check(self) -> None:
         """Raises AssertionError if the proxy or the ear has ended, or has failed inside."""
-        for one in (self.proxy, self.ear):
-            if one is not None:
-                assert one.returncode is None, one.output()
-                assert "Traceback" not in one.output(), one.output()
+        for process in (self.proxy, self.ear):
+            if process is not None:
+                assert process.returncode is None, process.output()
+                assert "Traceback" not in process.output(), process.output()
 
     def transcripts(self) -> list[tuple[str, str]]:
         """What everybody has printed."""
-        found = [*self.nodes, *(one for one in (self.proxy, self.ear) if one)]
-        return [(one.title, one.output()[-3000:]) for one in found]
+        processes = [*self.nodes, *(process for process in (self.proxy, self.ear) if process)]
+        return [(process.title, process.output()[-3000:]) for process in processes]
 
     def _own_environment(self) -> dict[str, str]:
         env = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONUNBUFFERED": "1"}

@@ -67,12 +67,14 @@ def with_shared_memory(topology: Topology, folder: Path) -> None:
         )
 
 
-def join_lans(one: Topology, other: Topology) -> None:
+def join_lans(first: Topology, second: Topology) -> None:
     """Make the LANs of two topologies one."""
-    here, there = (topology.places["host"].namespace for topology in (one, other))
-    peer = ("peer", "name", "lan9", "netns", there)
-    run_command("ip", "-n", here, "link", "add", "lan9", "type", "veth", *peer)
-    for namespace in (here, there):
+    first_namespace, second_namespace = (
+        topology.places["host"].namespace for topology in (first, second)
+    )
+    peer = ("peer", "name", "lan9", "netns", second_namespace)
+    run_command("ip", "-n", first_namespace, "link", "add", "lan9", "type", "veth", *peer)
+    for namespace in (first_namespace, second_namespace):
         run_command("ip", "-n", namespace, "link", "set", "lan9", "master", "out0", "up")
 
 
@@ -83,6 +85,6 @@ def wait_for_links(topology: Machines) -> None:
 
 
 def _runs(place: Place) -> bool:
-    found = run_command("ip", "-n", place.namespace, "-o", "addr", "show")
+    addresses = run_command("ip", "-n", place.namespace, "-o", "addr", "show")
     links = run_command("ip", "-n", place.namespace, "-o", "link", "show", "up")
-    return "tentative" not in found and "NO-CARRIER" not in links
+    return "tentative" not in addresses and "NO-CARRIER" not in links

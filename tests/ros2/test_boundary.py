@@ -31,7 +31,7 @@ OUTWARD, INWARD = ("c1", "c2", "out"), ("out", "out", "c1")
 
 
 @pytest.mark.parametrize(
-    ("vendor", "here", "near", "far"),
+    ("vendor", "origin", "near", "far"),
     [
         pytest.param("jazzy", *OUTWARD, marks=pytest.mark.smoke),
         ("jazzy", *INWARD),
@@ -41,22 +41,22 @@ OUTWARD, INWARD = ("c1", "c2", "out"), ("out", "out", "c1")
     ids=["jazzy-outward", "jazzy-inward", "cyclone-outward", "cyclone-inward"],
 )
 def test_nothing_passes_without_the_proxy(
-    lab: Lab, vendor: str, here: str, near: str, far: str
+    lab: Lab, vendor: str, origin: str, near: str, far: str
 ) -> None:
-    words = {"topic": "/all", "of": "source"} if vendor == "jazzy" else {"topic": "/all"}
-    there = lab.node(vendor, far, USES[vendor], name="far", **words)
-    there.wait_for("^ready")
-    source = lab.node(vendor, here, OFFERS[vendor], name="source", topic="/all")
-    listener = lab.node(vendor, near, USES[vendor], name="near", **words)
+    options = {"topic": "/all", "of": "source"} if vendor == "jazzy" else {"topic": "/all"}
+    far_node = lab.node(vendor, far, USES[vendor], name="far", **options)
+    far_node.wait_for("^ready")
+    source = lab.node(vendor, origin, OFFERS[vendor], name="source", topic="/all")
+    listener = lab.node(vendor, near, USES[vendor], name="near", **options)
     for pattern in GOT[vendor][:4]:
         listener.wait_for(pattern)
     listener.wait_for_count("^got hello ", 15)
     assert source.returncode is None
-    heard = {line.split()[0] for line in there.output().splitlines()}
-    assert heard <= {"ready", "nodes"}, there.output()
-    assert "source" not in there.output()
+    heard = {line.split()[0] for line in far_node.output().splitlines()}
+    assert heard <= {"ready", "nodes"}, far_node.output()
+    assert "source" not in far_node.output()
 
     lab.start_proxy()
 
     for pattern in GOT[vendor]:
-        there.wait_for(pattern)
+        far_node.wait_for(pattern)

@@ -18,21 +18,21 @@ BAD_QOS = pytest.mark.parametrize(
 )
 
 
-def wait_for_problem(lab: Lab, subject: str, there: bool = True) -> None:
+def wait_for_problem(lab: Lab, subject: str, present: bool = True) -> None:
     """Wait until the proxy tells of a problem by itself, or no more."""
 
     def told() -> bool:
-        return any(one.subject == subject for one in lab.status().problems) is there
+        return any(problem.subject == subject for problem in lab.status().problems) is present
 
-    wait_until(f"a problem of {subject}: {there}", told, 60)
+    wait_until(f"a problem of {subject}: {present}", told, 60)
 
 
 def wait_shown(lab: Lab, topic: str, state: str, text: str = "") -> None:
     """Wait until the live page has a link so, and why."""
 
     def is_shown() -> bool:
-        shown = [one for one in lab.page()["links"].values() if one["name"] == topic]
-        return any(one["state"] == state and text in one.get("text", "") for one in shown)
+        shown = [link for link in lab.page()["links"].values() if link["name"] == topic]
+        return any(link["state"] == state and text in link.get("text", "") for link in shown)
 
     wait_until(f"the page shows {topic}: {state}", is_shown)
 
@@ -46,9 +46,9 @@ def doctor_of_networks(lab: Lab) -> str:
 def line(text: str, start: str) -> str:
     """The finding that begins so, in one line, with what mends it."""
     shown = " ".join(text.split())
-    found = [part for part in shown.split("ERROR ") if part.startswith(start)]
-    assert found, text
-    return found[0]
+    findings = [finding for finding in shown.split("ERROR ") if finding.startswith(start)]
+    assert findings, text
+    return findings[0]
 
 
 @BAD_QOS
@@ -68,14 +68,14 @@ def test_qos_that_does_not_match(
     wait_for_problem(lab, "topic /scan")
     told = line(lab.tool("doctor", fails=True), f"topic /scan: {policy} differs")
     domain = lab.domain()
-    for one in (*domain.inside, *domain.outside):
-        assert f"{one.guid_prefix} at {one.address} (Fast DDS," in told
+    for participant in (*domain.inside, *domain.outside):
+        assert f"{participant.guid_prefix} at {participant.address} (Fast DDS," in told
     assert "> " in told
     assert "got hello" not in reader.output()
     wait_shown(lab, "/scan", "broken", policy)
 
     reader.stop()
-    wait_for_problem(lab, "topic /scan", there=False)
+    wait_for_problem(lab, "topic /scan", present=False)
     lab.node("jazzy", sink, "sub", topic="/scan", **offer).wait_for_count("^got hello ", 5)
     assert "Nothing wrong was found." in lab.tool("doctor")
     wait_shown(lab, "/scan", "ok")
@@ -111,7 +111,7 @@ def test_a_discovery_range_of_one_machine(lab: Lab, vendor: str) -> None:
     env["ROS_STATIC_PEERS"] = lab.place("px").address
     lab.node(vendor, "c2", "pub", topic="/chatter", env=env)
     lab.node(vendor, "out", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
-    assert lab.place("c2").address in {one.address for one in lab.domain().inside}
+    assert lab.place("c2").address in {participant.address for participant in lab.domain().inside}
 
 
 def test_another_domain(lab: Lab) -> None:
@@ -127,8 +127,8 @@ def test_tcp(lab: Lab) -> None:
     env = {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
     lab.node("jazzy", "c1", "pub", topic="/chatter", env=env).wait_for("^sent")
     lab.wait_for_participants(1, 0)
-    (one,) = lab.domain().inside
-    wait_for_problem(lab, one.guid_prefix)
-    told = line(lab.tool("doctor", fails=True), one.guid_prefix)
-    assert f"at {one.address} (Fast DDS, inside): it is reached by TCP alone" in told
+    (participant,) = lab.domain().inside
+    wait_for_problem(lab, participant.guid_prefix)
+    told = line(lab.tool("doctor", fails=True), participant.guid_prefix)
+    assert f"at {participant.address} (Fast DDS, inside): it is reached by TCP alone" in told
     assert "unset FASTDDS_BUILTIN_TRANSPORTS" in told

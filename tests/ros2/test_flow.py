@@ -12,15 +12,17 @@ ways = pytest.mark.parametrize(
 )
 PAIRS = [("jazzy", "jazzy"), ("jazzy", "kilted"), ("kilted", "jazzy")]
 pairings = pytest.mark.parametrize(
-    ("one", "other"), PAIRS, ids=[f"{one}-to-{other}" for one, other in PAIRS]
+    ("source_vendor", "sink_vendor"),
+    PAIRS,
+    ids=[f"{source_vendor}-to-{sink_vendor}" for source_vendor, sink_vendor in PAIRS],
 )
 
 
 @ways
 @pairings
-def test_topics(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
-    lab.node(one, source, "pub", topic="/chatter")
-    lab.node(other, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+def test_topics(lab: Lab, source_vendor: str, sink_vendor: str, source: str, sink: str) -> None:
+    lab.node(source_vendor, source, "pub", topic="/chatter")
+    lab.node(sink_vendor, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
 
 
 @ways
@@ -51,18 +53,18 @@ def test_best_effort(lab: Lab, source: str, sink: str) -> None:
 
 @ways
 @pairings
-def test_services(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
-    lab.node(one, source, "serve", topic="/add")
-    lab.node(other, sink, "call", topic="/add").wait_for_count("^reply .* hello", 5)
+def test_services(lab: Lab, source_vendor: str, sink_vendor: str, source: str, sink: str) -> None:
+    lab.node(source_vendor, source, "serve", topic="/add")
+    lab.node(sink_vendor, sink, "call", topic="/add").wait_for_count("^reply .* hello", 5)
 
 
 @ways
 def test_a_thousand_calls(lab: Lab, source: str, sink: str) -> None:
     """One client: of two that share a service, rmw loses replies now and then without a proxy."""
     lab.node("jazzy", source, "serve", topic="/add")
-    words = {"topic": "/add", "count": 1000, "period": 0.001, "in_turn": True}
-    caller = lab.node("jazzy", sink, "call", **words)
-    answered = [one[1] for one in caller.wait_for_count(r"^reply (\d+) hello", 1000)]
+    options = {"topic": "/add", "count": 1000, "period": 0.001, "in_turn": True}
+    caller = lab.node("jazzy", sink, "call", **options)
+    answered = [match[1] for match in caller.wait_for_count(r"^reply (\d+) hello", 1000)]
     assert answered == [str(number) for number in range(1000)]
 
 
@@ -85,9 +87,9 @@ def test_all_nodes_see_each_other(lab: Lab) -> None:
     for node in nodes:
         node.wait_for(f"^{everybody}$")
     domain = lab.domain()
-    assert {len(one.leases) for one in domain.inside} == {3}
+    assert {len(participant.leases) for participant in domain.inside} == {3}
     assert (len(domain.inside), len(domain.outside)) == (3, 2)
-    assert not any(one.problem for one in domain.inside)
+    assert not any(participant.problem for participant in domain.inside)
 
 
 def test_the_status_names_topics_and_services(lab: Lab) -> None:
@@ -96,23 +98,25 @@ def test_the_status_names_topics_and_services(lab: Lab) -> None:
     talker, server = (lab.place(role).address for role in ("c1", "c2"))
 
     def told() -> bool:
-        found = {one.address: one for one in lab.domain().inside}
-        if found.keys() != {talker, server}:
+        participants = {participant.address: participant for participant in lab.domain().inside}
+        if participants.keys() != {talker, server}:
             return False
-        return "/chatter" in found[talker].publishes and "/add" in found[server].services
+        return (
+            "/chatter" in participants[talker].publishes and "/add" in participants[server].services
+        )
 
     wait_until("topics and services are told", told, 60)
-    assert {one.vendor for one in lab.domain().inside} == {"Fast DDS"}
+    assert {participant.vendor for participant in lab.domain().inside} == {"Fast DDS"}
     shown = lab.tool("status")
-    for word in ("domain 0: peers 10.77.0.2", "Fast DDS", "/chatter", "/add", "172.30.1.11:7410"):
-        assert word in shown, shown
+    for text in ("domain 0: peers 10.77.0.2", "Fast DDS", "/chatter", "/add", "172.30.1.11:7410"):
+        assert text in shown, shown
 
 
 def test_the_doctor_tells_what_the_proxy_sees(lab: Lab) -> None:
     lab.node("jazzy", "c1", "pub", topic="/chatter")
     lab.node("jazzy", "out", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
-    found = lab.tool("doctor")
-    assert "inside: 1 participant of Fast DDS" in found
-    assert "outside: 1 participant of Fast DDS" in found
-    assert "ERROR" not in found
-    assert "WARNING" not in found
+    report = lab.tool("doctor")
+    assert "inside: 1 participant of Fast DDS" in report
+    assert "outside: 1 participant of Fast DDS" in report
+    assert "ERROR" not in report
+    assert "WARNING" not in report

@@ -29,7 +29,9 @@ PAIRS = [
     ("cyclone", "jazzy"),
 ]
 pairings = pytest.mark.parametrize(
-    ("one", "other"), PAIRS, ids=[f"{one}-to-{other}" for one, other in PAIRS]
+    ("source_vendor", "sink_vendor"),
+    PAIRS,
+    ids=[f"{source_vendor}-to-{sink_vendor}" for source_vendor, sink_vendor in PAIRS],
 )
 ways = pytest.mark.parametrize(
     ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
@@ -94,10 +96,10 @@ def test_without_the_proxy_implementations_do_not_meet(lab: Lab) -> None:
 
 @ways
 @pairings
-def test_topics(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
+def test_topics(lab: Lab, source_vendor: str, sink_vendor: str, source: str, sink: str) -> None:
     proxy(lab, *EAR)
-    node(lab, one, source, "pub", topic="/chatter")
-    node(lab, other, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+    node(lab, source_vendor, source, "pub", topic="/chatter")
+    node(lab, sink_vendor, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
 
 
 @ways
@@ -112,8 +114,8 @@ def test_where_inside_has_no_way_out(lab: Lab, source: str, sink: str) -> None:
     proxy(lab, *PEER, "--direction", "both")
     node(lab, "jazzy", source, "pub", topic="/chatter")
     node(lab, "jazzy", sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
-    (there,) = lab.domain().outside
-    assert all(":" in lease.where for lease in there.leases)
+    (participant,) = lab.domain().outside
+    assert all(":" in lease.where for lease in participant.leases)
 
 
 @ways

@@ -28,8 +28,8 @@ OPTIONS = (*PEER, "--direction", "both")
 def stand_ins(lab: Lab) -> dict[str, set[tuple[int, str]]]:
     """The ports that stand for locators outside, by participant."""
     return {
-        one.guid_prefix: {(lease.port, lease.where) for lease in one.leases}
-        for one in lab.domain().outside
+        participant.guid_prefix: {(lease.port, lease.where) for lease in participant.leases}
+        for participant in lab.domain().outside
     }
 
 
@@ -38,16 +38,16 @@ def test_ports_that_stand_for_outside_are_the_same_again(lab: Lab) -> None:
     reader = lab.node("jazzy", "out", "sub", topic="/outward", depth=100)
     lab.node("kilted", "out", "pub", topic="/inward", depth=100)
     inner = lab.node("jazzy", "c2", "sub", topic="/inward", depth=100)
-    for one in (reader, inner):
-        one.wait_for_count("^got hello ", 5)
-    everything = lambda: [len(found) for found in stand_ins(lab).values()] == [3, 3]  # noqa: E731
+    for subscriber in (reader, inner):
+        subscriber.wait_for_count("^got hello ", 5)
+    everything = lambda: [len(ports) for ports in stand_ins(lab).values()] == [3, 3]  # noqa: E731
     wait_until("each locator outside has a stand-in", everything, 30)
     before = stand_ins(lab)
     lab.restart_proxy()
     wait_until("they are the same", lambda: stand_ins(lab) == before, 30)
-    for one in (reader, inner):
-        one.wait_for_count("^got hello ", 10, since=one.mark())
-        got = [int(line.split()[2]) for line in one.output().splitlines() if "got " in line]
+    for subscriber in (reader, inner):
+        subscriber.wait_for_count("^got hello ", 10, since=subscriber.mark())
+        got = [int(line.split()[2]) for line in subscriber.output().splitlines() if "got " in line]
         assert got == list(range(got[0], got[-1] + 1)), "messages were lost"
 
 

@@ -27,13 +27,18 @@ sizes = pytest.mark.parametrize("size", [0, 1_000_000], ids=["small", "in-fragme
 
 def leases(lab: Lab, kind: str = "data") -> list[LocatorStatus]:
     """The leases of a kind of all participants inside."""
-    return [lease for one in lab.domain().inside for lease in one.leases if lease.kind == kind]
+    return [
+        lease
+        for participant in lab.domain().inside
+        for lease in participant.leases
+        if lease.kind == kind
+    ]
 
 
 def are_forwarded(lab: Lab, count: int) -> bool:
     """Whether so many leases of user data are there, and the kernel forwards them all."""
-    found = leases(lab)
-    return len(found) == count and all(lease.plane == "kernel" for lease in found)
+    data_leases = leases(lab)
+    return len(data_leases) == count and all(lease.plane == "kernel" for lease in data_leases)
 
 
 def by_kernel(lab: Lab) -> int:

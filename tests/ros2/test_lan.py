@@ -26,17 +26,25 @@ ways = pytest.mark.parametrize(
 
 
 @ways
-@pytest.mark.parametrize(("one", "other"), PAIRS, ids=[f"{one}-to-{other}" for one, other in PAIRS])
-def test_topics(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
-    lab.node(one, source, "pub", topic="/chatter")
-    lab.node(other, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+@pytest.mark.parametrize(
+    ("source_vendor", "sink_vendor"),
+    PAIRS,
+    ids=[f"{source_vendor}-to-{sink_vendor}" for source_vendor, sink_vendor in PAIRS],
+)
+def test_topics(lab: Lab, source_vendor: str, sink_vendor: str, source: str, sink: str) -> None:
+    lab.node(source_vendor, source, "pub", topic="/chatter")
+    lab.node(sink_vendor, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
 
 
 @ways
-@pytest.mark.parametrize(("one", "other"), PAIRS[2:4], ids=["jazzy-to-cyclone", "cyclone-to-jazzy"])
-def test_messages_in_fragments(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
-    lab.node(one, source, "pub", topic="/image", size=1_000_000, period=0.5)
-    reader = lab.node(other, sink, "sub", topic="/image")
+@pytest.mark.parametrize(
+    ("source_vendor", "sink_vendor"), PAIRS[2:4], ids=["jazzy-to-cyclone", "cyclone-to-jazzy"]
+)
+def test_messages_in_fragments(
+    lab: Lab, source_vendor: str, sink_vendor: str, source: str, sink: str
+) -> None:
+    lab.node(source_vendor, source, "pub", topic="/image", size=1_000_000, period=0.5)
+    reader = lab.node(sink_vendor, sink, "sub", topic="/image")
     reader.wait_for_count("^got hello .* size 1000000", 5)
 
 
@@ -53,5 +61,5 @@ def test_the_ear_may_be_killed(lab: Lab) -> None:
     lab.ear.kill()
     lab.start_ear()
     later = lab.node("jazzy", "out", "sub", topic="/chatter")
-    for one in (reader, later):
-        one.wait_for_count("^got hello ", 5, since=one.mark())
+    for subscriber in (reader, later):
+        subscriber.wait_for_count("^got hello ", 5, since=subscriber.mark())

@@ -62,8 +62,8 @@ def test_participants_that_hang_until_they_count_as_gone_go_on(lab: Lab, tmp_pat
     env = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(profile)}
     nodes = {}
     for role in ("c1", "c2", "out"):
-        words = {"topic": "/talk", "word": f"from-{role}"}
-        nodes[role] = lab.node("jazzy", role, "pub,sub", env=env, **words)
+        options = {"topic": "/talk", "word": f"from-{role}"}
+        nodes[role] = lab.node("jazzy", role, "pub,sub", env=env, **options)
 
     def all_hear(inside: str) -> None:
         nodes["out"].wait_for_count(f"^got from-{inside} ", 5, since=nodes["out"].mark())
@@ -71,9 +71,9 @@ def test_participants_that_hang_until_they_count_as_gone_go_on(lab: Lab, tmp_pat
 
     for inside in ("c1", "c2"):
         all_hear(inside)
-    for role, rest in (("c1", (1, 1)), ("out", (2, 0))):
+    for role, counts in (("c1", (1, 1)), ("out", (2, 0))):
         nodes[role].send(signal.SIGSTOP)
-        lab.wait_for_participants(*rest)
+        lab.wait_for_participants(*counts)
         nodes[role].send(signal.SIGCONT)
         for inside in ("c1", "c2"):
             all_hear(inside)
@@ -91,8 +91,8 @@ def test_a_server_that_crashed_is_called_again(lab: Lab, source: str, sink: str)
 def test_a_node_that_ends_is_gone_on_the_other_side(lab: Lab) -> None:
     inside = lab.node("jazzy", "c1", "names", name="inside", period=0.2)
     outside = lab.node("jazzy", "out", "names", name="outside", period=0.2)
-    for one in (inside, outside):
-        one.wait_for("^nodes inside outside end$")
+    for node in (inside, outside):
+        node.wait_for("^nodes inside outside end$")
     later = lab.node("jazzy", "out", "names", name="later", period=0.2)
     inside.wait_for("^nodes inside later outside end$")
     later.stop()

@@ -39,7 +39,7 @@ def gets_nothing(reader: Process, meanwhile: Process) -> None:
 def hidden(lab: Lab) -> set[tuple[str, str]]:
     policy = lab.status().policy
     assert policy is not None
-    return {(one.kind, one.name) for one in policy.hidden}
+    return {(name_status.kind, name_status.name) for name_status in policy.hidden}
 
 
 @pytest.mark.parametrize(
@@ -87,5 +87,9 @@ def test_announcements_in_fragments_are_read(lab: Lab, source: str, sink: str) -
     public = lab.node(vendors[sink], sink, "sub", topic="/open", **(long if sink == "c1" else {}))
     gets(public, 20)
     assert "got" not in secret.output()
-    told = {name for one in lab.domain().inside for name in (*one.publishes, *one.subscribes)}
+    told = {
+        name
+        for participant in lab.domain().inside
+        for name in (*participant.publishes, *participant.subscribes)
+    }
     assert told >= {"/secret", "/open"}

@@ -23,21 +23,21 @@ def test_deadline(lab: Lab, source: str, sink: str) -> None:
     reader.wait_for("^deadline missed 1")
     assert "got hello 29 " in reader.output(), "it was missed before the last message"
     writer.wait_for("^offered deadline missed 1")
-    for one in (writer, strict):
-        one.wait_for("^incompatible deadline")
+    for node in (writer, strict):
+        node.wait_for("^incompatible deadline")
     assert "got" not in strict.output()
 
 
 @ways
 def test_liveliness(lab: Lab, source: str, sink: str) -> None:
-    words = {"topic": "/arm", "liveliness": "AUTOMATIC", "lease": LEASE}
-    writer = lab.node("jazzy", source, "pub", count=1, **words)
-    reader = lab.node("jazzy", sink, "sub", **words)
+    options = {"topic": "/arm", "liveliness": "AUTOMATIC", "lease": LEASE}
+    writer = lab.node("jazzy", source, "pub", count=1, **options)
+    reader = lab.node("jazzy", sink, "sub", **options)
     manual = {"topic": "/leg", "liveliness": "MANUAL_BY_TOPIC", "lease": LEASE}
     silent = lab.node("jazzy", source, "pub", count=10, matched=True, **manual)
     listener = lab.node("jazzy", sink, "sub", **manual)
-    for one in (reader, listener):
-        one.wait_for("^alive 1 not 0")
+    for subscriber in (reader, listener):
+        subscriber.wait_for("^alive 1 not 0")
     listener.wait_for("^alive 0 not 1")
     silent.wait_for("^liveliness lost 1")
     assert silent.returncode is None

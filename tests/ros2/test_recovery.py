@@ -22,7 +22,9 @@ def test_ten_participants_get_their_ports_again(lab: Lab) -> None:
     for reader in readers:
         reader.wait_for_count("^got hello ", 5)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 33, 90)
-    wait_until("they are kept", lambda: all(one.kept for one in lab.domain().inside), 90)
+    wait_until(
+        "they are kept", lambda: all(participant.kept for participant in lab.domain().inside), 90
+    )
     before = lab.ports()
 
     lab.restart_proxy()
@@ -41,7 +43,9 @@ def test_a_participant_gets_its_ports_again(lab: Lab, vendor: str, ports: int) -
     reader = lab.node("jazzy", "out", "sub", topic="/chatter")
     reader.wait_for_count("^got hello ", 5)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 2 * ports, 90)
-    wait_until("they are kept", lambda: all(one.kept for one in lab.domain().inside), 90)
+    wait_until(
+        "they are kept", lambda: all(participant.kept for participant in lab.domain().inside), 90
+    )
     before = lab.ports()
     for _ in range(2):
         lab.restart_proxy()
@@ -84,10 +88,10 @@ def test_50_messages_a_second_and_calls_go_on_without_a_loss(lab: Lab) -> None:
     topics = {"c1": "/inward", "out": "/outward"}
     readers = {}
     for role, topic in topics.items():
-        words = {"topic": topic, "depth": 1000}
-        readers[role] = lab.node("jazzy", role, "sub,serve", **words)
+        options = {"topic": topic, "depth": 1000}
+        readers[role] = lab.node("jazzy", role, "sub,serve", **options)
         other = "out" if role == "c1" else "c1"
-        lab.node("jazzy", other, "pub", period=0.02, **words)
+        lab.node("jazzy", other, "pub", period=0.02, **options)
     callers = [
         lab.node("jazzy", role, "call", topic=topic, period=0.02, in_turn=True)
         for role, topic in (("out", "/inward"), ("c1", "/outward"))
@@ -95,7 +99,9 @@ def test_50_messages_a_second_and_calls_go_on_without_a_loss(lab: Lab) -> None:
     for reader in readers.values():
         reader.wait_for_count("^got hello ", 50)
     wait_until("all ports are given", lambda: lab.domain().ports_used == 9, 90)
-    wait_until("they are kept", lambda: all(one.kept for one in lab.domain().inside), 90)
+    wait_until(
+        "they are kept", lambda: all(participant.kept for participant in lab.domain().inside), 90
+    )
 
     lab.restart_proxy()
 

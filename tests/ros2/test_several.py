@@ -16,10 +16,10 @@ from tests.ros2.machines import PORTS
 
 def all_hear_all(nodes: Mapping[str, Process]) -> None:
     """Wait until each node, by the word that it says, hears that of each other one."""
-    marks = {word: node.mark() for word, node in nodes.items()}
-    for word, node in nodes.items():
-        for other in nodes.keys() - {word}:
-            node.wait_for_count(f"^got {other} ", 3, since=marks[word])
+    marks = {name: node.mark() for name, node in nodes.items()}
+    for name, node in nodes.items():
+        for other in nodes.keys() - {name}:
+            node.wait_for_count(f"^got {other} ", 3, since=marks[name])
 
 
 def all_see_all(nodes: Iterable[Process], names: Iterable[str]) -> None:
@@ -28,14 +28,14 @@ def all_see_all(nodes: Iterable[Process], names: Iterable[str]) -> None:
         node.wait_for(f"^nodes {' '.join(sorted(names))} end$")
 
 
-def talk(lab: Lab, role: str, word: str, **options: object) -> Process:
+def talk(lab: Lab, role: str, name: str, **options: object) -> Process:
     """A node that publishes its name and hears others."""
-    return lab.node("jazzy", role, "names,pub,sub", name=word, word=word, period=0.2, **options)
+    return lab.node("jazzy", role, "names,pub,sub", name=name, word=name, period=0.2, **options)
 
 
 def test_participants_containers_and_robots(lab: Lab, other: Lab) -> None:
-    robots = [one.topology.plan.robot for one in (lab, other)]
-    lab.options = tuple(word for robot in robots for word in ("--ros2-peer", robot))
+    robots = [host_lab.topology.plan.robot for host_lab in (lab, other)]
+    lab.options = tuple(argument for robot in robots for argument in ("--ros2-peer", robot))
     lab.restart_proxy()
     nodes = {
         "one": talk(lab, "c1", "one"),
@@ -68,8 +68,8 @@ def test_two_proxies_that_meet(lab: Lab, other: Lab) -> None:
     all_see_all(nodes.values(), [*nodes, "adder", "caller"])
     all_hear_all(nodes)
     for killed in ([lab], [other], [lab, other]):
-        for one in killed:
-            one.restart_proxy()
+        for killed_lab in killed:
+            killed_lab.restart_proxy()
         all_hear_all(nodes)
     caller.wait_for_count("^reply .* hello", 5, since=caller.mark())
 

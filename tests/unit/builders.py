@@ -116,8 +116,8 @@ def make_addressing(
 ) -> Addressing:
     """The addressing of a proxy that knows no node yet."""
     ports = PortMap(PortRange(*listen), PortRange(*(advertise or listen)))
-    known = tuple(map(ip_network, networks))
-    return Addressing(Registry(ports.listen), host, ports, make_stand_ins(ports), known)
+    inside_networks = tuple(map(ip_network, networks))
+    return Addressing(Registry(ports.listen), host, ports, make_stand_ins(ports), inside_networks)
 
 
 def make_stand_ins(ports: PortMap | None = None, **options: Any) -> StandIns:
@@ -158,9 +158,9 @@ def add_registration(
 ) -> Registration:
     """Register something for an endpoint; a service at port 50001 of the node's host."""
     api = f"rosrpc://{HostPort(endpoint.node.host, 50001)}" if kind is Kind.SERVICE else None
-    held = Registration(kind, name, caller_id, "std_msgs/String", api, 1.0)
-    addressing.registry.register(endpoint, held)
-    return held
+    registration = Registration(kind, name, caller_id, "std_msgs/String", api, 1.0)
+    addressing.registry.register(endpoint, registration)
+    return registration
 
 
 @dataclass
@@ -197,11 +197,11 @@ def exchange(
 
 def note(registry: Registry, fact: RegistryChange) -> None:
     """Take a fact into the registry."""
-    held = fact.registration
+    registration = fact.registration
     if fact.endpoint:
-        registry.register(fact.endpoint, held)
+        registry.register(fact.endpoint, registration)
     else:
-        registry.unregister(held.kind, held.name, held.caller_id)
+        registry.unregister(registration.kind, registration.name, registration.caller_id)
 
 
 def _outcome(

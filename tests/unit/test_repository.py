@@ -29,12 +29,12 @@ def lines(node: ast.stmt) -> int:
 
 def functions(path: Path) -> dict[str, int]:
     """The functions of a module, each with its lines of code: no docstring, no decorators."""
-    found = {}
+    sizes = {}
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             docstring = lines(node.body[0]) if ast.get_docstring(node) else 0
-            found[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = lines(node) - docstring
-    return found
+            sizes[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = lines(node) - docstring
+    return sizes
 
 
 def run_options() -> list[click.Option]:
@@ -69,7 +69,7 @@ def test_every_option_is_documented() -> None:
     text = (REFERENCE / "options.md").read_text()
     names = [name for option in run_options() for name in option.opts]
     variables = [str(option.envvar) for option in run_options() if option.envvar]
-    missing = [word for word in names + variables if not re.search(rf"(?<![\w-]){word}\b", text)]
+    missing = [name for name in names + variables if not re.search(rf"(?<![\w-]){name}\b", text)]
     assert not missing
 
 
@@ -109,8 +109,8 @@ def test_every_block_of_code_says_its_language(page: Path) -> None:
 def test_links_lead_somewhere(page: Path) -> None:
     broken = []
     for target, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)", page.read_text()):
-        found = page.parent / target if target else page
-        if not found.exists() or (anchor and anchor not in headings(found)):
+        linked_page = page.parent / target if target else page
+        if not linked_page.exists() or (anchor and anchor not in headings(linked_page)):
             broken.append(f"{target}#{anchor}")
     assert not broken
 
@@ -151,7 +151,7 @@ def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     metrics = [family.name for family in DockerMetrics().registry.collect()]
     own = [name for name in metrics if not name.startswith("process_")]
     text = reference()
-    assert not [word for word in [*options, *LABELS, *own] if word not in text]
+    assert not [name for name in [*options, *LABELS, *own] if name not in text]
 
 
 def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
@@ -165,7 +165,7 @@ def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
     metrics = [family.name for family in ClusterMetrics().registry.collect()]
     own = [name for name in metrics if not name.startswith("process_")]
     text = reference()
-    assert not [word for word in [*options, *labels, *annotations, *own] if word not in text]
+    assert not [name for name in [*options, *labels, *annotations, *own] if name not in text]
 
 
 def test_reference_names_every_metric_of_the_proxy() -> None:
@@ -174,7 +174,7 @@ def test_reference_names_every_metric_of_the_proxy() -> None:
     metrics = [family.name for family in Metrics().registry.collect()]
     own = [name for name in metrics if not name.startswith("process_")]
     text = reference()
-    assert not [word for word in own if word not in text]
+    assert not [name for name in own if name not in text]
 
 
 def rules() -> dict[str, set[str]]:

@@ -92,7 +92,7 @@ def test_so_many_flaky_tests_refuse_a_run() -> None:
 
 def test_a_run_in_which_all_fails_ends_soon() -> None:
     few = [case(str(n), failed=True) for n in range(MOST)]
-    assert worth_a_look([*few, *(replace(one, failed=False, passed=True) for one in few)])
+    assert worth_a_look([*few, *(replace(failure, failed=False, passed=True) for failure in few)])
     assert not worth_a_look([*few, case("more", failed=True)])
 
 

@@ -91,9 +91,9 @@ GOOD = [
 ]
 
 
-@pytest.mark.parametrize(("option", "value", "name", "held"), GOOD)
-def test_a_good_value(option: str, value: Any, name: str, held: Any) -> None:
-    assert getattr(parse_settings({**GIVEN, option: value}), name) == held
+@pytest.mark.parametrize(("option", "value", "name", "expected"), GOOD)
+def test_a_good_value(option: str, value: Any, name: str, expected: Any) -> None:
+    assert getattr(parse_settings({**GIVEN, option: value}), name) == expected
 
 
 TIMES = ["probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval"]

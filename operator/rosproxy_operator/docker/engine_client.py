@@ -19,7 +19,13 @@ from docker.errors import APIError, DockerException, TLSParameterError
 from docker.utils import kwargs_from_env
 
 import docker
-from rosproxy_operator.docker.errors import EngineError, Gone, Unavailable, refusal, unreachable
+from rosproxy_operator.docker.errors import (
+    EngineError,
+    NoSuchObject,
+    Unavailable,
+    refusal,
+    unreachable,
+)
 
 Json = dict[str, Any]
 DEFAULT_SOCKET = "unix:///var/run/docker.sock"
@@ -45,8 +51,8 @@ PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
 class DockerClient:
     """The engine that DOCKER_HOST names, or the one of this machine. Can be used by many threads.
 
-    Every method raises EngineError: Unavailable if the engine can't be reached, Gone, Conflict or
-    PortTaken where it refuses for that reason.
+    Every method raises EngineError: Unavailable if the engine can't be reached, NoSuchObject,
+    Conflict or PortTaken where it refuses for that reason.
     """
 
     def __init__(self) -> None:
@@ -71,7 +77,7 @@ class DockerClient:
         """The id of an image, empty if the host does not have it."""
         try:
             return str(self._call(READ_TIMEOUT, "inspect_image", image)["Id"])
-        except Gone:
+        except NoSuchObject:
             return ""
 
     def run(self, container: str, *command: str) -> bytes:

@@ -12,7 +12,7 @@ import msgspec
 
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
-from rosproxy_operator.docker.planner.own_containers import Making
+from rosproxy_operator.docker.planner.own_containers import CreationFacts
 from rosproxy_operator.docker.planner.specs import SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
@@ -121,10 +121,10 @@ def signature(row: Json) -> tuple[tuple[str, str], ...]:
     return tuple(connections) or (("", str(row.get("State"))),)
 
 
-def read_making(inspected: Json | None) -> Making:
+def read_making(inspected: Json | None) -> CreationFacts:
     """How a container was made, from its inspection."""
     argvs = (dig(inspected, "Config", key) or () for key in ("Entrypoint", "Cmd"))
-    return Making(
+    return CreationFacts(
         image=dig(inspected, "Image") or "",
         user=dig(inspected, "Config", "User") or "",
         command=tuple(argument for argv in argvs for argument in argv),

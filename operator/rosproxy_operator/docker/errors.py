@@ -26,7 +26,7 @@ class Conflict(EngineError):
     """The name is taken, or another request is at work on it."""
 
 
-class Gone(EngineError):
+class NoSuchObject(EngineError):
     """A container, network or image does not exist."""
 
 
@@ -44,7 +44,7 @@ def refusal(status: int, text: str, request: str) -> EngineError:
     # "page not found" is about the path of the request, not about an object: engines answer so to
     # calls that they don't know (moby: daemon/server/server.go, CreateMux).
     if status == 404 and "page not found" not in message:
-        return Gone(message)
+        return NoSuchObject(message)
     if status == 409:
         return Conflict(message)
     if _PORT_TAKEN.search(message):

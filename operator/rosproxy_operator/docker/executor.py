@@ -19,7 +19,7 @@ from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.engine_client import DockerClient, Json
-from rosproxy_operator.docker.errors import Conflict, EngineError, Gone, PortTaken
+from rosproxy_operator.docker.errors import Conflict, EngineError, NoSuchObject, PortTaken
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -73,7 +73,7 @@ DONE: dict[type, tuple[str, ...]] = {
     Disconnect: ("is not connected",),
     Remove: ("is already in progress",),
 }
-"""Parts of the engine's error that mean there is nothing left to do; so does Gone, for these."""
+"""Parts of the engine's error that mean there is nothing left to do; so does NoSuchObject."""
 
 LONGEST_RUN = 10.0
 """Seconds after which a container that does one thing, in milliseconds, is given up."""
@@ -258,7 +258,7 @@ class DockerApplier:
         except EngineError as error:
             phrases = DONE.get(type(action))
             if phrases is None or not (
-                isinstance(error, Gone) or any(phrase in str(error) for phrase in phrases)
+                isinstance(error, NoSuchObject) or any(phrase in str(error) for phrase in phrases)
             ):
                 raise
             log.debug("nothing left to do: %s", error)

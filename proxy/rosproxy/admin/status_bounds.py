@@ -28,7 +28,7 @@ MOST_OF_PARTICIPANTS = 128 * 1024
 """The same for topics and services of the participants of ROS 2 on one side of a domain."""
 CONNECTION_OVERHEAD = 160
 """Characters of a connection besides its texts."""
-Item = str | ConnectionStatus
+ListEntry = str | ConnectionStatus
 _LISTS = ("nodes", "publishes", "services", "subscribes", "parameters", "connections")
 
 
@@ -89,10 +89,10 @@ def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
 
 def _cut(node: EndpointStatus, share: int) -> EndpointStatus:
     """A node with the first items of its lists, as many as fit."""
-    lists: dict[str, tuple[Item, ...]] = {}
+    lists: dict[str, tuple[ListEntry, ...]] = {}
     left_out = 0
     for name in _LISTS:
-        kept: list[Item] = []
+        kept: list[ListEntry] = []
         for item in getattr(node, name):
             share -= _size(item)
             if share >= 0:
@@ -103,11 +103,11 @@ def _cut(node: EndpointStatus, share: int) -> EndpointStatus:
     return msgspec.structs.replace(node, **lists, left_out=left_out)
 
 
-def _items(node: EndpointStatus) -> chain[Item]:
+def _items(node: EndpointStatus) -> chain[ListEntry]:
     return chain.from_iterable(getattr(node, name) for name in _LISTS)
 
 
-def _size(item: Item) -> int:
+def _size(item: ListEntry) -> int:
     """Characters of an item as JSON, with what separates it from the next; about."""
     if isinstance(item, str):
         return len(json.dumps(item)) + 2

@@ -20,7 +20,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.graph import read_types
 
 
-class Reach(Enum):
+class ReachOutcome(Enum):
     """How an attempt to reach somebody ended."""
 
     ANSWERED = "answers"
@@ -34,13 +34,13 @@ class Reach(Enum):
 class Attempt(msgspec.Struct, frozen=True):
     """An attempt to reach somebody: how it ended and, in the words of the caller, why."""
 
-    reach: Reach = Reach.UNTRIED
+    reach: ReachOutcome = ReachOutcome.UNTRIED
     reason: str = ""
 
     @property
     def failed(self) -> bool:
         """Whether it was tried in vain."""
-        return self.reach not in (Reach.ANSWERED, Reach.UNTRIED)
+        return self.reach not in (ReachOutcome.ANSWERED, ReachOutcome.UNTRIED)
 
 
 class MasterFacts(msgspec.Struct, frozen=True):

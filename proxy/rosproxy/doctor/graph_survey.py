@@ -20,7 +20,7 @@ from rosproxy.doctor.facts import (
     DoctorFacts,
     MasterFacts,
     NodeFacts,
-    Reach,
+    ReachOutcome,
     SystemState,
     data_port,
     slave_report,
@@ -75,7 +75,7 @@ async def ask_graph(
         collector = _Collector(master, nodes, choose)
         published = await collector.published_master(facts)
         facts = replace(facts, master=await collector.master(), published_master=published)
-        if facts.master and facts.master.attempt.reach is Reach.ANSWERED:
+        if facts.master and facts.master.attempt.reach is ReachOutcome.ANSWERED:
             with contextlib.suppress(Unreachable, MasterError):
                 facts = await collector.master_state(facts)
     finally:
@@ -100,7 +100,7 @@ class _Collector:
         uri = self._master.master_uri
         addresses = tuple(await self._master.master_addresses())
         if not addresses:
-            return MasterFacts(uri, Attempt(Reach.UNRESOLVABLE))
+            return MasterFacts(uri, Attempt(ReachOutcome.UNRESOLVABLE))
         started = time.monotonic()
         attempt, _ = await _attempt(self._master.call_master("getPid"))
         trip = time.monotonic() - started
@@ -110,9 +110,9 @@ class _Collector:
         # rosmaster answers at / and /RPC2 alone (xmlrpc.server, rpc_paths): a URI with another path
         # looks as if no master was there.
         root = parse_slave_uri(uri)
-        if attempt.reach is Reach.STRANGER and root and urlsplit(uri).path not in ("", "/"):
+        if attempt.reach is ReachOutcome.STRANGER and root and urlsplit(uri).path not in ("", "/"):
             at_root = await self._ask_pid(root)
-            master = replace(master, at_root=at_root.reach is Reach.ANSWERED)
+            master = replace(master, at_root=at_root.reach is ReachOutcome.ANSWERED)
         return master
 
     async def published_master(self, facts: DoctorFacts) -> Attempt:
@@ -173,18 +173,20 @@ class _Collector:
         if facts.is_ours(slave):
             async with self._limit:
                 attempts = [await self._ask_pid(s) for s in (slave, node.inside) if s]
-            answered = next((a for a in attempts if a.reach is Reach.ANSWERED), None)
+            answered = next((a for a in attempts if a.reach is ReachOutcome.ANSWERED), None)
             return replace(node, attempt=answered) if answered else node
         async with self._limit:
             addresses = tuple(await resolve(self._nodes.reach(slave).host))
-            attempt = await self._ask_pid(slave) if addresses else Attempt(Reach.UNRESOLVABLE)
+            attempt = (
+                await self._ask_pid(slave) if addresses else Attempt(ReachOutcome.UNRESOLVABLE)
+            )
         return replace(node, addresses=addresses, attempt=attempt)
 
     async def _ask_pid(self, target: HostPort) -> Attempt:
         attempt, pid = await _attempt(self._nodes.call_node(target, WITHIN, "getPid"))
         if attempt.failed or isinstance(pid, int):
             return attempt
-        return Attempt(Reach.STRANGER, "its answer is not a node's")
+        return Attempt(ReachOutcome.STRANGER, "its answer is not a node's")
 
     async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """What a node says of itself, asked through the proxy if it is behind it."""
@@ -217,7 +219,7 @@ class _Collector:
         if attempt.failed:
             return "", attempt
         if target is None:
-            return "", Attempt(Reach.STRANGER, "no TCPROS address")
+            return "", Attempt(ReachOutcome.STRANGER, "no TCPROS address")
         # That port is the proxy's own, which the try of the range has judged; NAT may have no way
         # back to it from here.
         if facts.is_ours(node.slave):
@@ -231,10 +233,10 @@ class _Collector:
         """Ask a service for its type, as rosservice does."""
         provider = parse_service_uri(facts.service_uris.get(service, ""))
         if provider is None:
-            return Attempt(Reach.STRANGER, "no address")
+            return Attempt(ReachOutcome.STRANGER, "no address")
         target = _reached_at(facts, provider)
         if target is None:
-            return Attempt(Reach.REFUSED, "its port is not held by a node")
+            return Attempt(ReachOutcome.REFUSED, "its port is not held by a node")
         header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
         return await _shake_hands(self._nodes.reach(target), header)
 
@@ -257,17 +259,21 @@ async def _shake_hands(target: HostPort, header: Mapping[str, str]) -> Attempt:
     """Exchange TCPROS connection headers."""
     addresses = await resolve(target.host)
     if not addresses:
-        return Attempt(Reach.UNRESOLVABLE)
+        return Attempt(ReachOutcome.UNRESOLVABLE)
     try:
         async with asyncio.timeout(WITHIN):
             reply = await _exchange(HostPort(addresses[0], target.port), header)
     except (ConnectionError, EOFError):
-        return Attempt(Reach.REFUSED)
+        return Attempt(ReachOutcome.REFUSED)
     except OSError:
-        return Attempt(Reach.SILENT)
+        return Attempt(ReachOutcome.SILENT)
     except HeaderError as error:
-        return Attempt(Reach.STRANGER, str(error))
-    return Attempt(Reach.STRANGER, reply["error"]) if "error" in reply else Attempt(Reach.ANSWERED)
+        return Attempt(ReachOutcome.STRANGER, str(error))
+    return (
+        Attempt(ReachOutcome.STRANGER, reply["error"])
+        if "error" in reply
+        else Attempt(ReachOutcome.ANSWERED)
+    )
 
 
 async def _exchange(target: HostPort, header: Mapping[str, str]) -> dict[str, str]:
@@ -291,16 +297,16 @@ def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
 async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
     """How a question ended, and the answer, None unless a node or master gave one."""
     try:
-        return Attempt(Reach.ANSWERED), await question
+        return Attempt(ReachOutcome.ANSWERED), await question
     except (Unreachable, MasterError) as error:
         if isinstance(error, Unreachable) and error.refused:
-            return Attempt(Reach.REFUSED), None
+            return Attempt(ReachOutcome.REFUSED), None
         # The failure of the connection (`_failures_of`).
         if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
-            return Attempt(Reach.SILENT), None
+            return Attempt(ReachOutcome.SILENT), None
         # Without the name of who was asked, which comes first; the finding has it already.
         reason = str(error).partition("\n")[0].partition(": ")[2][:200]
-        return Attempt(Reach.STRANGER, reason or "its answer can't be read"), None
+        return Attempt(ReachOutcome.STRANGER, reason or "its answer can't be read"), None
 
 
 async def _gather(

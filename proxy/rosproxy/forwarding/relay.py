@@ -285,7 +285,7 @@ def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
             os.close(end)
 
 
-class _Crowd:
+class _BusyDirections:
     """The directions that move many bytes at the moment."""
 
     def __init__(self) -> None:
@@ -309,4 +309,4 @@ class _Crowd:
                 self._pumps.discard(pump)
 
 
-_CROWD = _Crowd()
+_CROWD = _BusyDirections()

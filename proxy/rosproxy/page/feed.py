@@ -20,7 +20,13 @@ from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
 from rosproxy.net.tasks import Tasks
-from rosproxy.page.graph_document import Judged, graph_document, judge, relayed, topics_to_ask_about
+from rosproxy.page.graph_document import (
+    JudgedFacts,
+    graph_document,
+    judge,
+    relayed,
+    topics_to_ask_about,
+)
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import Json
 
@@ -155,7 +161,7 @@ class PageWatch:
     ) -> None:
         self._status, self._own_findings, self._admin = status, own_findings, admin
         self._measures = Measures()
-        self._judged: Judged | None = None
+        self._judged: JudgedFacts | None = None
         # Taken once: were the clock set meanwhile, the times of all links would change.
         self._epoch = time.time() - time.monotonic()
         # A document is made in a thread, and counters may not change while that reads them.

@@ -44,7 +44,7 @@ MASTER, PROXY = "master", "rosproxy"
 _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
 
 
-class Judged(msgspec.Struct, frozen=True):
+class JudgedFacts(msgspec.Struct, frozen=True):
     """The ``facts`` with the doctor's findings: on nodes, on pairs, and on the rest.
 
     ``unconnected_pairs`` are all pairs that are not connected; of them ``pairs`` has those that
@@ -72,7 +72,7 @@ def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, .
     return tuple(topics)
 
 
-def judge(facts: DoctorFacts, previous: Judged | None = None) -> Judged:
+def judge(facts: DoctorFacts, previous: JudgedFacts | None = None) -> JudgedFacts:
     """Have the doctor judge what was found out; ``previous`` is its judgement before this one.
 
     A pair is said to be apart once it is found so twice: nodes that start need a moment to meet.
@@ -94,7 +94,7 @@ def judge(facts: DoctorFacts, previous: Judged | None = None) -> Judged:
     apart = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
     for key in apart - (previous.unconnected_pairs if previous else frozenset()):
         del pairs[key]
-    return Judged(facts, nodes, pairs, tuple(rest), apart)
+    return JudgedFacts(facts, nodes, pairs, tuple(rest), apart)
 
 
 def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
@@ -116,7 +116,7 @@ def relayed(status: ProxyStatus, graph: SystemState) -> dict[Key, int]:
 
 def graph_document(
     status: ProxyStatus,
-    judged: Judged | None,
+    judged: JudgedFacts | None,
     measures: Measures,
     own_findings: Sequence[DoctorFinding],
     now: float,
@@ -127,7 +127,7 @@ def graph_document(
     ``now`` is in monotonic seconds, as the counters' times, and ``epoch`` when those began, in
     seconds since the epoch.
     """
-    judged = judged or Judged(DoctorFacts(status=status))
+    judged = judged or JudgedFacts(DoctorFacts(status=status))
     nodes, links = domain_graph.graph(status)
     left_out = 0
     if status.settings.for_ros1:
@@ -165,7 +165,7 @@ def _proxy_node(status: ProxyStatus) -> PageNode:
 class _Ros1Graph:
     """The nodes of ROS 1."""
 
-    def __init__(self, status: ProxyStatus, judged: Judged) -> None:
+    def __init__(self, status: ProxyStatus, judged: JudgedFacts) -> None:
         self._status, self._judged, self._facts = status, judged, judged.facts
         self._inside = inside_nodes(status)
 
@@ -222,7 +222,7 @@ class _Ros1Links:
     """The links of ROS 1."""
 
     def __init__(
-        self, status: ProxyStatus, judged: Judged, measures: Measures, now: float, epoch: float
+        self, status: ProxyStatus, judged: JudgedFacts, measures: Measures, now: float, epoch: float
     ) -> None:
         self._status, self._judged, self._measures = status, judged, measures
         self._now, self._epoch = now, epoch

@@ -33,7 +33,7 @@ MAX_REQUEST = 65536
 
 
 @dataclass(slots=True, eq=False)
-class _Trial:
+class _PortTrial:
     """A port under test: the secrets by which its two callers are told from strangers."""
 
     proxy_secret: str = field(default_factory=lambda: secrets.token_hex(16))
@@ -77,7 +77,7 @@ async def probe_range(
     pool, ports = context.registry.pool, context.settings.ports.listen.ports()
     probes: list[PortProbe] = []
     for order in (ports, reversed(ports)):
-        trial = _Trial()
+        trial = _PortTrial()
         async with leases.lent(order, trial.greet, or_fast) as port:
             if port is None:
                 break
@@ -93,7 +93,7 @@ async def probe_range(
     return tuple(probes)
 
 
-async def _dial(context: Context, trial: _Trial, target: HostPort) -> str:
+async def _dial(context: Context, trial: _PortTrial, target: HostPort) -> str:
     """Connect through the advertised address and see who answers."""
     addresses = await resolve(context.upstream.reach(target).host)
     if not addresses:
@@ -111,7 +111,7 @@ async def _dial(context: Context, trial: _Trial, target: HostPort) -> str:
 
 
 async def _await_greeting(
-    trial: _Trial, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    trial: _PortTrial, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
 ) -> str:
     answer = b""
     try:
@@ -130,7 +130,7 @@ async def _await_greeting(
     return "stranger" if answer else "closed"
 
 
-async def _ask_master(context: Context, trial: _Trial, target: HostPort) -> str:
+async def _ask_master(context: Context, trial: _PortTrial, target: HostPort) -> str:
     """Have the master call the port, as it calls a node whose parameter has changed."""
     try:
         async with _subscribed(context, trial, target), asyncio.timeout(MASTER_WAIT):
@@ -144,7 +144,7 @@ async def _ask_master(context: Context, trial: _Trial, target: HostPort) -> str:
 
 
 @asynccontextmanager
-async def _subscribed(context: Context, trial: _Trial, target: HostPort) -> AsyncIterator[None]:
+async def _subscribed(context: Context, trial: _PortTrial, target: HostPort) -> AsyncIterator[None]:
     """A parameter with the port under test as its subscriber, for as long as it takes."""
     # A subscriber's name that nobody else has: rosmaster calls shutdown at the former URI of a name
     # that registers with another (registrations.py, _register_node_api).

@@ -22,10 +22,10 @@
 static const double kPatience = 10;
 
 static sockaddr_un at(const std::string& path) {
-  sockaddr_un where{};
-  where.sun_family = AF_UNIX;
-  path.copy(where.sun_path, sizeof where.sun_path - 1);
-  return where;
+  sockaddr_un address{};
+  address.sun_family = AF_UNIX;
+  path.copy(address.sun_path, sizeof address.sun_path - 1);
+  return address;
 }
 
 // How many messages may still be sent.
@@ -33,9 +33,9 @@ class Window {
  public:
   Window(const std::string& path, int size) : path_(path), left_(size) {
     fd_ = socket(AF_UNIX, SOCK_DGRAM, 0);
-    auto where = at(path);
+    auto address = at(path);
     unlink(path.c_str());
-    if (bind(fd_, reinterpret_cast<sockaddr*>(&where), sizeof where)) throw std::runtime_error(path);
+    if (bind(fd_, reinterpret_cast<sockaddr*>(&address), sizeof address)) throw std::runtime_error(path);
     timeval patience{1, 0};
     setsockopt(fd_, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
   }

@@ -123,12 +123,12 @@ static void serve(int fd, int streams) {
 
 static int source() {
   int server = socket(AF_INET, SOCK_STREAM, 0);
-  sockaddr_in where{};
-  socklen_t size = sizeof where;
-  where.sin_family = AF_INET;
-  if (bind(server, reinterpret_cast<sockaddr*>(&where), size) || listen(server, 4096)) fail("bind");
-  getsockname(server, reinterpret_cast<sockaddr*>(&where), &size);
-  say(std::to_string(ntohs(where.sin_port)));
+  sockaddr_in address{};
+  socklen_t size = sizeof address;
+  address.sin_family = AF_INET;
+  if (bind(server, reinterpret_cast<sockaddr*>(&address), size) || listen(server, 4096)) fail("bind");
+  getsockname(server, reinterpret_cast<sockaddr*>(&address), &size);
+  say(std::to_string(ntohs(address.sin_port)));
   int streams = epoll_create1(0);
   std::thread(stream, streams).detach();
   while (true) {
@@ -142,11 +142,11 @@ static int connected(const Strings& to, const std::string& topic) {
   timeval patience{20, 0};
   setsockopt(fd, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
   noDelay(fd);
-  sockaddr_in where{};
-  where.sin_family = AF_INET;
-  where.sin_port = htons(std::stoi(to[1]));
-  inet_pton(AF_INET, to[0].c_str(), &where.sin_addr);
-  if (connect(fd, reinterpret_cast<sockaddr*>(&where), sizeof where)) fail("connect");
+  sockaddr_in address{};
+  address.sin_family = AF_INET;
+  address.sin_port = htons(std::stoi(to[1]));
+  inet_pton(AF_INET, to[0].c_str(), &address.sin_addr);
+  if (connect(fd, reinterpret_cast<sockaddr*>(&address), sizeof address)) fail("connect");
   std::string hello = header({"callerid=/bench_outside", "topic=" + topic, "type=std_msgs/String",
                               "md5sum=992ce8a1687cec8c8bd883ec73ca41d1", "tcp_nodelay=1"});
   if (!writeAll(fd, hello.data(), hello.size()) || readHeader(fd).empty()) fail("no header");

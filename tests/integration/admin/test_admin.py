@@ -33,8 +33,8 @@ DEAD_HOST = "127.0.9.9"
 
 async def ask(proxy: Proxy, path: str, verb: str = "GET") -> tuple[int, str]:
     """Status and text of a path of the admin endpoint."""
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
-    reply = await exchange(where, f"{verb} {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    reply = await exchange(address, f"{verb} {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
     return reply.status, reply.body.decode()
 
 
@@ -47,9 +47,9 @@ async def metrics(proxy: Proxy) -> dict[str, float]:
     code, text = await ask(proxy, "/metrics")
     assert code == 200
     samples = [s for family in text_string_to_metric_families(text) for s in family.samples]
-    found = {f"{s.name}{_labels(s.labels)}": s.value for s in samples}
-    assert len(found) == len(samples), "a sample twice"
-    return found
+    values = {f"{s.name}{_labels(s.labels)}": s.value for s in samples}
+    assert len(values) == len(samples), "a sample twice"
+    return values
 
 
 def _labels(labels: dict[str, str]) -> str:
@@ -97,8 +97,8 @@ async def test_status_tells_everything_of_a_node(proxy: Proxy, node: FakeNode) -
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header())
         await read_header(wire)
-        found = await status(proxy)
-    (told,) = found["nodes"]
+        document = await status(proxy)
+    (told,) = document["nodes"]
     assert told["nodes"] == ["/talker"]
     assert told["uri"] == node.uri
     assert told["advertised_uri"] == proxy.uri(node)
@@ -110,51 +110,51 @@ async def test_status_tells_everything_of_a_node(proxy: Proxy, node: FakeNode) -
     (connection,) = told["connections"]
     assert (connection["name"], connection["caller_id"]) == ("/chatter", "/outside")
     assert connection["peer"] == OUTSIDE
-    assert found["ports"]["used"] == 1
-    assert found["master"]["up"]
-    assert found["uptime"] >= 0
+    assert document["ports"]["used"] == 1
+    assert document["master"]["up"]
+    assert document["uptime"] >= 0
 
 
 async def test_metrics_of_a_proxy_at_work(
     make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
     proxy, node, dead = await make_proxy(), await make_node(), await make_node("/dead")
-    for one in (node, dead):
-        await one.publish(proxy.master)
+    for publisher in (node, dead):
+        await publisher.publish(proxy.master)
     await node.serve(proxy.master)
     await dead.stop()
     await _talk(proxy, node)
     await rpc(proxy.lease(node), "getPid", "/outside")
     await until(lambda: not master.holds("publishers", "/dead"), "cleaned up")
     await until(lambda: proxy.metric("cleanups_total"), "counted")
-    found = await metrics(proxy)
-    assert not [name for name in found if "_created" in name]
-    assert found["rosproxy_buffered_bytes"] <= found["rosproxy_buffered_bytes_limit"]
-    assert found["rosproxy_leases_used"] in (1, 2)
-    assert found["rosproxy_leases_used"] + found["rosproxy_leases_free"] == 8
-    assert found["rosproxy_leases_blocked"] == 0
-    assert found["rosproxy_endpoints{state=ok}"] == 1
-    assert found["rosproxy_master_up"] == 1
-    assert found["rosproxy_open_connections"] == 0
-    assert found["rosproxy_cleanups_total"] == 1
-    assert found["rosproxy_relay_errors_total{reason=bad header}"] == 1
-    assert found["rosproxy_master_round_trip_seconds_count"] > 0
+    samples = await metrics(proxy)
+    assert not [name for name in samples if "_created" in name]
+    assert samples["rosproxy_buffered_bytes"] <= samples["rosproxy_buffered_bytes_limit"]
+    assert samples["rosproxy_leases_used"] in (1, 2)
+    assert samples["rosproxy_leases_used"] + samples["rosproxy_leases_free"] == 8
+    assert samples["rosproxy_leases_blocked"] == 0
+    assert samples["rosproxy_endpoints{state=ok}"] == 1
+    assert samples["rosproxy_master_up"] == 1
+    assert samples["rosproxy_open_connections"] == 0
+    assert samples["rosproxy_cleanups_total"] == 1
+    assert samples["rosproxy_relay_errors_total{reason=bad header}"] == 1
+    assert samples["rosproxy_master_round_trip_seconds_count"] > 0
     calls = "rosproxy_xmlrpc_calls_total{api=%s,method=%s,outcome=answered}"
-    assert found[calls % ("master", "registerPublisher")] == 2
-    assert found[calls % ("slave", "getPid")] == 1
-    assert found["rosproxy_relayed_bytes_total{direction=inward,kind=topic,name=/chatter}"] >= 5
-    assert found["rosproxy_relayed_bytes_total{direction=outward,kind=topic,name=/chatter}"] >= 5
-    assert found["rosproxy_relayed_bytes_total{direction=outward,kind=service,name=/add}"] > 0
-    assert found["process_open_fds"] > 0
-    assert any(name.startswith("rosproxy_build_info{version=") for name in found)
+    assert samples[calls % ("master", "registerPublisher")] == 2
+    assert samples[calls % ("slave", "getPid")] == 1
+    assert samples["rosproxy_relayed_bytes_total{direction=inward,kind=topic,name=/chatter}"] >= 5
+    assert samples["rosproxy_relayed_bytes_total{direction=outward,kind=topic,name=/chatter}"] >= 5
+    assert samples["rosproxy_relayed_bytes_total{direction=outward,kind=service,name=/add}"] > 0
+    assert samples["process_open_fds"] > 0
+    assert any(name.startswith("rosproxy_build_info{version=") for name in samples)
 
 
 async def test_who_does_not_answer_is_named(
     make_proxy: MakeProxy, make_node: MakeNode, node: FakeNode
 ) -> None:
     proxy, dead = await make_proxy(cleanup_after=60.0), await make_node("/dead")
-    for one in (node, dead):
-        await one.publish(proxy.master)
+    for publisher in (node, dead):
+        await publisher.publish(proxy.master)
     assert not [name for name in await metrics(proxy) if "nodes_down{" in name]
     await dead.stop()
     await until(lambda: proxy.metric("nodes_down", node="/dead"), "it is missed")
@@ -196,12 +196,12 @@ async def test_strangers_cannot_multiply_series(proxy: Proxy, node: FakeNode) ->
             await wire.send(topic_header(f"/made_up_{number}", f"/caller_{number}"))
             await read_header(wire)
     await proxy.quiet()
-    found = await metrics(proxy)
-    assert not [name for name in found if "made_up" in name or "method_" in name]
-    assert not [name for name in found if "caller_" in name]
+    samples = await metrics(proxy)
+    assert not [name for name in samples if "made_up" in name or "method_" in name]
+    assert not [name for name in samples if "caller_" in name]
     key = "rosproxy_relayed_bytes_total{direction=outward,kind=topic,name=unregistered}"
-    assert found[key] > 0
-    assert [name for name in found if "method=other" in name]
+    assert samples[key] > 0
+    assert [name for name in samples if "method=other" in name]
 
 
 def test_names_of_topics_are_bounded() -> None:
@@ -224,22 +224,22 @@ async def test_probe_tries_the_lowest_and_the_highest_free_port(
     proxy: Proxy, node: FakeNode, master: FakeMaster
 ) -> None:
     await node.publish(proxy.master)
-    kept = dict(master.params)
+    params = dict(master.params)
     ports = proxy.settings.ports.listen
     before = proxy.ros1.context.registry.pool.free
-    found = await probe(proxy)
-    assert [p["port"] for p in found] == [ports.first + 1, ports.last]
-    assert {(p["from_proxy"], p["from_master"]) for p in found} == {("ok", "ok")}
-    assert found[0]["advertised"] == f"{HOST}:{ports.first + 1}"
+    attempts = await probe(proxy)
+    assert [p["port"] for p in attempts] == [ports.first + 1, ports.last]
+    assert {(p["from_proxy"], p["from_master"]) for p in attempts} == {("ok", "ok")}
+    assert attempts[0]["advertised"] == f"{HOST}:{ports.first + 1}"
     assert proxy.ros1.context.registry.pool.free == before
-    assert master.params == kept, "a parameter is left behind"
+    assert master.params == params, "a parameter is left behind"
     assert not [name for name in master.nodes if "probe" in name]
 
 
 async def test_probe_while_the_master_is_away(proxy: Proxy, master: FakeMaster) -> None:
     master.answers["system.multicall"] = End.RESET
-    found = await probe(proxy)
-    assert {(p["from_proxy"], p["from_master"]) for p in found} == {("ok", "unknown")}
+    attempts = await probe(proxy)
+    assert {(p["from_proxy"], p["from_master"]) for p in attempts} == {("ok", "unknown")}
 
 
 async def test_probe_tells_that_the_master_does_not_get_through(
@@ -248,8 +248,8 @@ async def test_probe_tells_that_the_master_does_not_get_through(
     monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 0.3)
     master.calls_back = False
     proxy = await make_proxy()
-    (found,) = await probe(proxy)  # the master is not sent into the void twice
-    assert (found["from_proxy"], found["from_master"]) == ("ok", "missed")
+    (attempt,) = await probe(proxy)  # the master is not sent into the void twice
+    assert (attempt["from_proxy"], attempt["from_master"]) == ("ok", "missed")
     assert proxy.ros1.context.registry.pool.free == 8
 
 
@@ -316,9 +316,9 @@ async def test_probe_is_not_deceived_by_who_knows_no_secret(
     master.calls_back = False
     proxy = await make_proxy(ports=1)
     trying = asyncio.create_task(probe(proxy))
-    where = (HOST, proxy.settings.ports.listen.first)
+    address = (HOST, proxy.settings.ports.listen.first)
     await until(lambda: proxy.ros1.context.registry.pool.free == 0, "the probe has begun")
-    async with connect(where) as wire:
+    async with connect(address) as wire:
         await wire.send(post(xml("paramUpdate", "/master", "/guess", 1)))
         assert await wire.end() in ("closed", "reset")
     assert (await trying)[0]["from_master"] == "missed"

@@ -86,9 +86,9 @@ async def test_without_a_token_nobody_from_afar_may(proxy: Proxy) -> None:
 @pytest.mark.usefixtures("from_afar")
 async def test_everybody_may_look(make_proxy: MakeProxy) -> None:
     proxy = await make_proxy(admin_token=TOKEN)
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
     for path in ("/healthz", "/metrics", "/status"):
-        reply = await exchange(where, f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        reply = await exchange(address, f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
         assert reply.status == 200
         assert TOKEN.encode() not in reply.body
 
@@ -331,9 +331,9 @@ async def test_it_goes_on_calling_itself_what_it_did(
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
     assert not master.holds("publishers", "/chatter")
     neighbour = await make_node("/neighbour", THIRD_NODE)
-    found = (await neighbour.subscribe(proxy.master, "/more"))[2]
-    assert found != [node.uri]
-    assert f":{proxy.lease(node)[1]}/" in found[0]
+    uris = (await neighbour.subscribe(proxy.master, "/more"))[2]
+    assert uris != [node.uri]
+    assert f":{proxy.lease(node)[1]}/" in uris[0]
 
 
 async def test_its_subscriptions_are_told_to_connect_again(container: Container) -> None:
@@ -415,8 +415,8 @@ async def test_retiring(
     await proxy.ros1.registrar.register_lost()
     await proxy.ros1.prober.look()
     assert not everything(master)
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
-    ready = await exchange(where, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    ready = await exchange(address, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
     assert (ready.status, ready.body) == (503, b"retired: nothing is registered any more\n")
 
 

@@ -15,18 +15,18 @@ from tests.integration.proxy import Proxy
 
 
 async def wait(proxy: Proxy, since: str = "", within: str = "60", *headers: str) -> Reply:
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
     path = f"/status/changes?since={quote(since)}&within={within}"
     lines = [f"GET {path} HTTP/1.1", "Host: x", *headers, "", ""]
-    return await exchange(where, "\r\n".join(lines).encode())
+    return await exchange(address, "\r\n".join(lines).encode())
 
 
 async def changes(proxy: Proxy, since: str = "", within: str = "60") -> tuple[str, dict[str, Any]]:
     """The version and the state."""
     reply = await wait(proxy, since, within)
     assert reply.status == 200, reply.body
-    found = json.loads(reply.body)
-    return found["version"], found["status"]
+    document = json.loads(reply.body)
+    return document["version"], document["status"]
 
 
 async def test_a_change_is_told(
@@ -74,7 +74,7 @@ async def test_so_many_may_wait(make_proxy: MakeProxy, monkeypatch: pytest.Monke
     some[0].cancel()
     await until(lambda: room._waiting < status_changes.MOST_WAITING, "there is room again")
     room.end()
-    assert {(await one).status for one in some[1:]} == {200}
+    assert {(await task).status for task in some[1:]} == {200}
 
 
 async def test_no_web_page_may_wait(proxy: Proxy) -> None:

@@ -41,30 +41,30 @@ async def opened(proxies: dict[str, tuple[HostPort, str]], client: ProxyClient) 
 async def test_all_proxies_stand_on_one_page(
     make_proxy: MakeProxy, node: FakeNode, client: ProxyClient
 ) -> None:
-    one, two = await make_proxy(admin_token=TOKEN), await make_proxy()
-    await node.publish(one.master)
+    first, second = await make_proxy(admin_token=TOKEN), await make_proxy()
+    await node.publish(first.master)
     gone = HostPort("127.0.0.1", free_ports(1))
     proxies = {
-        "one": (one.settings.admin, TOKEN),
-        "two": (two.settings.admin, ""),
+        "one": (first.settings.admin, TOKEN),
+        "two": (second.settings.admin, ""),
         "gone": (gone, ""),
     }
     server = await opened(proxies, client)
-    where = HostPort("127.0.0.1", free_ports(1))
-    await server.start(where)
+    address = HostPort("127.0.0.1", free_ports(1))
+    await server.start(address)
     try:
         async with aiohttp.ClientSession() as session:
-            async with session.get(f"http://{where}/graph") as reply:
+            async with session.get(f"http://{address}/graph") as reply:
                 nodes = json.loads(await reply.read())["nodes"]
             assert nodes["one /talker"]["label"] == "/talker"
             assert nodes["two rosproxy"]["label"] == "two"
             assert nodes["gone"]["state"] == "broken"
             assert f"{gone} refuses connections" in nodes["gone"]["text"]
-            async with session.get(f"http://{where}/", headers={"Host": "evil.example"}) as reply:
+            async with session.get(f"http://{address}/", headers={"Host": "evil.example"}) as reply:
                 assert reply.status == 403
-            async with session.get(f"http://{where}/events") as reply:
+            async with session.get(f"http://{address}/events") as reply:
                 assert reply.status == 200
-                assert looked_at(one)
+                assert looked_at(first)
     finally:
         await server.stop()
 
@@ -77,11 +77,11 @@ def looked_at(proxy: Proxy) -> bool:
 async def test_a_proxy_of_a_former_release_says_so(client: ProxyClient) -> None:
     former = web.AppRunner(web.Application())
     await former.setup()
-    where = HostPort("127.0.0.1", free_ports(1))
-    await web.TCPSite(former, where.host, where.port).start()
+    address = HostPort("127.0.0.1", free_ports(1))
+    await web.TCPSite(former, address.host, address.port).start()
     try:
-        found = await client.documents({"old": (where, TOKEN)})
-        assert found == {"old": "it has no live page: its image is that of a former release"}
+        documents = await client.documents({"old": (address, TOKEN)})
+        assert documents == {"old": "it has no live page: its image is that of a former release"}
     finally:
         await former.cleanup()
 
@@ -92,11 +92,11 @@ async def test_nobody_is_asked_while_nobody_looks(
     monkeypatch.setattr("rosproxy.page.feed.LINGER", 0.05)
     proxy = await make_proxy()
     server = await opened({"one": (proxy.settings.admin, "")}, client)
-    where = HostPort("127.0.0.1", free_ports(1))
-    await server.start(where)
+    address = HostPort("127.0.0.1", free_ports(1))
+    await server.start(address)
     assert not looked_at(proxy)
     try:
-        async with aiohttp.ClientSession() as session, session.get(f"http://{where}/events"):
+        async with aiohttp.ClientSession() as session, session.get(f"http://{address}/events"):
             await until(lambda: looked_at(proxy), "the proxy is asked")
         await until(lambda: not looked_at(proxy), "the proxy is left alone")
     finally:

@@ -50,9 +50,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def get(proxy: Proxy, path: str, *headers: str, host: str = "localhost") -> Reply:
     """The response to a GET; ``headers`` are whole lines."""
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
     lines = [f"GET {path} HTTP/1.1", f"Host: {host}", *headers, "", ""]
-    return await exchange(where, "\r\n".join(lines).encode())
+    return await exchange(address, "\r\n".join(lines).encode())
 
 
 class Stream:
@@ -89,9 +89,9 @@ class Stream:
         """A link, once it is so."""
         async with asyncio.timeout(PATIENCE):
             while True:
-                found: dict[str, Any] = self.document.get("links", {}).get(key, {})
-                if found and wanted.items() <= found.items():
-                    return found
+                link: dict[str, Any] = self.document.get("links", {}).get(key, {})
+                if link and wanted.items() <= link.items():
+                    return link
                 await self.follow()
 
 
@@ -240,8 +240,8 @@ async def test_a_page_that_reads_nothing_misses_documents_and_holds_few(
 
     monkeypatch.setattr(page.feed, "_make", documents)
     monkeypatch.setattr(page, "_event", counted)
-    where = (proxy.settings.admin.host, proxy.settings.admin.port)
-    async with connect(where) as wire:
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    async with connect(address) as wire:
         await wire.send(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         await until(lambda: made > 40, "documents are made")
         assert 0 < encoded <= 4
@@ -263,7 +263,7 @@ async def test_a_page_goes_on_after_a_mistake_of_ours(
         await page.follow()
         await page.follow()
         assert "rosproxy" in page.document["nodes"]
-    assert [one.getMessage() for one in caplog.records if one.exc_info] == [
+    assert [record.getMessage() for record in caplog.records if record.exc_info] == [
         "the live page failed; trying again"
     ]
     caplog.clear()

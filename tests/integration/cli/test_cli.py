@@ -194,8 +194,8 @@ class Terminal:
     def read(self) -> str:
         """What it has written until now."""
         try:
-            while part := os.read(self._mine, 65536):
-                self.text += part.decode()
+            while chunk := os.read(self._mine, 65536):
+                self.text += chunk.decode()
         except OSError:  # nothing yet, or it has ended
             pass
         return self.text
@@ -251,14 +251,14 @@ async def test_watch_into_a_file_has_no_control_characters(proxy: Proxy) -> None
 
 
 async def test_help_names_the_exit_codes_and_variables() -> None:
-    for command, words in (
+    for command, phrases in (
         ("status", ["--watch", "ROSPROXY_ADMIN_BIND"]),
         ("doctor", ["--outside", "Exits with 0"]),
         ("health", ["container health checks"]),
     ):
         result = await run(command, "--help")
         assert result.code == 0
-        assert all(word in " ".join(result.out.split()) for word in words)
+        assert all(phrase in " ".join(result.out.split()) for phrase in phrases)
 
 
 async def test_health_starts_fast() -> None:

@@ -143,8 +143,8 @@ KNOWN = ("ROSPROXY_PORT_RANGE", "ROSPROXY_ADMIN", "ROS_MASTER_URI", "ROS_DOMAIN_
     ],
 )
 def test_a_variable_that_looks_like_ours(name: str, meant: str):
-    (found,) = unknown({name: "1", "ROSPROXY_PORT_RANGE": "1-2"}, KNOWN)
-    assert (found.name, found.suggestion) == (name, meant)
+    (variable,) = unknown({name: "1", "ROSPROXY_PORT_RANGE": "1-2"}, KNOWN)
+    assert (variable.name, variable.suggestion) == (name, meant)
 
 
 @pytest.mark.parametrize(
@@ -189,13 +189,13 @@ def test_help_of_the_operators_names_the_variables():
 async def test_status_waits_until_the_proxy_is_ready(start_process, master):
     await master.stop()
     process: Process = start_process()
-    where = f"http://{process.options['admin_bind']}"
-    early = await run("status", "--admin", where)
+    admin = f"http://{process.options['admin_bind']}"
+    early = await run("status", "--admin", admin)
     assert early.code == 1
     assert "DOWN" in early.out
     assert "answers HTTP 503" in early.err
     await master.start()
-    late = await run("status", "--wait", "60", "--admin", where)
+    late = await run("status", "--wait", "60", "--admin", admin)
     assert (late.code, late.err) == (0, "")
     none = await run("status", "--wait", "1", "--admin", "http://127.0.0.1:1")
     assert (none.code, none.err.count("\n")) == (1, 1)
@@ -215,8 +215,8 @@ def on_a_terminal(*words: str, **environment: str) -> str:
         os.close(terminal)
         said = b""
         with suppress(OSError):
-            while part := os.read(controller, 65536):
-                said += part
+            while chunk := os.read(controller, 65536):
+                said += chunk
     os.close(controller)
     return said.decode()
 

@@ -34,12 +34,15 @@ def admin_of(process: Process) -> str:
 
 async def status(process: Process) -> dict[str, Any]:
     ended = await run("status", "--json", "--admin", admin_of(process))
-    found: dict[str, Any] = json.loads(ended.out)
-    return found
+    document: dict[str, Any] = json.loads(ended.out)
+    return document
 
 
 async def problems(process: Process) -> list[str]:
-    return [f"{one['subject']}: {one['text']}" for one in (await status(process))["problems"]]
+    return [
+        f"{problem['subject']}: {problem['text']}"
+        for problem in (await status(process))["problems"]
+    ]
 
 
 async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_process, node):
@@ -94,11 +97,11 @@ async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
     uri = f"http://{proxy.settings.advertise_host}:{port}/{node.address}:{node.slave.address[1]}/"
     await rpc(master.uri, "registerPublisher", "/others", "/t", "a/B", uri)
     await rpc(master.uri, "registerPublisher", "/ghost", "/t", "a/B", uri.replace(str(port), "9"))
-    found = [one for one in await examine(proxy) if one.severity is Severity.ERROR]
-    assert (found[0].check, found[0].subject) == ("two proxies", "/others")
-    assert "another rosproxy advertises the same host and ports" in found[0].text
-    assert "ROSPROXY_PORT_RANGE" in found[0].fix
-    assert all(not one.fix.startswith("rosnode cleanup") for one in found)
+    errors = [finding for finding in await examine(proxy) if finding.severity is Severity.ERROR]
+    assert (errors[0].check, errors[0].subject) == ("two proxies", "/others")
+    assert "another rosproxy advertises the same host and ports" in errors[0].text
+    assert "ROSPROXY_PORT_RANGE" in errors[0].fix
+    assert all(not finding.fix.startswith("rosnode cleanup") for finding in errors)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +119,9 @@ async def test_an_advertised_host_that_leads_nowhere_is_told_before_ready(
     log = process.text
     assert log.index(text) < log.index("ready: ")
     assert "ERROR" in log[: log.index("ready: ")]
-    (told,) = [one for one in await problems(process) if one.startswith("advertised host: ")]
+    (told,) = [
+        problem for problem in await problems(process) if problem.startswith("advertised host: ")
+    ]
     assert text in told
     assert cure in told
     assert told.removeprefix("advertised host: ")[:40] in (
@@ -133,7 +138,9 @@ async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(sta
     """192.0.2.1 is nobody's; the master does not get there either."""
     process: Process = start_process(advertise_host="192.0.2.1")
     await until(lambda: "published range: " in process.text, "the range was tried", 60)
-    (told,) = [one for one in await problems(process) if one.startswith("published range: ")]
+    (told,) = [
+        problem for problem in await problems(process) if problem.startswith("published range: ")
+    ]
     assert "docker run -p" in told
     assert process.text.count("published range: ") == 1
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import End, Where, where
+from examples.demo.fake_http import Address, End, host_and_port
 from examples.demo.proxy_process import clean_environment
 from rosproxy.setting_kinds import SettingError
 from tests.integration.net import (
@@ -183,8 +183,8 @@ def test_check_binds_nothing():
 def test_a_taken_port_ends_with_2_and_one_line_that_names_the_option(option):
     with socket.create_server(("0.0.0.0", 0)) as server:
         port = server.getsockname()[1]
-        held = {"admin_bind": f"127.0.0.1:{port}", "port_range": f"{port}-{port}"}
-        ended = run(options_for(**{**GOOD, option: held.get(option, port)}))
+        taken = {"admin_bind": f"127.0.0.1:{port}", "port_range": f"{port}-{port}"}
+        ended = run(options_for(**{**GOOD, option: taken.get(option, port)}))
     assert (ended.returncode, ended.stdout) == (2, "")
     (line,) = [text for text in ended.stderr.splitlines() if text.startswith("rosproxy: ")]
     assert "--" + option.replace("_", "-") in line
@@ -235,8 +235,8 @@ async def test_the_log_can_be_json(start_process):
     assert all(line.keys() >= {"time", "level", "message"} for line in lines)
 
 
-def admin_of(process: Process) -> Where:
-    return where(f"http://{process.options['admin_bind']}")
+def admin_of(process: Process) -> Address:
+    return host_and_port(f"http://{process.options['admin_bind']}")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -251,8 +251,8 @@ async def test_a_signal_ends_it_with_connections_open(start_process, master, mak
     node, hung = await make_node(), await make_node("/hung", "127.0.2.12")
     await node.publish(process.master)
     await hung.publish(process.master)
-    lease = where(master.holds("publishers", "/chatter")[0])
-    stuck = where(master.nodes["/hung"])
+    lease = host_and_port(master.holds("publishers", "/chatter")[0])
+    stuck = host_and_port(master.nodes["/hung"])
     hung.hang, master.answers["getParam"] = True, End.HANG
     get = b"GET /healthz HTTP/1.1\r\nHost: h\r\n\r\n"
     async with AsyncExitStack() as stack:

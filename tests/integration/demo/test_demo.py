@@ -78,7 +78,7 @@ async def test_a_proxy_that_comes_back_as_another_is_noticed(monkeypatch, change
     async def start_elsewhere(self):
         if self.state == "killed":
             monkeypatch.setattr("examples.demo.scenario.PATIENCE", 2.0)
-            self.options = [after if one == before else one for one in self.options]
+            self.options = [after if option == before else option for option in self.options]
         return await start(self)
 
     monkeypatch.setattr(ProxyProcess, "start", start_elsewhere)
@@ -119,13 +119,13 @@ def test_an_interrupted_demo_leaves_no_process(stop):
 
 def _commands():
     """The command lines of all processes; that of the demo's proxy has its master's address."""
-    found = []
+    command_lines = []
     for process in filter(str.isdecimal, os.listdir("/proc")):
         try:
-            found.append(Path(f"/proc/{process}/cmdline").read_text())
+            command_lines.append(Path(f"/proc/{process}/cmdline").read_text())
         except OSError:
             continue  # it has ended
-    return " ".join(found)
+    return " ".join(command_lines)
 
 
 def test_wrong_options_are_refused():
@@ -179,8 +179,8 @@ async def test_the_frame_has_the_act_the_nodes_and_the_events(scenario):
     text = text_of(scenario, 160)
     for node in (scenario.talker, scenario.listener, scenario.adder):
         await node.stop()
-    for part in ("first act", "CALLS ITSELF", "talker.inside:", "it began", "1 call"):
-        assert part in text
+    for phrase in ("first act", "CALLS ITSELF", "talker.inside:", "it began", "1 call"):
+        assert phrase in text
     rows = {tuple(line.split()[:3]): line for line in text.splitlines() if line.strip()}
     assert "10" in rows["1", "inside", "talker"]
     assert rows["1", "inside", "talker"].rstrip().endswith("nobody listens")
@@ -199,8 +199,8 @@ async def test_80_columns_show_all_addresses_whole(scenario):
     assert text.count(" 127.0.1.1:30001 ") == len(scenario.nodes)
     for node in scenario.nodes:
         assert f" {node.host}:{node.slave.address[1]} " in text
-    for one in scenario.ros2.nodes:
-        assert f" {one.locators[1]} " in text
+    for participant in scenario.ros2.nodes:
+        assert f" {participant.locators[1]} " in text
 
 
 async def test_without_a_terminal_each_event_is_told_once(scenario):

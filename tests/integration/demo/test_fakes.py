@@ -55,7 +55,7 @@ async def test_the_last_provider_of_a_service_wins(master):
 
 
 async def test_a_publisher_decides_on_a_topics_type(master):
-    found = []
+    topic_types = []
     for method, type_ in (
         ("registerSubscriber", "*"),
         ("registerSubscriber", "a/A"),
@@ -63,8 +63,8 @@ async def test_a_publisher_decides_on_a_topics_type(master):
         ("registerPublisher", "*"),
     ):
         await rpc(master.uri, method, "/n", "/t", type_, A)
-        found.append((await rpc(master.uri, "getTopicTypes", "/x"))[2])
-    assert found == [[], [["/t", "a/A"]], [["/t", "b/B"]], [["/t", "b/B"]]]
+        topic_types.append((await rpc(master.uri, "getTopicTypes", "/x"))[2])
+    assert topic_types == [[], [["/t", "a/A"]], [["/t", "b/B"]], [["/t", "b/B"]]]
 
 
 async def test_subscribers_of_a_parameter_hear_of_it_unless_they_set_it(master, node):

@@ -40,7 +40,7 @@ async def met():
                 first.append(node)
                 ending.push_async_callback(node.stop)
                 await node.start()
-                node.announce_to([one.locators[0] for one in first[:1] if one is not node])
+                node.announce_to([peer.locators[0] for peer in first[:1] if peer is not node])
             return nodes
 
         yield start
@@ -137,16 +137,29 @@ def test_a_writer_keeps_what_one_of_its_readers_lacks():
 
 @given(st.integers(1, 2**40), st.integers(0, 100), st.integers(0, 2**31 - 1))
 def test_what_is_asked_for_can_be_read(base, count, number):
-    (one,) = told(message(A, B, acknack(0x104, 0x103, base, range(base, base + count), number)))
-    assert (one.kind, one.reader, one.writer) == (SubmessageId.ACKNACK, 0x104, 0x103)
-    assert (one.first, one.missing) == (base, tuple(range(base, base + min(count, MOST_ASKED))))
+    (submessage,) = told(
+        message(A, B, acknack(0x104, 0x103, base, range(base, base + count), number))
+    )
+    assert (submessage.kind, submessage.reader, submessage.writer) == (
+        SubmessageId.ACKNACK,
+        0x104,
+        0x103,
+    )
+    assert (submessage.first, submessage.missing) == (
+        base,
+        tuple(range(base, base + min(count, MOST_ASKED))),
+    )
 
 
 @given(st.integers(1, 2**40), st.integers(0, 2**40), st.integers(0, 2**31 - 1))
 def test_a_heartbeat_can_be_read(first, last, number):
-    (one,) = told(message(A, B, heartbeat(0x104, 0x103, first, last, number)))
-    assert (one.kind, one.reader, one.writer) == (SubmessageId.HEARTBEAT, 0x104, 0x103)
-    assert (one.first, one.last, one.asks) == (first, last, True)
+    (submessage,) = told(message(A, B, heartbeat(0x104, 0x103, first, last, number)))
+    assert (submessage.kind, submessage.reader, submessage.writer) == (
+        SubmessageId.HEARTBEAT,
+        0x104,
+        0x103,
+    )
+    assert (submessage.first, submessage.last, submessage.asks) == (first, last, True)
 
 
 @given(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])))
@@ -155,9 +168,9 @@ def test_a_string_can_be_read(text):
 
 
 def test_a_domain_that_somebody_has_is_not_chosen(monkeypatch):
-    domain, held = reserve_domain()
+    domain, reservation = reserve_domain()
     monkeypatch.setattr(ros2_acts, "DOMAINS", range(domain, domain + 1))
-    with held, pytest.raises(DemoError, match="every domain"):
+    with reservation, pytest.raises(DemoError, match="every domain"):
         reserve_domain()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
         participant.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -56,14 +56,14 @@ async def examine(proxy: Proxy | None, *names: str, master_uri: str = "") -> lis
 
 async def faults(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[DoctorFinding]:
     """The findings that are more than notes."""
-    found = await examine(proxy, *names, master_uri=master_uri)
-    return [f for f in found if f.severity >= Severity.WARNING]
+    findings = await examine(proxy, *names, master_uri=master_uri)
+    return [f for f in findings if f.severity >= Severity.WARNING]
 
 
 async def only(proxy: Proxy | None, *names: str, master_uri: str = "") -> DoctorFinding:
     """The one fault."""
-    (found,) = await faults(proxy, *names, master_uri=master_uri)
-    return found
+    (finding,) = await faults(proxy, *names, master_uri=master_uri)
+    return finding
 
 
 def bus(*rows: tuple[str, str, str]) -> bytes:
@@ -77,9 +77,9 @@ async def test_a_sound_system(
 ) -> None:
     await node.publish(proxy.master)
     await until(lambda: proxy.endpoint(node).health.state == "ok", "the node was probed")
-    found = await examine(proxy)
-    assert {f.severity for f in found} == {Severity.OK}, found
-    texts = " ".join(f.text for f in found)
+    findings = await examine(proxy)
+    assert {f.severity for f in findings} == {Severity.OK}, findings
+    texts = " ".join(f.text for f in findings)
     assert f"{master.uri} answers in" in texts
     assert f"the master reaches {HOST}, port " in texts
     assert "1 of 1 answer" in texts
@@ -98,9 +98,9 @@ async def test_a_node_that_has_ended(make_proxy: MakeProxy, node: FakeNode) -> N
     await node.publish(proxy.master)
     await node.stop()
     await until(lambda: proxy.endpoint(node).health.down, "the node was missed")
-    found = await only(proxy)
-    assert (found.subject, found.severity) == ("/talker", Severity.ERROR)
-    assert "has ended without unregistering" in found.text
+    finding = await only(proxy)
+    assert (finding.subject, finding.severity) == ("/talker", Severity.ERROR)
+    assert "has ended without unregistering" in finding.text
 
 
 async def test_a_node_that_hangs(make_proxy: MakeProxy, node: FakeNode) -> None:
@@ -122,8 +122,8 @@ async def test_an_outside_node_that_is_gone(
 
 async def test_an_outside_node_of_an_unknown_host(proxy: Proxy, master: FakeMaster) -> None:
     await rpc(master.uri, "registerPublisher", "/far", "/t", "a/B", "http://nobody.invalid:4/")
-    found = [f for f in await faults(proxy) if f.subject == "/far"]
-    assert "the host name nobody.invalid can't be resolved" in found[0].text
+    findings = [f for f in await faults(proxy) if f.subject == "/far"]
+    assert "the host name nobody.invalid can't be resolved" in findings[0].text
 
 
 async def test_a_stale_registration(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
@@ -132,16 +132,16 @@ async def test_a_stale_registration(proxy: Proxy, node: FakeNode, master: FakeMa
     uri = f"http://{HOST}:{port}/127.0.2.99:4/"
     await rpc(master.uri, "registerPublisher", "/ghost", "/t", "a/B", uri)
     await rpc(master.uri, "registerService", "/ghost", "/s", f"rosrpc://{HOST}:{port}", uri)
-    found = await faults(proxy)
-    assert [f.subject for f in found] == ["/ghost", "/ghost"]
-    assert {f.check for f in found} == {"stale registration"}
+    findings = await faults(proxy)
+    assert [f.subject for f in findings] == ["/ghost", "/ghost"]
+    assert {f.check for f in findings} == {"stale registration"}
 
 
 async def test_the_master_is_away(proxy: Proxy, master: FakeMaster) -> None:
     await master.stop()
-    found = [f for f in await faults(proxy) if f.severity is Severity.ERROR]
-    assert [f.check for f in found] == ["master"]
-    assert "refuses connections" in found[0].text
+    findings = [f for f in await faults(proxy) if f.severity is Severity.ERROR]
+    assert [f.check for f in findings] == ["master"]
+    assert "refuses connections" in findings[0].text
 
 
 async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
@@ -153,10 +153,10 @@ async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
     fake = FakeHttpServer(respond)
     await fake.start(MASTER)
     proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/ros")
-    found = [f for f in await faults(proxy) if f.check == "master"]
+    findings = [f for f in await faults(proxy) if f.check == "master"]
     await proxy.stop()
     await fake.stop()
-    assert "not at the path /ros" in found[0].text
+    assert "not at the path /ros" in findings[0].text
 
 
 async def test_something_else_answers_for_the_master(make_proxy: MakeProxy) -> None:
@@ -166,23 +166,23 @@ async def test_something_else_answers_for_the_master(make_proxy: MakeProxy) -> N
     fake = FakeHttpServer(respond)
     await fake.start(MASTER)
     proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/")
-    found = [f for f in await faults(proxy) if f.check == "master"]
+    findings = [f for f in await faults(proxy) if f.check == "master"]
     await proxy.stop()
     await fake.stop()
-    assert "is no ROS master" in found[0].text
+    assert "is no ROS master" in findings[0].text
 
 
 async def test_the_proxy_is_its_own_master(make_proxy: MakeProxy) -> None:
     port = free_ports(1)
     proxy = await make_proxy(master_uri=f"http://127.0.0.1:{port}", master_port=port)
-    found = [f for f in await faults(proxy) if f.check == "master"]
-    assert "leads back to this proxy itself" in found[0].text
+    findings = [f for f in await faults(proxy) if f.check == "master"]
+    assert "leads back to this proxy itself" in findings[0].text
 
 
 async def test_the_published_master(make_proxy: MakeProxy) -> None:
     proxy = await make_proxy(publish_master=free_ports(1))
-    (found,) = [f for f in await examine(proxy) if f.check == "published master"]
-    assert found.severity is Severity.OK
+    (finding,) = [f for f in await examine(proxy) if f.check == "published master"]
+    assert finding.severity is Severity.OK
 
 
 async def connected_pair(proxy: Proxy, node: FakeNode) -> None:
@@ -197,8 +197,8 @@ async def test_a_topic_whose_pair_is_connected(
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header(caller="/listener"))
         await read_header(wire)
-        found = await examine(proxy, "/chatter")
-    (pair,) = [f for f in found if f.check == "pair"]
+        findings = await examine(proxy, "/chatter")
+    (pair,) = [f for f in findings if f.check == "pair"]
     assert pair.severity is Severity.OK
     assert pair.text.startswith("connected, ")
     assert pair.text.endswith(" just now")
@@ -207,16 +207,16 @@ async def test_a_topic_whose_pair_is_connected(
 async def test_types_that_differ(proxy: Proxy, node: FakeNode, listener: FakeNode) -> None:
     await node.publish(proxy.master)
     listener.subscribed["/chatter"] = "std_msgs/Int32"
-    found = await only(proxy, "/talker", "/listener")
-    assert "types differ, std_msgs/String and std_msgs/Int32" in found.text
+    finding = await only(proxy, "/talker", "/listener")
+    assert "types differ, std_msgs/String and std_msgs/Int32" in finding.text
 
 
 async def test_a_subscriber_that_did_not_come(
     proxy: Proxy, node: FakeNode, listener: FakeNode
 ) -> None:
     await node.publish(proxy.master)
-    found = await only(proxy, "/chatter")
-    assert "/listener has not connected" in found.text
+    finding = await only(proxy, "/chatter")
+    assert "/listener has not connected" in finding.text
 
 
 async def outside_publisher(master: FakeMaster, make_node: MakeNode) -> FakeNode:
@@ -267,19 +267,19 @@ async def test_nodes_that_talk_nonsense_do_no_harm(
 
 async def test_services(proxy: Proxy, node: FakeNode) -> None:
     await node.serve(proxy.master)
-    (found,) = [f for f in await examine(proxy, "/add") if f.check == "pair"]
-    assert found.severity is Severity.OK
+    (finding,) = [f for f in await examine(proxy, "/add") if f.check == "pair"]
+    assert finding.severity is Severity.OK
     assert node.headers[-1]["probe"] == "1"
     await node.tcpros.stop()
-    found = next(f for f in await faults(proxy, "/add") if f.check == "pair")
-    assert "connection refused" in found.text
+    finding = next(f for f in await faults(proxy, "/add") if f.check == "pair")
+    assert "connection refused" in finding.text
 
 
 async def test_without_a_proxy_the_master_and_its_nodes_are_looked_at(
     listener: FakeNode, master: FakeMaster
 ) -> None:
-    found = diagnose(await collect(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
-    errors = {f.check for f in found if f.severity is Severity.ERROR}
+    findings = diagnose(await collect(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
+    errors = {f.check for f in findings if f.severity is Severity.ERROR}
     assert errors == {"admin", "pair"}
 
 
@@ -293,8 +293,8 @@ async def test_the_look_from_outside(
     ]
     assert pair.text == "connected"
     await proxy.stop()
-    found = await only(None, master_uri=master.uri)
-    assert "registered through a rosproxy" in found.text
+    finding = await only(None, master_uri=master.uri)
+    assert "registered through a rosproxy" in finding.text
 
 
 async def test_the_command(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
@@ -334,9 +334,9 @@ async def test_many_nodes_are_looked_at_together(
         uri = f"http://{OUTSIDE}:{silent.address[1]}/"
         await rpc(master.uri, "registerPublisher", f"/n{number}", "/t", "a/B", uri)
     started = asyncio.get_running_loop().time()
-    found = await faults(proxy)
+    findings = await faults(proxy)
     await silent.stop()
-    assert len([f for f in found if f.subject.startswith("/n")]) == 100
+    assert len([f for f in findings if f.subject.startswith("/n")]) == 100
     assert asyncio.get_running_loop().time() - started < 25  # one after another: 50
 
 

@@ -33,8 +33,8 @@ async def received(sock: socket.socket) -> bytes:
 def relay_to(target: socket.socket, *sources: str) -> tuple[DatagramRelay, list[bool]]:
     """A relay, and what it tells of its end."""
     ends: list[bool] = []
-    where = HostPort(*target.getsockname())
-    return DatagramRelay(bind(PROXY, 0), sources, where, lambda: ends.append(True)), ends
+    address = HostPort(*target.getsockname())
+    return DatagramRelay(bind(PROXY, 0), sources, address, lambda: ends.append(True)), ends
 
 
 async def test_datagrams_arrive_as_they_were_sent(target: socket.socket) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import Where
+from examples.demo.fake_http import Address
 from rosproxy.forwarding.kernel import decisions, syncer
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel.decisions import HostForwarding
@@ -50,7 +50,7 @@ def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel_plane, "find_obstacle", something)
 
 
-async def ask(proxy: Any, node: Any) -> Where:
+async def ask(proxy: Any, node: Any) -> Address:
     """Where a subscriber outside is sent for a node's topic."""
     _, _, (protocol, host, port) = await rpc(
         proxy.uri(node), "requestTopic", "/x", "/chatter", TCPROS
@@ -81,8 +81,8 @@ async def test_a_service_keeps_to_the_lease(make_proxy, make_node, kernel, maste
     await node.serve(proxy.master)
     host, lease = proxy.lease(node)
     await ask(proxy, node)
-    found = await rpc(master.uri, "lookupService", "/x", "/add")
-    assert found[2] == f"rosrpc://{host}:{lease}"
+    reply = await rpc(master.uri, "lookupService", "/x", "/add")
+    assert reply[2] == f"rosrpc://{host}:{lease}"
 
 
 async def test_the_fast_port_of_a_node_that_ended_refuses(make_proxy, make_node, kernel):

@@ -81,9 +81,9 @@ class Bench:
         return endpoint
 
     def stand_in(self) -> StandIn:
-        where = HostPort("robot", 40000)
-        local, uri = HostPort("172.30.0.2", 20016), f"http://{where}/"
-        stand_in = StandIn(local, uri, where, is_uri_kept=False, topic_ports={"/chatter": 50000})
+        address = HostPort("robot", 40000)
+        local, uri = HostPort("172.30.0.2", 20016), f"http://{address}/"
+        stand_in = StandIn(local, uri, address, is_uri_kept=False, topic_ports={"/chatter": 50000})
         stand_in.address = NODE
         self.context.stand_ins.add(stand_in)
         assert stand_in.fast_candidate is not None
@@ -106,12 +106,12 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 async def bench(sound: None) -> AsyncIterator[Bench]:
-    one = Bench()
-    await one.plane.start()
-    one.plane.recovered([])
-    yield one
-    await one.context.tasks.cancel()
-    await one.plane.stop()
+    bench = Bench()
+    await bench.plane.start()
+    bench.plane.recovered([])
+    yield bench
+    await bench.context.tasks.cancel()
+    await bench.plane.stop()
 
 
 async def until(check: Callable[[], bool]) -> None:
@@ -335,8 +335,8 @@ async def test_what_is_missing_is_said(
     assert not bench.plane.syncer.usable
     assert caplog.records[-1].levelname == level
     assert "not permitted" in caplog.text
-    found = bench.context.problems.all()
-    assert [problem.subject for problem in found] == ["--data-plane"] * problems
+    reported = bench.context.problems.all()
+    assert [problem.subject for problem in reported] == ["--data-plane"] * problems
     endpoint = bench.node()
     bench.plane.recovered([endpoint])
     assert endpoint.fast_port == 45002

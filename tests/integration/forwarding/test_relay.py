@@ -67,12 +67,12 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
 
 async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lease):
     async with relayed(node, lease) as ends:
-        for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
-            await one.send(b"last words")
-            await one.half_close()
+        for sender, receiver in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+            await sender.send(b"last words")
+            await sender.half_close()
             async with asyncio.timeout(PATIENCE):
-                assert await other.reader.read() == b"last words"
-            if one is ends.outside:
+                assert await receiver.reader.read() == b"last words"
+            if sender is ends.outside:
                 await ends.inside.send(b"still here")
                 assert await ends.outside.exactly(10) == b"still here"
     await proxy.quiet()
@@ -82,14 +82,14 @@ async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lea
 @pytest.mark.parametrize("after", ["nothing", "data", "a half close"])
 async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
     async with relayed(node, lease) as ends:
-        one, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
+        resetting, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
         if after == "data":
-            await one.send(b"x" * 100_000)
+            await resetting.send(b"x" * 100_000)
             assert await other.exactly(100_000) == b"x" * 100_000
         elif after == "a half close":
             await other.half_close()
-            await until(one.reader.at_eof, "the half close arrives")
-        one.reset()
+            await until(resetting.reader.at_eof, "the half close arrives")
+        resetting.reset()
         assert await other.end() == "reset"
     await proxy.quiet()
 
@@ -97,11 +97,11 @@ async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
 @pytest.mark.parametrize("who", ["outside", "inside"])
 async def test_a_reset_passes_once_the_other_side_reads_on(proxy, node, lease, who):
     async with relayed(node, lease) as ends:
-        one, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
-        one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
-        flood = asyncio.create_task(one.send(b"x" * 50_000_000))
-        await one.stalls()
-        one.reset()
+        resetting, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
+        resetting.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+        flood = asyncio.create_task(resetting.send(b"x" * 50_000_000))
+        await resetting.stalls()
+        resetting.reset()
         await asyncio.gather(flood, return_exceptions=True)
         with pytest.raises(ConnectionResetError):
             await digest(other)
@@ -132,10 +132,10 @@ def slices(data: bytes, seed: int) -> list[bytes]:
     return parts
 
 
-async def write(wire: Wire, parts: list[bytes]) -> None:
-    for part in parts:
-        await wire.send(part)
-        if len(part) % 3 == 0:
+async def write(wire: Wire, chunks: list[bytes]) -> None:
+    for chunk in chunks:
+        await wire.send(chunk)
+        if len(chunk) % 3 == 0:
             await asyncio.sleep(0.0005)
     await wire.half_close()
 
@@ -184,8 +184,8 @@ async def test_single_messages_of_every_size_around_the_thresholds(node, lease):
     async with relayed(node, lease) as ends:
         for size in sorted({t + d for t in THRESHOLDS for d in (-1, 0, 1)} | {1, 1_000_000}):
             data = os.urandom(size)
-            for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
-                _, got = await asyncio.gather(one.send(data), other.exactly(size))
+            for sender, receiver in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+                _, got = await asyncio.gather(sender.send(data), receiver.exactly(size))
                 assert got == data, size
 
 
@@ -203,8 +203,8 @@ async def test_the_status_tells_of_open_connections(proxy, node, lease):
         await ends.outside.exactly(1000)
 
         def shown() -> dict[str, Any]:
-            (one,) = proxy.app.status()["nodes"][0]["connections"]
-            return dict(one)
+            (connection,) = proxy.app.status()["nodes"][0]["connections"]
+            return dict(connection)
 
         await until(lambda: shown()["sent"], "the bytes are counted")
         assert {**shown(), "sent_rate": 0, "received_rate": 0} == {
@@ -297,8 +297,8 @@ async def test_in_copy_mode_nothing_is_spliced(make_proxy, node, monkeypatch):
     await node.publish(proxy.master)
     async with relayed(node, proxy.lease(node)) as ends:
         data = random.Random(8).randbytes(3 * relay.BLOCK_SIZE + 17)
-        for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
-            _, got = await asyncio.gather(one.send(data), other.exactly(len(data)))
+        for sender, receiver in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+            _, got = await asyncio.gather(sender.send(data), receiver.exactly(len(data)))
             assert got == data
 
 
@@ -306,7 +306,9 @@ async def test_a_subscriber_that_says_nothing_costs_one_thread(proxy, node, leas
     former = set(threading.enumerate())
 
     def relaying() -> int:
-        return sum(one.name.startswith("relay ") for one in set(threading.enumerate()) - former)
+        return sum(
+            thread.name.startswith("relay ") for thread in set(threading.enumerate()) - former
+        )
 
     async with relayed(node, lease) as ends:
         await ends.inside.send(b"message")

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from typing import Any
 
-from examples.demo.fake_http import Where, value, where
+from examples.demo.fake_http import Address, host_and_port, value
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import OUTSIDE, connect, exchange, post, read_header, topic_header, until
 
@@ -81,7 +81,7 @@ def blocking_node(node: Any, serve: Any) -> Iterator[None]:
         del node.answers["requestTopic"]
 
 
-def subscribe(address: Where) -> socket.socket:
+def subscribe(address: Address) -> socket.socket:
     """A blocking connection to a topic, the headers exchanged."""
     conn = socket.create_connection(address, 10, (OUTSIDE, 0))
     conn.sendall(topic_header())
@@ -104,9 +104,9 @@ def offer(conn: socket.socket) -> None:
         conn.sendall(BLOCK)
 
 
-async def lease_of(process: Any, master: Any, node: Any) -> Where:
+async def lease_of(process: Any, master: Any, node: Any) -> Address:
     await node.publish(process.master)
-    return where(master.holds("publishers", "/chatter")[0])
+    return host_and_port(master.holds("publishers", "/chatter")[0])
 
 
 async def watch(process: Any, task: "asyncio.Task[Any]") -> int:

@@ -55,9 +55,9 @@ class Bench:
         self.leases.note_former(self.plane.forwards)
         self.plane.recovered([])
 
-    def lend(self, where: HostPort = LOCATOR, port: int = 45001) -> InsideParticipant:
-        participant = InsideParticipant(bytes(12), where.host, b"", 0.0)
-        lease = participant.leases[where] = Lease(port, where, LeaseKind.DATA)
+    def lend(self, locator: HostPort = LOCATOR, port: int = 45001) -> InsideParticipant:
+        participant = InsideParticipant(bytes(12), locator.host, b"", 0.0)
+        lease = participant.leases[locator] = Lease(port, locator, LeaseKind.DATA)
         self.inside.by_prefix[participant.prefix] = participant
         self.inside.leases[port] = participant, lease
         self.inside.changes += 1
@@ -69,7 +69,7 @@ class Bench:
         self.plane.syncer.note_change()
 
     async def forwarding(self, forwards: dict[int, HostPort]) -> None:
-        wanted = {port: (where.host, where.port) for port, where in forwards.items()}
+        wanted = {port: (locator.host, locator.port) for port, locator in forwards.items()}
         await until(lambda: self.tools.forwards == wanted, f"{forwards} are forwarded")
 
     def forgotten(self, *which: str) -> bool:
@@ -88,10 +88,10 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 async def bench(sound: None) -> AsyncIterator[Bench]:
-    one = Bench()
-    await one.start()
-    yield one
-    await one.close()
+    bench = Bench()
+    await bench.start()
+    yield bench
+    await bench.close()
 
 
 async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:

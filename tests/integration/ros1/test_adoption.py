@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import free_ports, where
+from examples.demo.fake_http import free_ports, host_and_port
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.clients.master_client import MasterClient, Unreachable
@@ -41,7 +41,7 @@ async def adopt(proxy: Proxy, *containers: dict[str, Any]) -> int:
 
 async def register_directly(master: FakeMaster, node: FakeNode) -> None:
     """One registration of each kind at the real master, around the proxy."""
-    real = where(master.uri)
+    real = host_and_port(master.uri)
     for topic in ("/chatter", "/rosout"):
         await node.publish(real, topic)
     await node.subscribe(real, "/back")
@@ -51,13 +51,13 @@ async def register_directly(master: FakeMaster, node: FakeNode) -> None:
 
 def all_of(master: FakeMaster, name: str = "/talker") -> dict[str, list[str]]:
     """By topic, service or parameter, the URIs that the master has of a node."""
-    found: dict[str, list[str]] = {}
+    registrations: dict[str, list[str]] = {}
     for table in master.tables.values():
         for key, row in table.items():
             for caller, uri in row:
                 if caller == name:
-                    found.setdefault(key, []).append(uri)
-    return found
+                    registrations.setdefault(key, []).append(uri)
+    return registrations
 
 
 def leased(proxy: Proxy, node: FakeNode) -> dict[str, list[str]]:
@@ -79,7 +79,9 @@ async def test_a_stray_is_adopted(proxy: Proxy, master: FakeMaster, node: FakeNo
     assert (await greet(lease, topic_header()))["callerid"] == "/talker"
     assert (await greet(lease, service_header()))["callerid"] == "/talker"
     endpoint = proxy.endpoint(node)
-    types = {held.name: held.type for held in endpoint.registrations.values()}
+    types = {
+        registration.name: registration.type for registration in endpoint.registrations.values()
+    }
     assert types["/chatter"] == types["/back"] == "std_msgs/String"
     assert await adopt(proxy) == 0
     assert not shutdowns(node)
@@ -107,9 +109,9 @@ async def test_who_is_told_of_it(
     outside = await make_node("/outside", OUTSIDE)
     inside = await make_node("/inside", OTHER_NODE)
     await register_directly(master, node)
-    await outside.subscribe(where(master.uri))
-    found = await inside.subscribe(proxy.master)
-    assert found[2] == [node.uri]
+    await outside.subscribe(host_and_port(master.uri))
+    reply = await inside.subscribe(proxy.master)
+    assert reply[2] == [node.uri]
     await adopt(proxy)
     await until(lambda: outside.updates()[-1:] == [[proxy.uri(node)]], "outside is told")
     await until(inside.updates, "inside is told")
@@ -121,7 +123,7 @@ async def test_its_own_subscription_goes_on_without_a_gap(
 ) -> None:
     outside = await make_node("/outside", OUTSIDE)
     inside = await make_node("/inside", OTHER_NODE)
-    await outside.publish(where(master.uri), "/back")
+    await outside.publish(host_and_port(master.uri), "/back")
     await inside.publish(proxy.master, "/back")
     await register_directly(master, node)
     await adopt(proxy)
@@ -133,8 +135,8 @@ async def test_two_strays_that_hear_each_other_directly(
     proxy: Proxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
 ) -> None:
     listener = await make_node("/listener", OTHER_NODE)
-    await node.publish(where(master.uri))
-    await listener.subscribe(where(master.uri))
+    await node.publish(host_and_port(master.uri))
+    await listener.subscribe(host_and_port(master.uri))
     assert await adopt(proxy, container(), container(OTHER_NODE)) == 2
     assert {tuple(update) for update in listener.updates()} == {(node.uri,)}
 
@@ -159,8 +161,8 @@ async def test_a_name_that_only_its_container_knows_is_not_given_to_neighbours(
     await register_directly(master, node)
     assert await adopt(proxy, container(NODE, "c1.invalid")) == 1
     neighbour = await make_node("/neighbour", OTHER_NODE)
-    (found,) = (await neighbour.subscribe(proxy.master))[2]
-    assert where(found)[1] == proxy.lease(node)[1]
+    (uri,) = (await neighbour.subscribe(proxy.master))[2]
+    assert host_and_port(uri)[1] == proxy.lease(node)[1]
 
 
 async def test_nodes_elsewhere_are_left_alone(
@@ -182,7 +184,9 @@ async def test_another_node_at_the_same_port(
     proxy: Proxy, master: FakeMaster, node: FakeNode
 ) -> None:
     """What the master has is from a former container of that name."""
-    await node.call(where(master.uri), "registerPublisher", "/old", "std_msgs/String", node.uri)
+    await node.call(
+        host_and_port(master.uri), "registerPublisher", "/old", "std_msgs/String", node.uri
+    )
     assert await adopt(proxy) == 0
     assert master.holds("publishers", "/old") == [node.uri]
 
@@ -202,8 +206,8 @@ async def test_two_containers_with_the_same_names(
     proxy: Proxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     first, second = await twins(make_node, "/a", "/b")
-    await first.publish(where(master.uri), "/a")
-    await second.publish(where(master.uri), "/b")
+    await first.publish(host_and_port(master.uri), "/a")
+    await second.publish(host_and_port(master.uri), "/b")
     assert await adopt(proxy, container(NODE, "twin"), container(OTHER_NODE, "twin")) == 2
     assert master.holds("publishers", "/a") == [proxy.uri(first)]
     assert master.holds("publishers", "/b") == [proxy.uri(second)]
@@ -214,7 +218,7 @@ async def test_two_containers_that_can_not_be_told_apart_are_left_alone(
     proxy: Proxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     first, _ = await twins(make_node, "/a", "/a")
-    await first.publish(where(master.uri), "/a")
+    await first.publish(host_and_port(master.uri), "/a")
     assert await adopt(proxy, container(NODE, "twin"), container(OTHER_NODE, "twin")) == 0
     assert master.holds("publishers", "/a") == [first.uri]
 
@@ -238,7 +242,7 @@ async def test_a_node_that_is_subscribed_to_a_parameter_is_left_as_it_was(
     """The master does not tell of it, and would shut the node down if it stayed."""
     master.params["/robot/name"] = 1
     await register_directly(master, node)
-    await node.call(where(master.uri), "subscribeParam", node.uri, key)
+    await node.call(host_and_port(master.uri), "subscribeParam", node.uri, key)
     before = all_of(master)
     assert await adopt(proxy) == 0
     del before["/rosout_disable_topics_generation"]  # which could not be told apart
@@ -253,9 +257,9 @@ async def test_one_node_that_can_not_be_adopted_does_not_stop_the_others(
     proxy: Proxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
 ) -> None:
     other = await make_node("/other", OTHER_NODE)
-    await other.publish(where(master.uri), "/b")
+    await other.publish(host_and_port(master.uri), "/b")
     await register_directly(master, node)
-    await node.call(where(master.uri), "subscribeParam", node.uri, "/nobody/knows")
+    await node.call(host_and_port(master.uri), "subscribeParam", node.uri, "/nobody/knows")
     assert await adopt(proxy, container(), container(OTHER_NODE)) == 1
     assert master.holds("publishers", "/b") == [proxy.uri(other)]
     assert master.holds("publishers", "/chatter") == [node.uri]
@@ -280,7 +284,7 @@ async def test_it_registers_around_the_proxy_again(
     proxy = await make_proxy(**PATIENT)
     await register_directly(master, node)
     await adopt(proxy)
-    await node.publish(where(master.uri), "/more")
+    await node.publish(host_and_port(master.uri), "/more")
     expected = leased(proxy, node) | {"/more": [proxy.uri(node)]}
     await until(lambda: all_of(master) == expected, "all is behind the proxy again")
     assert not shutdowns(node)
@@ -295,7 +299,7 @@ async def test_it_does_so_through_a_proxy_that_has_forgotten(
     await proxy.restart()
     await until(lambda: len(proxy.ros1.context.registry), "it is found at the master")
     await until(lambda: proxy.endpoint(node).trusted, "it is recovered")
-    await node.publish(where(master.uri), "/more")
+    await node.publish(host_and_port(master.uri), "/more")
     uri = proxy.uri(node)
     await until(lambda: all_of(master).get("/more") == [uri], "the new one is behind the proxy")
     await until(lambda: all_of(master).get("/chatter") == [uri], "and what it had")
@@ -324,7 +328,7 @@ async def test_a_shutdown_that_is_meant_is_passed_on(
     await rpc(proxy.uri(node), "shutdown", "/rosnode", "user request")
     assert len(shutdowns(node)) == 1
     another = await make_node("/talker", OUTSIDE)
-    await another.publish(where(master.uri))
+    await another.publish(host_and_port(master.uri))
     await until(lambda: len(shutdowns(node)) == 2, "the older one of the same name is shut down")
 
 
@@ -439,8 +443,8 @@ async def test_one_is_taken_over_from_a_former_container(
 async def test_many_at_once(proxy: Proxy, make_node: MakeNode, master: FakeMaster) -> None:
     nodes = [await make_node(f"/n{i}", NODE) for i in range(6)]
     for node in nodes:
-        await node.publish(where(master.uri), f"{node.name}/a")
-        await node.subscribe(where(master.uri), "/shared")
+        await node.publish(host_and_port(master.uri), f"{node.name}/a")
+        await node.subscribe(host_and_port(master.uri), "/shared")
     assert await adopt(proxy) == 6
     for node in nodes:
         assert master.holds("publishers", f"{node.name}/a") == [proxy.uri(node)]

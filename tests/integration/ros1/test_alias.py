@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import End, Where, ok, value, where
+from examples.demo.fake_http import Address, End, host_and_port, ok, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.rewriting.addressing import Caller
@@ -46,7 +46,7 @@ MOVED = "127.0.1.2"
 
 def behind_its_name(master: FakeMaster, **options: Any) -> dict[str, Any]:
     """Options of a proxy that stands in for the master's host; nodes there have its ports."""
-    port = where(master.uri)[1]
+    port = host_and_port(master.uri)[1]
     named = {"master_uri": f"http://robot:{port}", "master_address": MASTER}
     return {**named, "bind": PROXY, "advertise_host": PROXY, **options}
 
@@ -60,17 +60,17 @@ async def proxy(make_proxy: MakeProxy, master: FakeMaster) -> Proxy:
 async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
     """A node on the master's host that publishes and serves."""
     made = await make_node("/robot", MASTER, host="robot")
-    await made.publish(where(master.uri))
-    await made.serve(where(master.uri))
+    await made.publish(host_and_port(master.uri))
+    await made.serve(host_and_port(master.uri))
     return made
 
 
-def slave(node: FakeNode, address: str = PROXY) -> Where:
+def slave(node: FakeNode, address: str = PROXY) -> Address:
     """Where inside finds a node's slave API."""
     return address, node.slave.address[1]
 
 
-def service(node: FakeNode, address: str = PROXY) -> Where:
+def service(node: FakeNode, address: str = PROXY) -> Address:
     """Where inside finds a node's services."""
     return address, node.tcpros_port
 
@@ -93,8 +93,8 @@ async def look_up_service(proxy: Proxy) -> Any:
     return (await rpc(proxy.master, "lookupService", "/tool", "/add", source=NODE))[2]
 
 
-def real_master(proxy: Proxy) -> Where:
-    return MASTER, where(proxy.settings.master_uri)[1]
+def real_master(proxy: Proxy) -> Address:
+    return MASTER, host_and_port(proxy.settings.master_uri)[1]
 
 
 async def by_subscribing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
@@ -151,7 +151,7 @@ async def test_the_port_is_open_before_the_update_arrives(
 
     node.answers["publisherUpdate"] = look
     await node.subscribe(proxy.master, "/later")
-    await robot.publish(where(master.uri), "/later")
+    await robot.publish(host_and_port(master.uri), "/later")
     await until(lambda: refused, "a publisherUpdate")
     assert refused == [False]
 
@@ -266,7 +266,7 @@ async def test_nothing_happens_without_need(
         return [MASTER]
 
     monkeypatch.setattr("rosproxy.net.resolver.resolve", resolve)
-    port = where(master.uri)[1]
+    port = host_and_port(master.uri)[1]
     changed = {name: text and text.format(port=port) for name, text in options.items()}
     proxy = await make_proxy(**behind_its_name(master, **changed))
     assert await look_up(proxy, robot) == robot.uri
@@ -280,7 +280,7 @@ async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
 ) -> None:
     for name, host in (("/one", MASTER), ("/two", "laptop")):
         node = await make_node(name, MASTER, host=host)
-        await node.publish(where(master.uri))
+        await node.publish(host_and_port(master.uri))
         assert await look_up(proxy, node) == node.uri
     assert stand_ins(proxy) == {}
 
@@ -367,9 +367,9 @@ async def test_a_port_that_is_taken_is_a_problem_until_it_is_free(
 async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
     proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with socket.socket() as one, socket.socket() as other:
-        for taken, where_ in ((one, slave(robot)), (other, service(robot))):
-            taken.bind(where_)
+    with socket.socket() as slave_socket, socket.socket() as service_socket:
+        for taken, address in ((slave_socket, slave(robot)), (service_socket, service(robot))):
+            taken.bind(address)
             taken.listen()
         await look_up(proxy, robot)
         await look_up_service(proxy)
@@ -398,8 +398,8 @@ async def crowd(make_node: MakeNode, master: FakeMaster) -> list[FakeNode]:
     """Three nodes on the master's host."""
     made = [await make_node(f"/r{i}", MASTER, host="robot") for i in range(3)]
     for node in made:
-        await node.publish(where(master.uri), node.name)
-        await node.serve(where(master.uri), node.name)
+        await node.publish(host_and_port(master.uri), node.name)
+        await node.serve(host_and_port(master.uri), node.name)
     return made
 
 
@@ -482,7 +482,7 @@ async def test_nodes_on_the_masters_host_are_told_at_its_address(
     proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
 ) -> None:
     """What the proxy itself tells outside subscribers goes to the master's address as well."""
-    await robot.subscribe(where(master.uri))
+    await robot.subscribe(host_and_port(master.uri))
     await node.publish(proxy.master)
     robot.calls.clear()
     await proxy.restart()
@@ -495,10 +495,10 @@ async def test_alias_ports_are_measured(proxy: Proxy, robot: FakeNode) -> None:
     assert (await metrics(proxy))["rosproxy_stand_ins"] == 0
     await look_up(proxy, robot)
     await rpc(slave(robot), "getPid", "/tool", source=NODE)
-    found = await metrics(proxy)
-    assert found["rosproxy_stand_ins"] == 1
+    samples = await metrics(proxy)
+    assert samples["rosproxy_stand_ins"] == 1
     label = "{api=stand_in,method=getPid,outcome=answered}"
-    assert found[f"rosproxy_xmlrpc_calls_total{label}"] == 1
+    assert samples[f"rosproxy_xmlrpc_calls_total{label}"] == 1
 
 
 async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot: FakeNode) -> None:
@@ -592,7 +592,7 @@ async def test_an_alias_port_waits_for_an_operator_that_has_told_nothing_yet(
     proxy = await make_proxy(**operated)
     assert await look_up(proxy, robot) == robot.uri  # by a program on its own machine
     ask = post(xml("getPid", "/tool"))
-    both = [asyncio.create_task(knock(slave(robot), ask, one)) for one in (NODE, OTHER_NODE)]
+    both = [asyncio.create_task(knock(slave(robot), ask, source)) for source in (NODE, OTHER_NODE)]
     assert (await rpc(proxy.master, "getPid", "/doctor", source="127.0.0.1"))[0] == 1
     assert not any(asked.done() for asked in both)
     await news(proxy, selected=[NODE])

@@ -7,7 +7,7 @@ from xmlrpc.client import Binary
 
 import pytest
 
-from examples.demo.fake_http import value, where
+from examples.demo.fake_http import host_and_port, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
@@ -49,8 +49,8 @@ async def proxy(make_proxy: MakeProxy) -> Proxy:
 async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
     """A node outside that publishes and serves."""
     made = await make_node("/robot", MASTER)
-    await made.publish(where(master.uri))
-    await made.serve(where(master.uri))
+    await made.publish(host_and_port(master.uri))
+    await made.serve(host_and_port(master.uri))
     return made
 
 
@@ -65,13 +65,13 @@ async def test_whatever_way_a_node_is_named_it_is_reached_at_the_proxy(
 ) -> None:
     given = await way(proxy, robot, node)
     assert given != robot.uri
-    assert where(given)[0] in (PROXY, "127.0.0.1")
-    assert where(given)[1] not in proxy.settings.ports.listen
-    assert (await rpc(where(given), "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
+    assert host_and_port(given)[0] in (PROXY, "127.0.0.1")
+    assert host_and_port(given)[1] not in proxy.settings.ports.listen
+    assert (await rpc(host_and_port(given), "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
 
 
 async def test_a_topic_flows_through_the_proxy(proxy: Proxy, robot: FakeNode) -> None:
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     asked = await rpc(at, "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
     assert asked == [1, f"ready on {at[0]}:{at[1]}", ["TCPROS", *at]]
     async with connect(at, NODE) as wire:
@@ -85,7 +85,7 @@ async def test_a_topic_flows_through_the_proxy(proxy: Proxy, robot: FakeNode) ->
 
 async def test_a_service_is_called_through_the_proxy(proxy: Proxy, robot: FakeNode) -> None:
     given = await look_up_service(proxy)
-    async with connect(where(given), NODE) as wire:
+    async with connect(host_and_port(given), NODE) as wire:
         await wire.send(service_header(caller="/tool"))
         assert (await read_header(wire))["callerid"] == "/robot"
     assert robot.headers[0]["service"] == "/add"
@@ -100,8 +100,9 @@ async def test_a_subscriber_comes_back_to_the_same_port_after_a_restart(
     await until(lambda: len(node.updates()) > 1, "publisherUpdates by the proxy")
     gone, (again,) = node.updates()[:2]  # who has given up tries again once it is told of both
     assert gone == []
-    assert where(again)[1] == where(given[0])[1]
-    async with connect(where(again), NODE) as wire:  # its port is not known yet: it is asked for
+    assert host_and_port(again)[1] == host_and_port(given[0])[1]
+    # Its port is not known yet: it is asked for.
+    async with connect(host_and_port(again), NODE) as wire:
         await wire.send(topic_header(caller="/n"))
         assert (await read_header(wire))["callerid"] == "/robot"
 
@@ -124,17 +125,17 @@ async def test_tools_see_addresses_that_they_can_use(
     proxy: Proxy, robot: FakeNode, node: FakeNode, make_node: MakeNode, master: FakeMaster
 ) -> None:
     other = await make_node("/laptop", OUTSIDE)
-    await other.publish(where(master.uri), "/far")
+    await other.publish(host_and_port(master.uri), "/far")
     await node.publish(proxy.master, "/near")
     rows = [
         [1, other.uri, "i", "TCPROS", "/far", True],
         [2, proxy.uri(node), "i", "TCPROS", "/near", True],
     ]
     robot.answers["getBusInfo"] = value([1, "", rows])
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     seen = (await rpc(at, "getBusInfo", "/tool", source=NODE))[2]
     assert seen[1][1] == node.uri
-    assert (await rpc(where(seen[0][1]), "getPid", "/tool", source=NODE))[2] == other.pid
+    assert (await rpc(host_and_port(seen[0][1]), "getPid", "/tool", source=NODE))[2] == other.pid
 
 
 async def test_a_node_outside_has_no_port_opened_for_what_the_master_does_not_have(
@@ -142,25 +143,28 @@ async def test_a_node_outside_has_no_port_opened_for_what_the_master_does_not_ha
 ) -> None:
     strange = f"http://{OUTSIDE}:40000/"
     robot.answers["getBusInfo"] = value([1, "", [[1, strange, "i", "TCPROS", "/chatter", True]]])
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     assert (await rpc(at, "getBusInfo", "/tool", source=NODE))[2][0][1] == strange
     assert strange not in stand_ins(proxy)
 
 
 async def test_only_inside_is_let_in(proxy: Proxy, robot: FakeNode) -> None:
-    at, service = where(await look_up(proxy, robot)), where(await look_up_service(proxy))
+    at, service = (
+        host_and_port(await look_up(proxy, robot)),
+        host_and_port(await look_up_service(proxy)),
+    )
     for source in (OUTSIDE, MASTER, "127.0.0.1"):
         assert await knock(at, post(xml("getPid", "/tool")), source) in ("closed", "reset")
         assert await knock(service, service_header(), source) in ("closed", "reset")
 
 
 async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot: FakeNode) -> None:
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     await robot.stop()
     assert await knock(at, post(xml("getPid", "/tool")), NODE) == "reset"
     assert await refuses(at, NODE)
     await robot.start()
-    assert where(await look_up(proxy, robot)) == at
+    assert host_and_port(await look_up(proxy, robot)) == at
     assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
 
 
@@ -185,7 +189,10 @@ async def test_denied_topics_and_services_are_not_reached_by_an_address_that_is_
     proxy = await make_proxy(
         direction="both", policy=("deny subscribe /chatter by /spy; deny call /add by /spy",)
     )
-    at, service = where(await look_up(proxy, robot)), where(await look_up_service(proxy))
+    at, service = (
+        host_and_port(await look_up(proxy, robot)),
+        host_and_port(await look_up_service(proxy)),
+    )
     for caller, may in (("/spy", False), ("/friend", True)):
         asked = await rpc(at, "requestTopic", caller, "/chatter", [["TCPROS"]], source=NODE)
         assert (asked[0] == 1) is may
@@ -201,7 +208,7 @@ async def test_another_node_at_the_address_does_not_lend_its_name(
     proxy = await make_proxy(direction="both", policy=("deny subscribe /chatter by /spy",))
     spy = await make_node("/spy", OTHER_NODE)
     await spy.publish(proxy.master, "/own")
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     async with connect(at, OTHER_NODE) as wire:
         await wire.send(topic_header(caller="/friend"))
         assert "error" in await read_header(wire)
@@ -226,7 +233,7 @@ async def test_nodes_of_outside_may_run_on_the_proxys_machine(
     monkeypatch.setattr(
         "rosproxy.ros1.standins.outside_nodes.is_own", lambda address: address == MASTER
     )
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     assert (await rpc(at, "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
 
 
@@ -241,10 +248,10 @@ async def test_nothing_leads_to_the_proxys_own_ports(
     await node.publish(proxy.master)
     own = {"master": proxy.settings.master_port, "lease": proxy.lease(node)[1]}
     uri = f"http://{MASTER}:{own[port]}/"
-    await rpc(where(master.uri), "registerPublisher", "/evil", "/t", "x/Y", uri)
+    await rpc(host_and_port(master.uri), "registerPublisher", "/evil", "/t", "x/Y", uri)
     told = (await rpc(proxy.master, "lookupNode", "/tool", "/evil", source=NODE))[2]
-    assert await knock(where(told), post(xml("getPid", "/tool")), NODE) == "reset"
-    assert await refuses(where(told), NODE)
+    assert await knock(host_and_port(told), post(xml("getPid", "/tool")), NODE) == "reset"
+    assert await refuses(host_and_port(told), NODE)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.1.1", "0.0.0.0", "localhost"])
@@ -255,9 +262,9 @@ async def test_nothing_leads_to_loopback(
     listening = await asyncio.start_server(lambda *_: None, "127.0.0.1")
     port = listening.sockets[0].getsockname()[1]
     uri = f"http://{host}:{port}/"
-    await rpc(where(master.uri), "registerPublisher", "/evil", "/t", "x/Y", uri)
+    await rpc(host_and_port(master.uri), "registerPublisher", "/evil", "/t", "x/Y", uri)
     told = (await rpc(proxy.master, "lookupNode", "/tool", "/evil", source=NODE))[2]
-    assert await knock(where(told), post(xml("getPid", "/tool")), NODE) == "reset"
+    assert await knock(host_and_port(told), post(xml("getPid", "/tool")), NODE) == "reset"
     listening.close()
 
 
@@ -281,7 +288,7 @@ async def test_udpros_from_outside_comes_in_through_the_range(
     proxy = await make_proxy(direction="both", udp=True)
     node = await make_node("/node")
     await node.subscribe(proxy.master)
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     with bind(NODE, 0) as ear, bind(MASTER, 0) as mouth:
         port = ear.getsockname()[1]
         offer = udp_offer("/chatter", "node", port)
@@ -322,7 +329,7 @@ async def test_an_offer_that_can_not_be_had_is_taken_out(
     proxy = await make_proxy(direction="both", udp=udp)
     node = await make_node("/node")
     await node.subscribe(proxy.master)
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     offers = [udp_offer(topic, "node", 40000), ["TCPROS"]]
     asked = await rpc(at, "requestTopic", "/node", "/chatter", offers, source=NODE)
     assert offers_heard(robot) == [["TCPROS"]]
@@ -349,7 +356,7 @@ async def test_who_is_gone_was_not_cut_by_a_policy(
 ) -> None:
     proxy = await make_proxy(direction="both", udp=True)
     nodes = [await make_node("/one"), await make_node("/other", OTHER_NODE)]
-    at = where(await look_up(proxy, robot))
+    at = host_and_port(await look_up(proxy, robot))
     for node, source in zip(nodes, (NODE, OTHER_NODE), strict=True):
         await node.subscribe(proxy.master)
         offer = udp_offer("/chatter", "node", 40000)
@@ -368,8 +375,8 @@ async def test_a_name_that_changes_its_address_leads_nowhere_else(
 ) -> None:
     """Whoever registers a name may have a name server that answers otherwise the second time."""
     robot = await make_node("/robot", MASTER, host="robot.example")
-    await robot.publish(where(master.uri))
-    at = where(await look_up(proxy, robot))
+    await robot.publish(host_and_port(master.uri))
+    at = host_and_port(await look_up(proxy, robot))
     asked: list[str] = []
 
     async def resolve(host: str, source: str) -> list[str]:
@@ -378,7 +385,7 @@ async def test_a_name_that_changes_its_address_leads_nowhere_else(
         asked.append(host)
         return [MASTER] if len(asked) == 1 else [NODE]
 
-    for module in ("net.resolver", "ros1.standins.outside"):
+    for module in ("net.resolver", "ros1.standins.outside_nodes"):
         monkeypatch.setattr(f"rosproxy.{module}.resolve", resolve)
     assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
     assert asked == ["robot.example"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import End, FakeHttpServer, call, value, where
+from examples.demo.fake_http import End, FakeHttpServer, call, host_and_port, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.servers import callers
@@ -72,9 +72,9 @@ async def test_the_master_port_is_for_inside_alone(
         reply = await exchange(proxy.master, request(body), OUTSIDE)
         assert reply.status == 403
         assert reply.headers["connection"] == "close"
-    for part in (OUTSIDE, "127.0.2.0/24", "--inside-network"):
-        assert part in reply.body.decode()
-        assert part in problems(proxy)["master port"]
+    for phrase in (OUTSIDE, "127.0.2.0/24", "--inside-network"):
+        assert phrase in reply.body.decode()
+        assert phrase in problems(proxy)["master port"]
     assert caplog.text.count("no inside network") == 1  # it is told in the log now and then only
     assert proxy.metric("strangers_total", standing="outside") == 3
     assert "/stranger" not in master.nodes
@@ -110,9 +110,9 @@ async def test_where_an_operator_selects_only_its_containers_are_let_in(
     body = xml("registerPublisher", node.name, "/more", "x/Y", node.uri)
     reply = await exchange(proxy.master, request(body), NODE)
     assert reply.status == 403
-    for part in (NODE, "rosproxy.enable=true", "rosproxy.io/inject"):
-        assert part in reply.body.decode()
-        assert part in problems(proxy)["master port"]
+    for phrase in (NODE, "rosproxy.enable=true", "rosproxy.io/inject"):
+        assert phrase in reply.body.decode()
+        assert phrase in problems(proxy)["master port"]
     assert proxy.metric("strangers_total", standing="unselected") == 1
     assert (await other.publish(proxy.master))[0] == 1
     # What it has stays: only the operator's "gone" ends that.
@@ -322,14 +322,14 @@ async def test_so_is_one_that_a_gateway_calls_by_another_name(
     far = await make_node("/far", OUTSIDE)
     far.answers.update(dict.fromkeys(calls, value([-1, "no such method", 0])))
     params = "/far/chatter", "std_msgs/String", far.uri
-    found = await call(proxy.master, "registerPublisher", "/gateway_far", *params, source=NODE)
-    assert found[0] == 1
+    reply = await call(proxy.master, "registerPublisher", "/gateway_far", *params, source=NODE)
+    assert reply[0] == 1
     assert master.nodes["/gateway_far"] == far.uri
     assert list(proxy.ros1.context.registry) == []
     assert problems(proxy) == {}
     ended = "/far/chatter", far.uri
-    found = await call(proxy.master, "unregisterPublisher", "/gateway_far", *ended, source=NODE)
-    assert found[2] == 1
+    reply = await call(proxy.master, "unregisterPublisher", "/gateway_far", *ended, source=NODE)
+    assert reply[2] == 1
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
@@ -510,7 +510,7 @@ async def test_what_is_left_stays_where_nothing_is_cleaned_up(
 async def test_a_hundred_uris_of_one_node_are_not_all_remembered(
     proxy: Proxy, node: FakeNode
 ) -> None:
-    port = where(node.uri)[1]
+    port = host_and_port(node.uri)[1]
     for number in range(40):
         uri = f"http://name{number}.invalid:{port}/"
         await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)

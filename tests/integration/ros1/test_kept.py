@@ -25,10 +25,10 @@ Kept = KeptConnections[str]
 @pytest.fixture
 async def kept() -> AsyncIterator[Kept]:
     context = Context(Runtime(settings_for(master_uri="http://127.0.0.1:1")))
-    found = Kept(context.nodes, within=5.0)
-    found.most = 1
-    yield found
-    found.close_all()
+    kept = Kept(context.nodes, within=5.0)
+    kept.most = 1
+    yield kept
+    kept.close_all()
     await context.upstream.close()
 
 
@@ -38,14 +38,14 @@ def ask(kept: Kept, node: FakeNode, now: float = 0.0) -> bool:
 
 async def told(kept: Kept, now: float = 0.0) -> ProbeResult | None:
     """What becomes of the question, as soon as that is known."""
-    found = dict[str, ProbeResult | None]()
+    results = dict[str, ProbeResult | None]()
 
     def collected() -> bool:
-        found.update(kept.collect(now))
-        return bool(found)
+        results.update(kept.collect(now))
+        return bool(results)
 
     await until(collected, "the connection tells something")
-    return found[NAME]
+    return results[NAME]
 
 
 def asked(node: FakeNode) -> int:
@@ -150,11 +150,11 @@ async def test_there_are_never_too_many_and_those_of_others_are_closed(
 ) -> None:
     before = len(os.listdir("/proc/self/fd"))
     ask(kept, node)
-    where = HostPort(*node.slave.address)
-    assert not kept.ask("/another", where, node.pid, 0.0)
+    address = HostPort(*node.slave.address)
+    assert not kept.ask("/another", address, node.pid, 0.0)
     kept.keep({"/another"})
     assert len(os.listdir("/proc/self/fd")) <= before + 1  # the node's end may still be open
-    assert kept.ask("/another", where, node.pid, 0.0)
+    assert kept.ask("/another", address, node.pid, 0.0)
 
 
 async def test_the_proxy_keeps_a_connection_to_a_node_that_is_well(make_proxy, node):

@@ -165,8 +165,8 @@ async def test_a_node_that_only_serves_is_reached_without_a_request_topic(proxy,
     node.published.clear()
     await node.serve(proxy.master)
     lease = proxy.endpoint(node).port
-    found = await rpc(proxy.settings.master_uri, "lookupService", "/outside", "/add")
-    assert found[2] == f"rosrpc://{HOST}:{lease}"
+    reply = await rpc(proxy.settings.master_uri, "lookupService", "/outside", "/add")
+    assert reply[2] == f"rosrpc://{HOST}:{lease}"
     assert (await greet(proxy.lease(node), service_header()))["callerid"] == "/talker"
 
 
@@ -218,8 +218,8 @@ async def test_bus_info_and_master_uri_are_exported(proxy, make_node):
     listener.answers["getMasterUri"] = value([1, "", f"http://{PROXY}:11311/"])
     info = await rpc(proxy.uri(listener), "getBusInfo", "/outside")
     assert info[2] == [[1, proxy.uri(talker), "i", "TCPROS", "/chatter", True]]
-    found = await rpc(proxy.uri(listener), "getMasterUri", "/outside")
-    assert found[2] == proxy.settings.master_uri
+    reply = await rpc(proxy.uri(listener), "getMasterUri", "/outside")
+    assert reply[2] == proxy.settings.master_uri
 
 
 async def test_only_the_master_may_control_nodes_where_policy_says_so(make_proxy, node):
@@ -277,8 +277,8 @@ async def test_a_registration_never_gets_a_port_outside_the_range(make_proxy, ma
         assert (await node.publish(proxy.master))[0] == 1
     code, text, rest = await nodes[2].publish(proxy.master)
     assert (code, rest) == (-1, 0)
-    for part in (str(proxy.settings.ports.listen), "2 leases held", "--port-range"):
-        assert part in text
+    for phrase in (str(proxy.settings.ports.listen), "2 leases held", "--port-range"):
+        assert phrase in text
     assert text in caplog.text
     assert proxy.metric("range_exhausted_total") == 1
     # The others go on, and in a multicall each call has its own answer.

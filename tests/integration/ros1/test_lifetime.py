@@ -190,12 +190,12 @@ async def test_a_new_process_that_registers_at_a_cleaned_uri_keeps_what_it_regis
     await node.publish(proxy.master)
     await looks(master)
     endpoint = proxy.endpoint(node)
-    held = {(kind.value, name) for kind, name, _ in endpoint.registrations}
-    assert held == {("publisher", "/chatter"), ("service", "/new")}
+    registered = {(kind.value, name) for kind, name, _ in endpoint.registrations}
+    assert registered == {("publisher", "/chatter"), ("service", "/new")}
     assert master.holds("services", "/new") == [f"rosrpc://{HOST}:{endpoint.port}"]
     assert master.holds("services", "/old") == []
-    found = await node.call(proxy.master, "lookupService", "/new")
-    assert found[2] == node.service_api
+    reply = await node.call(proxy.master, "lookupService", "/new")
+    assert reply[2] == node.service_api
 
 
 async def test_a_node_restarted_on_its_uri_is_reachable_as_soon_as_it_registers(

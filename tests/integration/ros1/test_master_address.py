@@ -4,12 +4,12 @@ import json
 
 import pytest
 
-from examples.demo.fake_http import where
+from examples.demo.fake_http import host_and_port
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.admin.admin_client import AdminClient
 from rosproxy.doctor.collect import collect
-from rosproxy.doctor.facts import Reach
+from rosproxy.doctor.facts import ReachOutcome
 from tests.integration.admin_calls import post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -21,14 +21,14 @@ NAME = "robot.invalid"
 
 
 def uri_by_name(master: FakeMaster) -> str:
-    return f"http://{NAME}:{where(master.uri)[1]}"
+    return f"http://{NAME}:{host_and_port(master.uri)[1]}"
 
 
 async def master_status(proxy: Proxy) -> dict[str, object]:
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     reply = await exchange(address, b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n")
-    found: dict[str, object] = json.loads(reply.body)["master"]
-    return found
+    status: dict[str, object] = json.loads(reply.body)["master"]
+    return status
 
 
 async def test_the_name_is_not_resolved_but_told(
@@ -38,20 +38,20 @@ async def test_the_name_is_not_resolved_but_told(
     assert (await node.publish(proxy.master))[0] == 1
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
     told = {request.headers["host"] for request in master.requests}
-    assert told == {f"{NAME}:{where(master.uri)[1]}"}
-    found = await master_status(proxy)
-    assert (found["address"], found["pinned"], found["up"]) == (MASTER, True, True)
+    assert told == {f"{NAME}:{host_and_port(master.uri)[1]}"}
+    status = await master_status(proxy)
+    assert (status["address"], status["pinned"], status["up"]) == (MASTER, True, True)
 
 
 async def test_without_it_the_status_tells_where_the_name_led(proxy: Proxy) -> None:
     await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
-    found = await master_status(proxy)
-    assert (found["address"], found["pinned"]) == (MASTER, False)
+    status = await master_status(proxy)
+    assert (status["address"], status["pinned"]) == (MASTER, False)
 
 
 async def test_a_name_that_was_resolved(make_proxy: MakeProxy, master: FakeMaster) -> None:
     await master.stop()
-    port = where(master.uri)[1]
+    port = host_and_port(master.uri)[1]
     await master.start("127.0.0.1")
     proxy = await make_proxy(master_uri=f"http://localhost:{port}")
     await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
@@ -78,7 +78,7 @@ async def test_two_masters_and_the_one_that_is_named_is_asked(
     make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     """The connections that are kept to the former one are not used for the next."""
-    other = FakeMaster(ELSEWHERE, where(master.uri)[1])
+    other = FakeMaster(ELSEWHERE, host_and_port(master.uri)[1])
     await other.start()
     try:
         proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
@@ -118,7 +118,7 @@ async def test_an_outside_subscriber_on_the_masters_host_is_told_at_its_address(
 ) -> None:
     """Its URI names the master's host: as the proxy starts again, it is told of the publisher."""
     listener = await make_node("/listener", MASTER, NAME)
-    await listener.subscribe(where(master.uri))
+    await listener.subscribe(host_and_port(master.uri))
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
     await node.publish(proxy.master)
     await proxy.restart()
@@ -129,13 +129,16 @@ async def test_the_doctor_asks_the_master_at_its_address(
     make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     on_its_host = await make_node("/on_robot", MASTER, NAME)
-    await on_its_host.publish(where(master.uri))
+    await on_its_host.publish(host_and_port(master.uri))
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
     facts = await collect(AdminClient(admin_url(proxy)))
     assert facts.master is not None
-    assert (facts.master.addresses, facts.master.attempt.reach) == ((MASTER,), Reach.ANSWERED)
+    assert (facts.master.addresses, facts.master.attempt.reach) == (
+        (MASTER,),
+        ReachOutcome.ANSWERED,
+    )
     assert facts.nodes["/on_robot"].addresses == (MASTER,)
-    assert facts.nodes["/on_robot"].attempt.reach is Reach.ANSWERED
+    assert facts.nodes["/on_robot"].attempt.reach is ReachOutcome.ANSWERED
 
 
 async def test_the_doctor_without_a_proxy_is_told_the_address(master: FakeMaster) -> None:
@@ -143,13 +146,13 @@ async def test_the_doctor_without_a_proxy_is_told_the_address(master: FakeMaster
     facts = await collect(admin, uri_by_name(master), master_address=MASTER)
     assert facts.admin_error
     assert facts.master is not None
-    assert facts.master.attempt.reach is Reach.ANSWERED
+    assert facts.master.attempt.reach is ReachOutcome.ANSWERED
 
 
 async def test_the_doctors_option(master: FakeMaster) -> None:
     words = ("doctor", "--admin", "127.0.0.1:9", "--master-uri", uri_by_name(master))
-    found = await run(*words, ROSPROXY_MASTER_ADDRESS=MASTER)
-    assert "resolve" not in found.out
+    result = await run(*words, ROSPROXY_MASTER_ADDRESS=MASTER)
+    assert "resolve" not in result.out
     wrong = await run(*words, ROSPROXY_MASTER_ADDRESS="robot")
     assert (wrong.code, wrong.err) == (
         2,

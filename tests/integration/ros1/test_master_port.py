@@ -50,8 +50,8 @@ async def test_neighbours_get_each_others_own_uris(proxy, make_node):
     await talker.publish(proxy.master)
     assert (await listener.subscribe(proxy.master))[2] == [talker.uri]
     await talker.serve(proxy.master)
-    found = await listener.call(proxy.master, "lookupService", "/add")
-    assert found == [1, f"rosrpc URI: [{talker.service_api}]", talker.service_api]
+    reply = await listener.call(proxy.master, "lookupService", "/add")
+    assert reply == [1, f"rosrpc URI: [{talker.service_api}]", talker.service_api]
 
 
 async def test_a_name_that_resolves_nowhere_is_found_at_the_source_address(

@@ -69,8 +69,8 @@ async def test_a_service_of_a_neighbour_without_a_usable_name_is_relayed(proxy, 
     first, _ = twins
     caller = await make_node("/caller", THIRD_NODE)
     await first.serve(proxy.master)
-    found = await caller.call(proxy.master, "lookupService", "/add")
-    assert found[2] == f"rosrpc://{PROXY}:{proxy.endpoint(first).port}"
+    reply = await caller.call(proxy.master, "lookupService", "/add")
+    assert reply[2] == f"rosrpc://{PROXY}:{proxy.endpoint(first).port}"
     assert (await first.call(proxy.master, "lookupService", "/add"))[2] == first.service_api
 
 

@@ -12,7 +12,7 @@ from xmlrpc.client import Fault
 
 import pytest
 
-from examples.demo.fake_http import Answer, value, where
+from examples.demo.fake_http import Answer, host_and_port, value
 from examples.demo.fake_node import FakeNode
 from tests.clock import pass_time
 from tests.integration.net import (
@@ -106,7 +106,7 @@ async def test_one_that_can_not_show_who_it_is_stays_registered(proxy, master, n
     assert "does not tell whether it is the node" in problem["text"]
     await pass_time(10)
     assert master.nodes == {node.name: uri}
-    assert await refuses(where(uri))
+    assert await refuses(host_and_port(uri))
     await node.subscribe(proxy.master, "/more")  # from its own address: that shows it
     assert master.nodes == {node.name: uri}
     await until(partial(answers, uri), "it is served")
@@ -126,7 +126,7 @@ async def test_another_node_is_not_taken_for_it_by_what_it_lacks(proxy, master, 
     await proxy.restart(replaced)
     await until(lambda: proxy.app.status()["problems"], "it is told")
     await pass_time(5)
-    assert await refuses(where(uri))
+    assert await refuses(host_and_port(uri))
 
 
 async def on_own_ports(node: FakeNode, *names: str) -> None:
@@ -183,8 +183,8 @@ async def test_ports_of_services_survive_a_restart(proxy, master, node):
         await proxy.restart()
         await until(partial(answers, uri), "it is served")
         for service in ("/sub", "/add"):
-            found = await greeted(proxy, node, service_header(service))
-            assert found["callerid"] == node.name
+            header = await greeted(proxy, node, service_header(service))
+            assert header["callerid"] == node.name
 
 
 async def test_a_node_that_only_serves_is_found_by_its_service(proxy, master, node):
@@ -229,13 +229,13 @@ async def test_a_uri_without_a_slash_at_the_end_is_the_same_after_a_restart(prox
     assert (await node.subscribe(proxy.master, "/more"))[2] == [node.uri]
     assert master.nodes == {node.name: uri}
     for topic in ("/out", "/more", "/rosout"):
-        found = await node.call(proxy.master, "unregisterPublisher", topic, node.uri)
-        assert found[2] == 1, topic
+        reply = await node.call(proxy.master, "unregisterPublisher", topic, node.uri)
+        assert reply[2] == 1, topic
     for topic in ("/out", "/more", "/news"):
-        found = await node.call(proxy.master, "unregisterSubscriber", topic, node.uri)
-        assert found[2] == 1, topic
-    found = await node.call(proxy.master, "unregisterService", "/add", node.service_api)
-    assert found[2] == 1
+        reply = await node.call(proxy.master, "unregisterSubscriber", topic, node.uri)
+        assert reply[2] == 1, topic
+    reply = await node.call(proxy.master, "unregisterService", "/add", node.service_api)
+    assert reply[2] == 1
     assert not master.nodes
 
 
@@ -255,7 +255,7 @@ async def test_a_uri_without_a_host_is_at_the_callers_address(proxy, master, nod
     await until(partial(answers, uri), "it is served")
     assert (await node.publish(proxy.master, "/more"))[0] == 1
     assert master.nodes[node.name] == uri
-    found = await node.call(proxy.master, "unregisterPublisher", "/out", node.uri)
-    assert found[2] == 1
-    found = await node.call(proxy.master, "unregisterService", "/own", api)
-    assert found[2] == 1
+    reply = await node.call(proxy.master, "unregisterPublisher", "/out", node.uri)
+    assert reply[2] == 1
+    reply = await node.call(proxy.master, "unregisterService", "/own", api)
+    assert reply[2] == 1

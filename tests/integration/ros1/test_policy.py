@@ -99,8 +99,8 @@ async def test_a_hidden_service_is_found_inside_alone(make_proxy, master, make_n
         1,
     ]
     assert master.holds("services", "/add") == []
-    found = await client.call(proxy.master, "lookupService", "/add")
-    assert found == [1, f"rosrpc URI: [{server.service_api}]", server.service_api]
+    reply = await client.call(proxy.master, "lookupService", "/add")
+    assert reply == [1, f"rosrpc URI: [{server.service_api}]", server.service_api]
     assert (await client.call(proxy.master, "lookupNode", "/server"))[2] == server.uri
     ended = await server.call(proxy.master, "unregisterService", "/add", server.service_api)
     assert ended == [1, "Unregistered [/server] as provider of [/add]", 1]
@@ -261,8 +261,8 @@ async def test_a_denied_topic_is_refused_outside_and_served_to_neighbours(make_p
     assert "policy of --policy: deny publish /chatter" in header["error"]
     assert (await greet(proxy.lease(talker), topic_header("/odom")))["callerid"] == "/talker"
     asked = (PROXY, proxy.endpoint(talker).port)
-    found = await rpc(asked, "requestTopic", "/other", "/chatter", TCPROS, source=OTHER_NODE)
-    assert found[0] == 1
+    reply = await rpc(asked, "requestTopic", "/other", "/chatter", TCPROS, source=OTHER_NODE)
+    assert reply[0] == 1
     async with connect(asked, OTHER_NODE) as wire:
         await wire.send(topic_header("/chatter"))
         assert (await read_header(wire))["callerid"] == "/talker"

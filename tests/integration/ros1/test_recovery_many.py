@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import where
+from examples.demo.fake_http import host_and_port
 from examples.demo.fake_node import FakeNode
 from tests.integration.net import looks, refuses, until
 from tests.integration.proxy import Proxy
@@ -50,7 +50,7 @@ async def test_nodes_that_answer_late_are_announced_together(make_proxy, master,
     await proxy.restart()
     for node in nodes:
         uri = master.nodes[node.name]
-        assert await refuses(where(uri))
+        assert await refuses(host_and_port(uri))
     await asyncio.sleep(0.5)
     master.delay, before = 0.1, len(master.named("getSystemState"))
     for node in nodes:

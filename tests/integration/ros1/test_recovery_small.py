@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import where
+from examples.demo.fake_http import host_and_port
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from examples.demo.players import Adder, Listener, Talker
@@ -143,7 +143,7 @@ async def test_a_new_node_gets_no_port_that_belongs_to_another(proxy, master, no
     await proxy.restart()
     late: FakeNode = await make_node("/late", OTHER_NODE)
     await late.publish(proxy.master)
-    ports = {where(uri)[1] for uri in master.nodes.values()}
+    ports = {host_and_port(uri)[1] for uri in master.nodes.values()}
     assert len(ports) == 4
 
 
@@ -163,7 +163,7 @@ async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
     await until(lambda: answers(uri_of(master, "/b")), "the others are served")
     assert clock() - started < 8
     await until(lambda: nodes[1].updates("/news")[-1:] == [[FAR]], "the others are told")
-    assert await refuses(where(uri_of(master, "/a")))
+    assert await refuses(host_and_port(uri_of(master, "/a")))
     nodes[0].hang = False
     await until(lambda: answers(uri_of(master, "/a")), "it is served again")
     await until(lambda: nodes[0].updates("/news")[-1:] == [[FAR]], "it is told as well")
@@ -287,18 +287,20 @@ async def test_messages_flow_again(start_process, master):
     heard = far_listener.received, listener.received
 
     def flowing(*counts: int) -> bool:
-        return all(len(one) >= count + 5 for one, count in zip(heard, counts, strict=True))
+        return all(
+            len(messages) >= count + 5 for messages, count in zip(heard, counts, strict=True)
+        )
 
     async with AsyncExitStack() as stack:
         for node in (talker, far_talker, listener, far_listener, adder):
             await node.start()
             stack.push_async_callback(node.stop)
             await node.register(inner if node.address.startswith("127.0.2.") else master.uri)
-        for one in (talker, far_talker):
-            stack.callback(asyncio.create_task(one.talk()).cancel)
+        for speaker in (talker, far_talker):
+            stack.callback(asyncio.create_task(speaker.talk()).cancel)
         await until(lambda: flowing(0, 0), "messages flow both ways")
         await restart(process)
-        counts = [len(one) for one in heard]
+        counts = [len(messages) for messages in heard]
         await until(lambda: flowing(*counts), "messages flow again")
         assert await far_listener.add(master.uri, "/add", 2, 3) == 5
         assert HOST in master.holds("services", "/add")[0]

@@ -69,10 +69,10 @@ async def listening(proxy: Proxy, publisher: FakeNode, name: str) -> AsyncIterat
 async def served(proxy: Proxy, *nodes: FakeNode) -> None:
     """Wait until the nodes are served."""
     for node in nodes:
-        await until(partial(known, proxy, node), f"{node.name} is recovered")
+        await until(partial(is_recovered, proxy, node), f"{node.name} is recovered")
 
 
-def known(proxy: Proxy, node: FakeNode) -> bool:
+def is_recovered(proxy: Proxy, node: FakeNode) -> bool:
     slaves = [e.slave for e in proxy.ros1.context.registry if e.trusted]
     return HostPort(node.address, node.slave.address[1]) in slaves
 

@@ -47,12 +47,12 @@ def _remove(directory: Path, seconds: float = 5) -> None:
 
 
 def _pids(name: str) -> list[int]:
-    found = set()
+    pids = set()
     for hierarchy in _hierarchies():
         for directory, _, files in os.walk(hierarchy / name):
             if "cgroup.procs" in files:
-                found |= set(map(int, Path(directory, "cgroup.procs").read_text().split()))
-    return sorted(found)
+                pids |= set(map(int, Path(directory, "cgroup.procs").read_text().split()))
+    return sorted(pids)
 
 
 def _hierarchies() -> list[Path]:

@@ -39,10 +39,10 @@ def _import(node: Node, archive: Path) -> None:
 
 def _loaded(node: Node) -> dict[str, str]:
     try:
-        found: dict[str, str] = json.loads(node.images.read_text())
+        loaded: dict[str, str] = json.loads(node.images.read_text())
     except OSError:
         return {}
-    return found
+    return loaded
 
 
 def _id(image: str) -> str:

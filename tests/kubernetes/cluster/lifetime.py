@@ -73,5 +73,5 @@ def _images() -> None:
 
 
 def _takes_pods() -> bool:
-    found = kubectl("get", "serviceaccount", "default", "--ignore-not-found", "--output=name")
-    return found != ""
+    account = kubectl("get", "serviceaccount", "default", "--ignore-not-found", "--output=name")
+    return account != ""

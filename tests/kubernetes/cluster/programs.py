@@ -43,7 +43,7 @@ class Program:
             pid = int(self._pid_file.read_text())
         except (OSError, ValueError):
             return None
-        own = b"\0".join(os.fsencode(str(word)) for word in self.command)
+        own = b"\0".join(os.fsencode(str(argument)) for argument in self.command)
         return pid if own in command_line(pid) else None
 
     def start(self) -> None:

@@ -11,9 +11,9 @@ from tests.kubernetes.cluster.network import plug_in_robot, unplug_robot
 
 def start_robot() -> None:
     """Start it, unless it runs the image that there is now."""
-    found = inspect(ROBOT, check=False)
+    inspection = inspect(ROBOT, check=False)
     wanted = docker("image", "inspect", "--format", "{{.Id}}", ROS)
-    if found and found["State"]["Running"] and found["Image"] == wanted:
+    if inspection and inspection["State"]["Running"] and inspection["Image"] == wanted:
         return
     docker("rm", "--force", ROBOT, check=False)
     docker(

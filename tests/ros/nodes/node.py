@@ -26,7 +26,7 @@ class Options:
     """The `--option value` pairs of the command line."""
 
     def __init__(self, argv: list[str]) -> None:
-        names = [word.removeprefix("--") for word in argv[::2]]
+        names = [argument.removeprefix("--") for argument in argv[::2]]
         self._values = dict(zip(names, argv[1::2], strict=True))
 
     def text(self, name: str, default: str = "") -> str:
@@ -48,9 +48,9 @@ def spin() -> None:
         time.sleep(0.02)
 
 
-def payload(word: str, number: int, size: int) -> str:
-    """`word number` filled up to `size` characters."""
-    head = f"{word} {number} "
+def payload(prefix: str, number: int, size: int) -> str:
+    """`prefix number` filled up to `size` characters."""
+    head = f"{prefix} {number} "
     if size <= len(head):
         return head
     return head + (ALPHABET * (size // len(ALPHABET) + 1))[: size - len(head)]
@@ -58,9 +58,9 @@ def payload(word: str, number: int, size: int) -> str:
 
 def describe(text: str) -> str:
     """What identifies a payload: its first two words, its size and its checksum."""
-    word, number = text.split(" ", 2)[:2]
+    prefix, number = text.split(" ", 2)[:2]
     data = text.encode()
-    return f"{word} {number} size {len(data)} crc {zlib.crc32(data):08x} at {time.time():.3f}"
+    return f"{prefix} {number} size {len(data)} crc {zlib.crc32(data):08x} at {time.time():.3f}"
 
 
 def publish(options: Options) -> None:
@@ -68,12 +68,12 @@ def publish(options: Options) -> None:
     latch = options.number("latch", 0) > 0
     topic = options.text("topic")
     publisher = rospy.Publisher(topic, String, queue_size=10, latch=latch)
-    word, size = options.text("word", "hello"), int(options.number("size", 0))
+    prefix, size = options.text("word", "hello"), int(options.number("size", 0))
     rate, count = rospy.Rate(options.number("rate", 20)), options.number("count", 1e9)
     say("ready")
     number = 0
     while number < count and not rospy.is_shutdown():
-        text = payload(word, number, size)
+        text = payload(prefix, number, size)
         publisher.publish(text)
         say("sent", describe(text))
         number += 1

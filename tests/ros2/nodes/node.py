@@ -45,17 +45,17 @@ def say(*words: object) -> None:
 
 
 def profile(options: argparse.Namespace) -> QoSProfile:
-    found = QoSProfile(depth=options.depth)
+    qos = QoSProfile(depth=options.depth)
     if options.best_effort:
-        found.reliability = ReliabilityPolicy.BEST_EFFORT
+        qos.reliability = ReliabilityPolicy.BEST_EFFORT
     if options.latched:
-        found.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
     if options.deadline:
-        found.deadline = Duration(seconds=options.deadline)
+        qos.deadline = Duration(seconds=options.deadline)
     if options.liveliness:
-        found.liveliness = LivelinessPolicy[options.liveliness]
-        found.liveliness_lease_duration = Duration(seconds=options.lease)
-    return found
+        qos.liveliness = LivelinessPolicy[options.liveliness]
+        qos.liveliness_lease_duration = Duration(seconds=options.lease)
+    return qos
 
 
 def incompatible(event: object) -> None:
@@ -176,7 +176,9 @@ def pursue(node: Node, options: argparse.Namespace) -> None:
 def hold(node: Node, options: argparse.Namespace) -> None:
     node.declare_parameter("speed", 1)
     node.add_post_set_parameters_callback(
-        lambda changed: say("changed", *(f"{one.name}={one.value}" for one in changed))
+        lambda changed: say(
+            "changed", *(f"{parameter.name}={parameter.value}" for parameter in changed)
+        )
     )
     say("ready")
 
@@ -262,8 +264,8 @@ def run(name: str, options: argparse.Namespace) -> None:
 def main() -> None:
     options = read_options()
     for number in range(1, options.contexts):
-        words = f"{options.name}_{number}", options
-        threading.Thread(target=run, args=words, daemon=True).start()
+        arguments = f"{options.name}_{number}", options
+        threading.Thread(target=run, args=arguments, daemon=True).start()
     run(options.name, options)
 
 

@@ -26,25 +26,27 @@ def layer(rules: str, name: str = "administrator", mode: str = "enforce") -> Pol
 
 
 def test_the_first_rule_that_matches_decides() -> None:
-    found = [layer("allow publish /camera/front; deny publish /camera/*")]
-    assert decide(found, PUBLISH, "/camera/front", "/driver", "").allowed
-    verdict = decide(found, PUBLISH, "/camera/rear", "/driver", "")
+    policy = [layer("allow publish /camera/front; deny publish /camera/*")]
+    assert decide(policy, PUBLISH, "/camera/front", "/driver", "").allowed
+    verdict = decide(policy, PUBLISH, "/camera/rear", "/driver", "")
     assert not verdict.allowed
     assert verdict.reason == "policy of administrator: deny publish /camera/*"
-    assert decide(found, PUBLISH, "/odom", "/driver", "").allowed
-    assert decide(found, RuleKind.SUBSCRIBE, "/camera/rear", "/driver", "").allowed
+    assert decide(policy, PUBLISH, "/odom", "/driver", "").allowed
+    assert decide(policy, RuleKind.SUBSCRIBE, "/camera/rear", "/driver", "").allowed
 
 
 def test_a_rule_may_be_for_one_node() -> None:
-    found = [layer("deny publish * by /driver")]
-    assert decide(found, PUBLISH, "/a", "/other", "").allowed
-    assert not decide(found, PUBLISH, "/a", "/driver", "").allowed
+    policy = [layer("deny publish * by /driver")]
+    assert decide(policy, PUBLISH, "/a", "/other", "").allowed
+    assert not decide(policy, PUBLISH, "/a", "/driver", "").allowed
 
 
 def test_a_layer_may_be_for_some_addresses() -> None:
-    found = [PolicyLayer("label", parse_rules("deny publish *"), addresses=frozenset(["10.0.0.1"]))]
-    assert decide(found, PUBLISH, "/a", "/n", "10.0.0.2").allowed
-    assert not decide(found, PUBLISH, "/a", "/n", "10.0.0.1").allowed
+    policy = [
+        PolicyLayer("label", parse_rules("deny publish *"), addresses=frozenset(["10.0.0.1"]))
+    ]
+    assert decide(policy, PUBLISH, "/a", "/n", "10.0.0.2").allowed
+    assert not decide(policy, PUBLISH, "/a", "/n", "10.0.0.1").allowed
 
 
 def test_audit_tells_and_enforcement_goes_first() -> None:
@@ -58,46 +60,48 @@ def test_audit_tells_and_enforcement_goes_first() -> None:
 
 @given(st.lists(LAYERS, max_size=3), LAYERS, st.sampled_from(RuleKind), NAMES)
 def test_one_more_layer_only_narrows(
-    found: list[PolicyLayer], more: PolicyLayer, kind: RuleKind, name: str
+    policy: list[PolicyLayer], more: PolicyLayer, kind: RuleKind, name: str
 ) -> None:
-    if not decide(found, kind, name, "/a", "10.0.0.1").allowed:
-        assert not decide([*found, more], kind, name, "/a", "10.0.0.1").allowed
+    if not decide(policy, kind, name, "/a", "10.0.0.1").allowed:
+        assert not decide([*policy, more], kind, name, "/a", "10.0.0.1").allowed
 
 
 @given(st.lists(LAYERS, max_size=3), st.sampled_from(RuleKind), NAMES, NAMES)
 def test_nothing_below_an_allowed_prefix_is_denied(
-    found: list[PolicyLayer], kind: RuleKind, prefix: str, rest: str
+    policy: list[PolicyLayer], kind: RuleKind, prefix: str, rest: str
 ) -> None:
-    if decide_below(found, kind, prefix, "/a", "10.0.0.1").allowed:
-        assert decide(found, kind, prefix + rest, "/a", "10.0.0.1").allowed
+    if decide_below(policy, kind, prefix, "/a", "10.0.0.1").allowed:
+        assert decide(policy, kind, prefix + rest, "/a", "10.0.0.1").allowed
 
 
 @given(st.lists(LAYERS, max_size=3), st.sampled_from(RuleKind), NAMES)
-def test_what_is_denied_may_be(found: list[PolicyLayer], kind: RuleKind, name: str) -> None:
-    if not decide(found, kind, name, "/a", "10.0.0.1").allowed:
-        assert may_deny(found, [kind], ["/b", "/a"], "10.0.0.1")
+def test_what_is_denied_may_be(policy: list[PolicyLayer], kind: RuleKind, name: str) -> None:
+    if not decide(policy, kind, name, "/a", "10.0.0.1").allowed:
+        assert may_deny(policy, [kind], ["/b", "/a"], "10.0.0.1")
 
 
 @given(st.lists(LAYERS, max_size=3), st.sampled_from(RuleKind), NAMES)
 def test_rules_of_other_kinds_decide_nothing(
-    found: list[PolicyLayer], kind: RuleKind, name: str
+    policy: list[PolicyLayer], kind: RuleKind, name: str
 ) -> None:
-    mine = layers.of_kind(found, kind)
-    assert decide(mine, kind, name, "/a", "10.0.0.1") == decide(found, kind, name, "/a", "10.0.0.1")
+    mine = layers.of_kind(policy, kind)
+    assert decide(mine, kind, name, "/a", "10.0.0.1") == decide(
+        policy, kind, name, "/a", "10.0.0.1"
+    )
 
 
 def test_an_allow_list_lets_its_namespaces_be_read() -> None:
-    found = [layer("allow get-param /arm/*; allow get-param /arm; deny get-param *")]
+    policy = [layer("allow get-param /arm/*; allow get-param /arm; deny get-param *")]
     kind = RuleKind.GET_PARAM
-    assert decide_below(found, kind, "/arm/", "/n", "").allowed
-    assert decide_below(found, kind, "/arm/joints/", "/n", "").allowed
-    assert not decide_below(found, kind, "/", "/n", "").allowed
+    assert decide_below(policy, kind, "/arm/", "/n", "").allowed
+    assert decide_below(policy, kind, "/arm/joints/", "/n", "").allowed
+    assert not decide_below(policy, kind, "/", "/n", "").allowed
 
 
 @given(st.lists(LAYERS, max_size=3))
-def test_layers_are_read_as_they_are_written(found: list[PolicyLayer]) -> None:
-    as_json = msgspec.json.decode(msgspec.json.encode(layers.layers_as_json(found)))
-    assert layers.read_layers(as_json) == tuple(found)
+def test_layers_are_read_as_they_are_written(policy: list[PolicyLayer]) -> None:
+    as_json = msgspec.json.decode(msgspec.json.encode(layers.layers_as_json(policy)))
+    assert layers.read_layers(as_json) == tuple(policy)
 
 
 @pytest.mark.parametrize(

@@ -24,15 +24,15 @@ def test_a_rule_is_read_as_it_is_written(rule: Rule) -> None:
 
 
 @given(st.lists(RULES).map(tuple))
-def test_rules_are_read_as_they_are_written(found: tuple[Rule, ...]) -> None:
-    assert parse_rules(rules.format_rules(found)) == found
+def test_rules_are_read_as_they_are_written(original: tuple[Rule, ...]) -> None:
+    assert parse_rules(rules.format_rules(original)) == original
 
 
 @given(st.text())
 def test_any_text_is_rules_or_an_error(text: str) -> None:
     with contextlib.suppress(ValueError):
-        found = parse_rules(text)
-        assert parse_rules(rules.format_rules(found)) == found
+        parsed = parse_rules(text)
+        assert parse_rules(rules.format_rules(parsed)) == parsed
 
 
 def test_lines_semicolons_and_comments() -> None:

@@ -23,18 +23,20 @@ from rosproxy.admin.status_document import PortsStatus
     ],
 )
 def test_where_the_advertised_host_leads(host, addresses, all_here, severity, text) -> None:
-    found = list(advertised_host(host, addresses, all_here))
-    assert [one.severity for one in found] == ([severity] if severity else [])
-    assert all(text in one.text and "--advertise-host ADDRESS" in one.fix for one in found)
+    findings = list(advertised_host(host, addresses, all_here))
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    assert all(
+        text in finding.text and "--advertise-host ADDRESS" in finding.fix for finding in findings
+    )
 
 
 def test_udp_that_does_not_come_back_proves_little() -> None:
     ports = PortsStatus("11400-11431", "12400-12431")
     for outcome, severity in (("ok", Severity.OK), ("silent", Severity.INFO)):
         probe = RangeProbe((PortProbe(11400, "host:12400", outcome, "unknown", "udp"),))
-        (found,) = published_range(probe, "host", ports)
-        assert found.severity is severity
-    assert "12400-12431:11400-11431/udp" in found.fix
+        (finding,) = published_range(probe, "host", ports)
+        assert finding.severity is severity
+    assert "12400-12431:11400-11431/udp" in finding.fix
 
 
 def test_another_proxy_on_the_range_is_named() -> None:

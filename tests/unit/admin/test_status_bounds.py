@@ -39,11 +39,11 @@ def test_shares_are_fair(wanted: list[int], most: int) -> None:
 @given(st.lists(st.lists(st.text(max_size=300), max_size=30), max_size=6), st.integers(0, 5000))
 def test_it_fits_and_counts_what_is_missing(given_names: list[list[str]], most: int) -> None:
     status = ProxyStatus(nodes=tuple(EndpointStatus(publishes=tuple(n)) for n in given_names))
-    found = bounded(status, most)
+    shortened = bounded(status, most)
     empty = ProxyStatus(nodes=(EndpointStatus(),) * len(given_names))
     longest = len(json.dumps(to_json(empty))) + most + 10 * len(given_names)
-    assert len(json.dumps(to_json(found))) <= longest
-    for names, node in zip(given_names, found.nodes, strict=True):
+    assert len(json.dumps(to_json(shortened))) <= longest
+    for names, node in zip(given_names, shortened.nodes, strict=True):
         assert node.left_out == len(names) - len(node.publishes)
 
 
@@ -73,7 +73,7 @@ def test_what_is_hidden_is_bounded_too() -> None:
     """A node may register any number of long names that a rule hides."""
     many = [HiddenStatus("publish", f"/{n}" + "x" * 1000, "/node", "a rule") for n in range(5000)]
     shown = first_hidden(many)
-    assert 0 < sum(len(json.dumps(to_json(one))) for one in shown) < 1.1 * MOST_HIDDEN
+    assert 0 < sum(len(json.dumps(to_json(hidden))) for hidden in shown) < 1.1 * MOST_HIDDEN
     assert shown == many[: len(shown)]
     assert first_hidden(many[:3]) == many[:3]
 
@@ -83,16 +83,16 @@ def test_names_of_participants_fit(lengths: list[list[int]], most: int) -> None:
     """Sixty participants with the longest names had megabytes of them."""
     before = [
         ParticipantStatus(
-            publishes=tuple("p" * one for one in own),
-            subscribes=tuple("s" * one for one in own),
-            services=tuple("v" * one for one in own),
+            publishes=tuple("p" * length for length in own),
+            subscribes=tuple("s" * length for length in own),
+            services=tuple("v" * length for length in own),
         )
         for own in lengths
     ]
     after = bounded_names(before, most)
-    shown = [(*one.publishes, *one.subscribes, *one.services) for one in after]
+    shown = [(*p.publishes, *p.subscribes, *p.services) for p in after]
     assert sum(len(name) + 3 for names in shown for name in names) <= most
-    for had, one, names in zip(before, after, shown, strict=True):
-        everything = (*had.publishes, *had.subscribes, *had.services)
+    for full, shortened, names in zip(before, after, shown, strict=True):
+        everything = (*full.publishes, *full.subscribes, *full.services)
         assert everything[: len(names)] == names
-        assert one.left_out == len(everything) - len(names)
+        assert shortened.left_out == len(everything) - len(names)

@@ -27,17 +27,17 @@ def a_status() -> dict[str, Any]:
 
 
 def test_a_status_is_the_same_after_reading_and_writing() -> None:
-    found = parse_status(json.dumps(a_status()))
-    assert (found.version, found.pid, found.uptime) == ("0.1.0", 42, 75.0)
-    assert found.settings.inside_networks == ("10.0.0.0/24",)
-    (node,) = found.nodes
+    status = parse_status(json.dumps(a_status()))
+    assert (status.version, status.pid, status.uptime) == ("0.1.0", 42, 75.0)
+    assert status.settings.inside_networks == ("10.0.0.0/24",)
+    (node,) = status.nodes
     assert (node.nodes, node.address, node.given_up) == (("/talker",), "10.0.0.5:40001", False)
     assert node.connections[0].caller_id == "/listener"
     assert node.data_plane is not None
     assert (node.data_plane.port, node.data_plane.reason) == (45050, None)
-    assert parse_status(json.dumps(to_json(found))) == found
-    assert make_status().keys() <= to_json(found).keys()
-    assert make_node().keys() <= to_json(found)["nodes"][0].keys()
+    assert parse_status(json.dumps(to_json(status))) == status
+    assert make_status().keys() <= to_json(status).keys()
+    assert make_node().keys() <= to_json(status)["nodes"][0].keys()
 
 
 @pytest.mark.parametrize(
@@ -60,12 +60,12 @@ def test_what_does_not_fit_leaves_the_rest_alone() -> None:
     status["nodes"][0] |= {"state": 7, "publishes": ["/a", 1, None], "data_plane": {"port": []}}
     status["nodes"][0]["connections"] += ["x", {"name": "/b", "sent": True}]
     status["nodes"] += ["x", None]
-    found = parse_status(json.dumps(status))
-    assert (found.uptime, found.pid, found.stand_ins, found.data_plane) == (0.0, 0, (), None)
-    assert (found.master.up, found.master.uri) == (True, "http://robot:11311")
-    assert (found.master.error, found.master.round_trip, found.master.since) == ("", None, 0.0)
-    assert (found.ports.used, found.ports.free) == (0, 99)
-    (node,) = found.nodes
+    parsed = parse_status(json.dumps(status))
+    assert (parsed.uptime, parsed.pid, parsed.stand_ins, parsed.data_plane) == (0.0, 0, (), None)
+    assert (parsed.master.up, parsed.master.uri) == (True, "http://robot:11311")
+    assert (parsed.master.error, parsed.master.round_trip, parsed.master.since) == ("", None, 0.0)
+    assert (parsed.ports.used, parsed.ports.free) == (0, 99)
+    (node,) = parsed.nodes
     assert (node.state, node.publishes, node.address) == ("", ("/a",), "10.0.0.5:40001")
     assert [c.name for c in node.connections] == ["/chatter", "/b"]
     assert node.data_plane is not None
@@ -93,5 +93,5 @@ _JSON = st.recursive(
 
 @given(_JSON)
 def test_nothing_is_too_strange(document: Any) -> None:
-    found = read_status(document)
-    assert parse_status(json.dumps(to_json(found))) == found
+    status = read_status(document)
+    assert parse_status(json.dumps(to_json(status))) == status

@@ -71,8 +71,8 @@ def test_cpu_is_by_the_time_between_two_readings() -> None:
 def test_outside_and_inside_share_no_processor_but_a_single_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for there, parts in (({3}, ("3", "3")), ({0, 1}, ("0", "1")), ({0, 2, 5}, ("0", "2,5"))):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _, there=there: there)
+    for cpus, parts in (({3}, ("3", "3")), ({0, 1}, ("0", "1")), ({0, 2, 5}, ("0", "2,5"))):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cpus=cpus: cpus)
         assert (processors()["inside"], processors()["outside"]) == parts
 
 

@@ -52,7 +52,7 @@ def shown(domain: DomainStatus) -> str:
 
 def test_a_domain_and_its_participants_are_shown() -> None:
     text = shown(DOMAIN)
-    for part in (
+    for expected in (
         "ROS 2, domain 7, networks 172.30.0.0/16",
         "domain 7: ear 172.30.0.1:7500; found at 10.0.0.1:11400; 1 ports used, 62 free",
         "4 datagrams refused",
@@ -63,7 +63,7 @@ def test_a_domain_and_its_participants_are_shown() -> None:
         "2.4 kB  500 B/s",
         "outside?",
     ):
-        assert part in text, part
+        assert expected in text, expected
     assert "\x1b" not in text
     assert "master" not in text
 

@@ -11,24 +11,26 @@ from rosproxy.doctor.facts import (
     DoctorFacts,
     MasterFacts,
     NodeFacts,
-    Reach,
+    ReachOutcome,
     SlaveReport,
     SystemState,
 )
 from rosproxy.net.addresses import HostPort
 from tests.unit.status_json import HOST, make_node, make_status
 
-ANSWERED = Attempt(Reach.ANSWERED)
+ANSWERED = Attempt(ReachOutcome.ANSWERED)
 INSIDE_URI = f"http://{HOST}:45000/"
 INSIDE = HostPort("10.0.0.5", 40001)
 OUTSIDE_URI = "http://192.168.0.9:35001/"
 PROBE = {"port": 45001, "advertised": f"{HOST}:45001", "from_proxy": "ok", "from_master": "ok"}
 
 
-def make_master(reach: Reach = Reach.ANSWERED, reason: str = "", **changes: Any) -> MasterFacts:
+def make_master(
+    reach: ReachOutcome = ReachOutcome.ANSWERED, reason: str = "", **changes: Any
+) -> MasterFacts:
     """The real master."""
-    known = {"uri": "http://robot:11311", "addresses": ("192.168.0.1",), "round_trip": 0.002}
-    return MasterFacts(attempt=Attempt(reach, reason), **{**known, **changes})
+    defaults = {"uri": "http://robot:11311", "addresses": ("192.168.0.1",), "round_trip": 0.002}
+    return MasterFacts(attempt=Attempt(reach, reason), **{**defaults, **changes})
 
 
 def probes(*outcomes: tuple[str, str]) -> dict[str, Any]:
@@ -49,7 +51,7 @@ def probes(*outcomes: tuple[str, str]) -> dict[str, Any]:
 
 def make_facts(**changes: Any) -> DoctorFacts:
     """A talker inside and a listener outside, both sound."""
-    known: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "admin": "http://127.0.0.1:11312",
         "status": make_status(make_node()),
         "probe": probes(("ok", "ok"), ("ok", "ok")),
@@ -59,7 +61,7 @@ def make_facts(**changes: Any) -> DoctorFacts:
         "graph": SystemState({"/chatter": ["/talker"]}, {"/chatter": ["/listener"]}, {}),
         "nodes": by_name(talker(), listener()),
     }
-    given = {**known, **changes}
+    given = {**defaults, **changes}
     if given["status"] is not None:
         given["status"] = read_status(given["status"])
     if given["probe"] is not None:
@@ -84,18 +86,18 @@ def talker(**changes: Any) -> NodeFacts:
     report = SlaveReport(
         {"/chatter": "std_msgs/String"}, {}, frozenset({("o", "/chatter", "/listener")})
     )
-    known = {"name": "/talker", "uri": INSIDE_URI, "inside": INSIDE, "report": report}
-    return NodeFacts(**{**known, **changes})
+    defaults = {"name": "/talker", "uri": INSIDE_URI, "inside": INSIDE, "report": report}
+    return NodeFacts(**{**defaults, **changes})
 
 
 def listener(**changes: Any) -> NodeFacts:
     """The node outside."""
     report = SlaveReport({}, {"/chatter": "std_msgs/String"})
-    known = {"name": "/listener", "uri": OUTSIDE_URI, "addresses": ("192.168.0.9",)}
-    return NodeFacts(**{**known, "attempt": ANSWERED, "report": report, **changes})
+    defaults = {"name": "/listener", "uri": OUTSIDE_URI, "addresses": ("192.168.0.9",)}
+    return NodeFacts(**{**defaults, "attempt": ANSWERED, "report": report, **changes})
 
 
 def only(findings: Iterable[DoctorFinding], severity: Severity = Severity.WARNING) -> DoctorFinding:
     """The one finding that is at least so bad."""
-    (found,) = [f for f in findings if f.severity >= severity]
-    return found
+    (finding,) = [f for f in findings if f.severity >= severity]
+    return finding

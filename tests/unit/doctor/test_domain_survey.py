@@ -19,9 +19,9 @@ NAME = "00.01.02.03.04.05.06.07.08.09.0a.0b"
 
 
 def answer(port: int, domain: int | None = None) -> bytes:
-    held = [(Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(SOURCE, port), "<"))]
-    held += [] if domain is None else [(Pid.DOMAIN_ID, struct.pack("<I", domain))]
-    return message(data(payload(held)))
+    parameters = [(Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(SOURCE, port), "<"))]
+    parameters += [] if domain is None else [(Pid.DOMAIN_ID, struct.pack("<I", domain))]
+    return message(data(payload(parameters)))
 
 
 @pytest.mark.parametrize(
@@ -29,8 +29,8 @@ def answer(port: int, domain: int | None = None) -> bytes:
     [(7410, None, 0), (7412, 0, 0), (8660, None, 5), (58_793, 3, 3), (65_410, None, 232)],
 )
 def test_of_which_domain_it_is(port: int, said: int | None, domain: int) -> None:
-    found = heard_participant(answer(port, said), SOURCE)
-    assert found == HeardParticipant(domain, NAME, SOURCE, "Fast DDS")
+    participant = heard_participant(answer(port, said), SOURCE)
+    assert participant == HeardParticipant(domain, NAME, SOURCE, "Fast DDS")
 
 
 @pytest.mark.parametrize(

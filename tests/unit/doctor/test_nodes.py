@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach, SystemState
+from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome, SystemState
 from rosproxy.doctor.rules import node as node_rules
 from rosproxy.net.addresses import HostPort
 from tests.unit.doctor.cases import (
@@ -22,7 +22,7 @@ from tests.unit.doctor.cases import (
 )
 from tests.unit.status_json import HOST, make_node, make_status
 
-REFUSED, UNRESOLVABLE = Attempt(Reach.REFUSED), Attempt(Reach.UNRESOLVABLE)
+REFUSED, UNRESOLVABLE = Attempt(ReachOutcome.REFUSED), Attempt(ReachOutcome.UNRESOLVABLE)
 
 
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
@@ -59,21 +59,21 @@ def test_an_address_of_the_proxy_is_of_its_host_and_range() -> None:
 
 
 def test_nobody_uses_the_proxy() -> None:
-    found = only(check(make_facts(status=make_status(), nodes={})))
-    assert (found.severity, found.text) == (
+    finding = only(check(make_facts(status=make_status(), nodes={})))
+    assert (finding.severity, finding.text) == (
         Severity.WARNING,
         "none has registered through the proxy",
     )
-    assert "ROS_MASTER_URI=http://PROXY:11311" in found.fix
+    assert "ROS_MASTER_URI=http://PROXY:11311" in finding.fix
 
 
 @pytest.mark.parametrize(("host", "state"), [("127.0.0.1", "refused"), ("localhost", "ok")])
 def test_a_node_that_listens_on_loopback_only(host: str, state: str) -> None:
     """A roscpp node answers probes all the same: only its TCPROS server is on loopback."""
-    found = inside(uri=f"http://{host}:40001/", state=state)
-    assert (found.severity, found.subject) == (Severity.ERROR, "/talker")
-    assert "listens on loopback only" in found.text
-    assert found.fix.startswith("where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP=10.0.0.5;")
+    finding = inside(uri=f"http://{host}:40001/", state=state)
+    assert (finding.severity, finding.subject) == (Severity.ERROR, "/talker")
+    assert "listens on loopback only" in finding.text
+    assert finding.fix.startswith("where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP=10.0.0.5;")
 
 
 def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
@@ -95,10 +95,10 @@ def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
 def test_a_node_behind_the_proxy_that_does_not_answer(
     state: str, severity: Severity, text: str, fix: str
 ) -> None:
-    found = inside(state=state)
-    assert (found.severity, found.subject) == (severity, "/talker")
-    assert text in found.text
-    assert fix in found.fix
+    finding = inside(state=state)
+    assert (finding.severity, finding.subject) == (severity, "/talker")
+    assert text in finding.text
+    assert fix in finding.fix
 
 
 def test_a_dead_node_with_clean_up_switched_off() -> None:
@@ -108,17 +108,17 @@ def test_a_dead_node_with_clean_up_switched_off() -> None:
 
 def test_two_nodes_of_one_name() -> None:
     nodes = by_name(talker(uri="http://192.168.0.9:4/", attempt=ANSWERED))
-    found = only(check(make_facts(nodes=nodes)))
-    assert "two nodes have this name" in found.text
-    assert "__name:=" in found.fix
+    finding = only(check(make_facts(nodes=nodes)))
+    assert "two nodes have this name" in finding.text
+    assert "__name:=" in finding.fix
 
 
 def test_a_registration_with_a_port_that_nobody_holds() -> None:
     nodes = by_name(NodeFacts("/old", "http://robot-host:45007/"))
-    found = only(check(make_facts(nodes=nodes)))
-    assert (found.check, found.subject) == ("stale registration", "/old")
-    assert "a port that no node holds any more" in found.text
-    assert found.fix == "rosnode cleanup (answer y)"
+    finding = only(check(make_facts(nodes=nodes)))
+    assert (finding.check, finding.subject) == ("stale registration", "/old")
+    assert "a port that no node holds any more" in finding.text
+    assert finding.fix == "rosnode cleanup (answer y)"
 
 
 def test_a_registration_with_a_port_that_another_node_holds() -> None:
@@ -142,13 +142,13 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
             "rosnode cleanup (answer y)",
         ),
         (
-            {"attempt": Attempt(Reach.STRANGER, "HTTP status 404")},
+            {"attempt": Attempt(ReachOutcome.STRANGER, "HTTP status 404")},
             Severity.ERROR,
             "but gone: something else answers (HTTP status 404)",
             "rosnode cleanup (answer y)",
         ),
         (
-            {"attempt": Attempt(Reach.SILENT)},
+            {"attempt": Attempt(ReachOutcome.SILENT)},
             Severity.ERROR,
             "no answer at http://192.168.0.9:35001/",
             "nc -vz 192.168.0.9 35001",
@@ -184,11 +184,11 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
 def test_an_outside_node_that_cannot_be_reached(
     changes: dict[str, Any], severity: Severity, text: str, fix: str
 ) -> None:
-    found = outside(**changes)
-    assert (found.severity, found.subject) == (severity, "/listener")
-    assert (found.check == "stale registration") is ("but gone" in text)
-    assert text in found.text
-    assert fix in found.fix
+    finding = outside(**changes)
+    assert (finding.severity, finding.subject) == (severity, "/listener")
+    assert (finding.check == "stale registration") is ("but gone" in text)
+    assert text in finding.text
+    assert fix in finding.fix
 
 
 def test_no_such_suspicion_where_the_master_is_in_that_network_too() -> None:
@@ -199,9 +199,9 @@ def test_no_such_suspicion_where_the_master_is_in_that_network_too() -> None:
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
 def test_an_outside_node_that_calls_itself_loopback(host: str) -> None:
-    found = outside(uri=f"http://{host}:4000/")
-    assert "to every other machine that is the machine itself" in found.text
-    assert "ROS_IP=ADDRESS" in found.fix
+    finding = outside(uri=f"http://{host}:4000/")
+    assert "to every other machine that is the machine itself" in finding.text
+    assert "ROS_IP=ADDRESS" in finding.fix
 
 
 def test_loopback_is_fine_where_all_is_on_one_machine() -> None:
@@ -211,17 +211,17 @@ def test_loopback_is_fine_where_all_is_on_one_machine() -> None:
 
 def test_cleaning_up_is_no_advice_while_the_proxy_is_down() -> None:
     facts = without_proxy(nodes=by_name(talker(attempt=REFUSED)))
-    found = only(check(facts))
-    assert "on robot-host: rosproxy doctor" in found.fix
-    assert "cleanup" not in found.fix
+    finding = only(check(facts))
+    assert "on robot-host: rosproxy doctor" in finding.fix
+    assert "cleanup" not in finding.fix
 
 
 def test_a_service_with_a_port_that_nobody_holds() -> None:
     graph = SystemState({}, {}, {"/add": ["/listener"], "/other": ["/listener"]})
     uris = {"/add": "rosrpc://robot-host:45009", "/other": "rosrpc://192.168.0.9:4"}
-    found = only(check(make_facts(graph=graph, service_uris=uris)))
-    assert (found.subject, found.check) == ("/listener", "stale registration")
-    assert "its service /add is registered as rosrpc://robot-host:45009" in found.text
+    finding = only(check(make_facts(graph=graph, service_uris=uris)))
+    assert (finding.subject, finding.check) == ("/listener", "stale registration")
+    assert "its service /add is registered as rosrpc://robot-host:45009" in finding.text
 
 
 def test_simulated_time_without_a_clock() -> None:
@@ -244,5 +244,5 @@ def test_a_proxy_whose_advertised_name_is_unknown_here() -> None:
 
 
 def test_a_dead_node_on_the_proxys_own_machine() -> None:
-    found = inside(address="127.0.0.1:4", uri="http://localhost:4/", state="refused")
-    assert "has ended" in found.text
+    finding = inside(address="127.0.0.1:4", uri="http://localhost:4/", state="refused")
+    assert "has ended" in finding.text

@@ -10,7 +10,7 @@ from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
     NodeFacts,
-    Reach,
+    ReachOutcome,
     SlaveReport,
     SystemState,
     scope,
@@ -41,11 +41,11 @@ def check(names: Sequence[str], **changes: Any) -> list[DoctorFinding]:
 
 def apart(giver: NodeFacts, taker: NodeFacts, **changes: Any) -> DoctorFinding:
     """The finding on a publisher and a subscriber that are not connected."""
-    (found,) = check(["/chatter"], nodes=by_name(giver, taker), **changes)
-    assert found.severity is Severity.ERROR
-    assert found.subject == "/chatter from /talker to /listener"
-    assert found.text.startswith("not connected: ")
-    return found
+    (finding,) = check(["/chatter"], nodes=by_name(giver, taker), **changes)
+    assert finding.severity is Severity.ERROR
+    assert finding.subject == "/chatter from /talker to /listener"
+    assert finding.text.startswith("not connected: ")
+    return finding
 
 
 def silent_talker(**changes: Any) -> NodeFacts:
@@ -77,9 +77,9 @@ def test_what_names_lead_to(
     lonely: list[str],
     nodes: set[str] | None,
 ) -> None:
-    found = scope(GRAPH, names)
-    assert (found.pairs, found.one_sided_topics) == (pairs, lonely)
-    assert nodes is None or found.nodes == nodes
+    asked = scope(GRAPH, names)
+    assert (asked.pairs, asked.one_sided_topics) == (pairs, lonely)
+    assert nodes is None or asked.nodes == nodes
 
 
 def test_without_names_nothing_is_said() -> None:
@@ -87,15 +87,15 @@ def test_without_names_nothing_is_said() -> None:
 
 
 def test_without_a_graph_that_is_said() -> None:
-    (found,) = check(["/chatter"], graph=None)
-    assert found.severity is Severity.INFO
+    (finding,) = check(["/chatter"], graph=None)
+    assert finding.severity is Severity.INFO
 
 
 def test_a_name_that_nobody_knows() -> None:
-    found = only(check(["/chater"]))
-    assert found.text.endswith("; there is /chatter")
-    found = only(check(["/listener2", "/nothing"])[:1])
-    assert "/listener" in found.text
+    finding = only(check(["/chater"]))
+    assert finding.text.endswith("; there is /chatter")
+    finding = only(check(["/listener2", "/nothing"])[:1])
+    assert "/listener" in finding.text
 
 
 def test_a_name_without_its_namespace() -> None:
@@ -119,22 +119,22 @@ def test_a_name_without_its_namespace() -> None:
     ],
 )
 def test_a_topic_with_one_side_only(graph: SystemState, text: str) -> None:
-    found = only(check(["/chatter"], graph=graph))
-    assert found.text == text
-    assert found.fix.startswith("there is also /ns/chatter: a namespace or remapping?")
+    finding = only(check(["/chatter"], graph=graph))
+    assert finding.text == text
+    assert finding.fix.startswith("there is also /ns/chatter: a namespace or remapping?")
 
 
 def test_the_lonely_topics_of_a_node_are_no_error() -> None:
     graph = SystemState({"/chatter": ["/talker"]}, {}, {})
-    (found,) = check(["/talker"], graph=graph)
-    assert (found.subject, found.severity) == ("/chatter", Severity.INFO)
+    (finding,) = check(["/talker"], graph=graph)
+    assert (finding.subject, finding.severity) == ("/chatter", Severity.INFO)
 
 
 def test_nodes_with_nothing_in_common() -> None:
     graph = SystemState({"/a": ["/talker"]}, {"/b": ["/listener"]}, {})
-    found = only(check(["/talker", "/listener"], graph=graph))
-    assert found.subject == "/talker and /listener"
-    assert found.fix.startswith("compare: rosnode info /talker /listener")
+    finding = only(check(["/talker", "/listener"], graph=graph))
+    assert finding.subject == "/talker and /listener"
+    assert finding.fix.startswith("compare: rosnode info /talker /listener")
 
 
 def test_a_topic_that_a_node_has_nothing_to_do_with() -> None:
@@ -147,8 +147,8 @@ def test_a_topic_that_a_node_has_nothing_to_do_with() -> None:
 
 def test_a_connected_pair_with_what_it_moves() -> None:
     status = make_status(make_node(connections=[make_connection()]))
-    (found,) = check(["/chatter"], status=status)
-    assert (found.severity, found.text) == (
+    (finding,) = check(["/chatter"], status=status)
+    assert (finding.severity, finding.text) == (
         Severity.OK,
         "connected, 3.4 MB so far, 1.2 kB/s just now",
     )
@@ -159,8 +159,8 @@ def test_the_subscribers_word_counts_where_the_publisher_cannot_be_asked() -> No
     nodes = by_name(
         talker(report=None), listener(report=SlaveReport({}, {"/chatter": STRING}, peers))
     )
-    (found,) = check(["/chatter"], nodes=nodes)
-    assert found.text == "connected"
+    (finding,) = check(["/chatter"], nodes=nodes)
+    assert finding.text == "connected"
 
 
 def test_the_publishers_word_counts_more() -> None:
@@ -172,7 +172,7 @@ def test_the_publishers_word_counts_more() -> None:
 def test_a_node_that_cannot_be_reached() -> None:
     status = make_status(make_node(state="silent"))
     assert "/talker can't be reached" in apart(silent_talker(), listener(), status=status).text
-    taker = listener(attempt=Attempt(Reach.SILENT), report=None)
+    taker = listener(attempt=Attempt(ReachOutcome.SILENT), report=None)
     assert "/listener can't be reached" in apart(silent_talker(), taker).text
     gone = silent_talker(uri="http://robot-host:45050/10.0.0.9:1/")
     assert "/talker can't be reached" in apart(gone, listener()).text
@@ -187,8 +187,8 @@ def test_nodes_that_deny_what_the_master_says() -> None:
 
 def test_types_that_differ() -> None:
     taker = listener(report=SlaveReport({}, {"/chatter": "std_msgs/Int32"}))
-    found = apart(silent_talker(), taker)
-    assert "types differ, std_msgs/String and std_msgs/Int32" in found.text
+    finding = apart(silent_talker(), taker)
+    assert "types differ, std_msgs/String and std_msgs/Int32" in finding.text
 
 
 def test_any_type_fits_all() -> None:
@@ -197,60 +197,61 @@ def test_any_type_fits_all() -> None:
 
 
 def test_a_subscriber_outside_that_does_not_come() -> None:
-    found = apart(silent_talker(), listener())
-    assert "/listener has not connected to robot-host:45000" in found.text
-    assert found.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
+    finding = apart(silent_talker(), listener())
+    assert "/listener has not connected to robot-host:45000" in finding.text
+    assert finding.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
 
 
 def subscriber_inside(**settings: str | bool) -> DoctorFinding:
     """A publisher outside that serves its topic, and a subscriber behind the proxy."""
-    giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))
-    ports = {("/talker", "/chatter"): ("192.168.0.9:5000", Attempt(Reach.ANSWERED))}
+    giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(ReachOutcome.ANSWERED))
+    ports = {("/talker", "/chatter"): ("192.168.0.9:5000", Attempt(ReachOutcome.ANSWERED))}
     status = make_status(make_node("/listener"), settings=settings)
     return apart(giver, listener(uri=INSIDE_URI), data_ports=ports, status=status)
 
 
 def test_a_subscriber_inside_that_has_no_route_outwards() -> None:
-    found = subscriber_inside()
+    finding = subscriber_inside()
     assert (
-        "/listener, behind the proxy, has not connected to 192.168.0.9:5000 by itself" in found.text
+        "/listener, behind the proxy, has not connected to 192.168.0.9:5000 by itself"
+        in finding.text
     )
-    assert found.fix.startswith("where /listener runs: nc -vz 192.168.0.9 5000; if there is no")
-    assert "--direction both" in found.fix
+    assert finding.fix.startswith("where /listener runs: nc -vz 192.168.0.9 5000; if there is no")
+    assert "--direction both" in finding.fix
 
 
 def test_a_subscriber_inside_that_has_the_proxy_as_its_way() -> None:
-    found = subscriber_inside(direction="both")
-    assert f"has not connected to the proxy's port for {OUTSIDE_URI}" in found.text
-    assert "--direction" not in found.fix
-    assert "if it wants UDP alone: --udp" in found.fix
+    finding = subscriber_inside(direction="both")
+    assert f"has not connected to the proxy's port for {OUTSIDE_URI}" in finding.text
+    assert "--direction" not in finding.fix
+    assert "if it wants UDP alone: --udp" in finding.fix
     assert "--udp" not in subscriber_inside(direction="both", udp=True).fix
 
 
 def outside_pair(data_port: tuple[str, Attempt]) -> DoctorFinding:
     """A publisher outside whose data port was tried."""
-    giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))
+    giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(ReachOutcome.ANSWERED))
     ports = {("/talker", "/chatter"): data_port}
     return apart(giver, listener(), data_ports=ports)
 
 
 def test_a_data_port_that_cannot_be_reached() -> None:
-    found = outside_pair(("laptop:5000", Attempt(Reach.UNRESOLVABLE)))
-    assert "/talker gives laptop:5000 as its data port, host name unknown" in found.text
-    assert "ROS_IP=ADDRESS" in found.fix
-    found = outside_pair(("", Attempt(Reach.STRANGER, "no TCPROS address")))
-    assert "gives nothing as its data port" in found.text
-    assert "(no TCPROS address)" in found.text
+    finding = outside_pair(("laptop:5000", Attempt(ReachOutcome.UNRESOLVABLE)))
+    assert "/talker gives laptop:5000 as its data port, host name unknown" in finding.text
+    assert "ROS_IP=ADDRESS" in finding.fix
+    finding = outside_pair(("", Attempt(ReachOutcome.STRANGER, "no TCPROS address")))
+    assert "gives nothing as its data port" in finding.text
+    assert "(no TCPROS address)" in finding.text
 
 
 def test_a_data_port_on_loopback() -> None:
-    found = outside_pair(("127.0.0.1:5000", Attempt(Reach.ANSWERED)))
-    assert "which is loopback" in found.text
+    finding = outside_pair(("127.0.0.1:5000", Attempt(ReachOutcome.ANSWERED)))
+    assert "which is loopback" in finding.text
 
 
 def test_what_is_left_is_the_message_definition() -> None:
-    found = outside_pair(("192.168.0.9:5000", Attempt(Reach.ANSWERED)))
-    assert "md5sum" in found.text
+    finding = outside_pair(("192.168.0.9:5000", Attempt(ReachOutcome.ANSWERED)))
+    assert "md5sum" in finding.text
 
 
 SERVICE_GRAPH = SystemState({}, {}, {"/add": ["/talker"]})
@@ -258,21 +259,21 @@ SERVICE_GRAPH = SystemState({}, {}, {"/add": ["/talker"]})
 
 def service(attempt: Attempt) -> DoctorFinding:
     """The finding on a service."""
-    (found,) = check(
+    (finding,) = check(
         ["/add"],
         graph=SERVICE_GRAPH,
         service_uris={"/add": "rosrpc://robot-host:45000"},
         services={"/add": attempt},
     )
-    return found
+    return finding
 
 
 def test_services() -> None:
-    assert service(Attempt(Reach.ANSWERED)).severity is Severity.OK
-    dead = service(Attempt(Reach.REFUSED))
+    assert service(Attempt(ReachOutcome.ANSWERED)).severity is Severity.OK
+    dead = service(Attempt(ReachOutcome.REFUSED))
     assert dead.text == "/talker provides it at rosrpc://robot-host:45000: connection refused"
     assert "rosnode cleanup" in dead.fix
-    assert "ROS_IP" in service(Attempt(Reach.UNRESOLVABLE)).fix
+    assert "ROS_IP" in service(Attempt(ReachOutcome.UNRESOLVABLE)).fix
 
 
 def test_no_facts_at_all() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
-from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach
+from rosproxy.doctor.facts import Attempt, DoctorFacts, ReachOutcome
 from rosproxy.doctor.rules import proxy as proxy_rules
 from tests.unit.doctor.cases import (
     make_facts,
@@ -35,10 +35,10 @@ def test_a_sound_proxy() -> None:
 
 
 def test_no_proxy_answers() -> None:
-    found = only(check(without_proxy()))
-    assert (found.severity, found.check) == (Severity.ERROR, "admin")
-    assert "no rosproxy answers" in found.text
-    assert "docker exec CONTAINER rosproxy doctor" in found.fix
+    finding = only(check(without_proxy()))
+    assert (finding.severity, finding.check) == (Severity.ERROR, "admin")
+    assert "no rosproxy answers" in finding.text
+    assert "docker exec CONTAINER rosproxy doctor" in finding.fix
 
 
 def test_a_look_from_outside_does_not_ask_for_a_proxy() -> None:
@@ -55,49 +55,51 @@ def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
 @pytest.mark.parametrize(
     ("master", "text", "fix"),
     [
-        (make_master(Reach.REFUSED), "no roscore runs there", "on robot: roscore -p 11311"),
-        (make_master(Reach.SILENT), "does not answer", "nc -vz robot 11311"),
+        (make_master(ReachOutcome.REFUSED), "no roscore runs there", "on robot: roscore -p 11311"),
+        (make_master(ReachOutcome.SILENT), "does not answer", "nc -vz robot 11311"),
         (
-            make_master(Reach.UNRESOLVABLE, addresses=()),
+            make_master(ReachOutcome.UNRESOLVABLE, addresses=()),
             "the host name robot can't be resolved here",
             "docker run --add-host robot:ADDRESS",
         ),
         (
             make_master(
-                Reach.STRANGER, "HTTP status 404", uri="http://robot:11311/x", at_root=True
+                ReachOutcome.STRANGER, "HTTP status 404", uri="http://robot:11311/x", at_root=True
             ),
             "not at the path /x (it knows only / and /RPC2)",
             "--master-uri http://robot:11311/",
         ),
         (
-            make_master(Reach.STRANGER, "HTTP status 404"),
+            make_master(ReachOutcome.STRANGER, "HTTP status 404"),
             "is no ROS master (HTTP status 404)",
             "--master-uri http://HOST:11311",
         ),
         (
-            make_master(Reach.STRANGER, is_this_proxy=True),
+            make_master(ReachOutcome.STRANGER, is_this_proxy=True),
             "leads back to this proxy itself",
             "--master-uri http://HOST:11311",
         ),
         (
-            make_master(Reach.REFUSED, uri="http://localhost:11311", addresses=("127.0.0.1",)),
+            make_master(
+                ReachOutcome.REFUSED, uri="http://localhost:11311", addresses=("127.0.0.1",)
+            ),
             "In a container localhost is the container itself",
             "--master-uri http://ADDRESS:11311",
         ),
     ],
 )
 def test_the_master_is_not_there(master: Any, text: str, fix: str) -> None:
-    found = only(check(make_facts(master=master, graph=None)))
-    assert (found.severity, found.check) == (Severity.ERROR, "master")
-    assert text in found.text
-    assert fix in found.fix
+    finding = only(check(make_facts(master=master, graph=None)))
+    assert (finding.severity, finding.check) == (Severity.ERROR, "master")
+    assert text in finding.text
+    assert fix in finding.fix
 
 
 def test_the_master_answers_the_doctor_but_not_the_proxy() -> None:
     status = make_status(make_node(), master={"up": False, "error": "no answer in time"})
-    found = only(check(make_facts(status=status)))
-    assert found.severity is Severity.WARNING
-    assert "answers here, but the proxy says: no answer in time" in found.text
+    finding = only(check(make_facts(status=status)))
+    assert finding.severity is Severity.WARNING
+    assert "answers here, but the proxy says: no answer in time" in finding.text
 
 
 def test_a_proxy_that_has_not_asked_its_master_yet_is_sound() -> None:
@@ -110,9 +112,9 @@ def test_a_master_that_keeps_its_state_to_itself() -> None:
 
 
 def test_a_loopback_address_is_advertised() -> None:
-    found = only(of("advertised host", make_facts(advertise_host="127.0.0.1")))
-    assert found.severity is Severity.ERROR
-    assert "--advertise-host ADDRESS" in found.fix
+    finding = only(of("advertised host", make_facts(advertise_host="127.0.0.1")))
+    assert finding.severity is Severity.ERROR
+    assert "--advertise-host ADDRESS" in finding.fix
 
 
 @pytest.mark.parametrize(
@@ -127,8 +129,8 @@ def test_loopback_is_fine_where_all_is_on_one_machine(master: Any) -> None:
 
 
 def test_an_advertised_name_that_is_unknown_here() -> None:
-    found = only(of("advertised host", without_proxy(advertised_addresses=())))
-    assert "robot-host can't be resolved here" in found.text
+    finding = only(of("advertised host", without_proxy(advertised_addresses=())))
+    assert "robot-host can't be resolved here" in finding.text
 
 
 @pytest.mark.parametrize(
@@ -165,22 +167,22 @@ def test_tries_at_the_published_range(
     outcome: tuple[str, str], severity: Severity, text: str, fix: str
 ) -> None:
     status = make_status(make_node(), ports={"advertise": "46000-46099"})
-    (found,) = of("published range", make_facts(status=status, probe=probes(outcome, outcome)))
-    assert found.severity is severity
-    assert text in found.text
-    assert fix in found.fix
+    (finding,) = of("published range", make_facts(status=status, probe=probes(outcome, outcome)))
+    assert finding.severity is severity
+    assert text in finding.text
+    assert fix in finding.fix
 
 
 def test_a_range_that_is_published_in_part() -> None:
     facts = make_facts(probe=probes(("ok", "ok"), ("refused", "missed")))
-    found = only(of("published range", facts))
-    assert found.text.startswith("robot-host, port 45099: nothing listens there")
-    assert found.fix == "publish the whole range: docker run -p 45000-45099:45000-45099"
+    finding = only(of("published range", facts))
+    assert finding.text.startswith("robot-host, port 45099: nothing listens there")
+    assert finding.fix == "publish the whole range: docker run -p 45000-45099:45000-45099"
 
 
 def test_a_range_that_could_not_be_tried() -> None:
-    found = only(of("published range", make_facts(probe=None, probe_error="HTTP 500")))
-    assert (found.severity, found.text) == (Severity.WARNING, "not tried: HTTP 500")
+    finding = only(of("published range", make_facts(probe=None, probe_error="HTTP 500")))
+    assert (finding.severity, finding.text) == (Severity.WARNING, "not tried: HTTP 500")
 
 
 def test_no_port_is_left_to_try() -> None:
@@ -196,23 +198,23 @@ def test_no_port_is_left_to_try() -> None:
     ],
 )
 def test_how_many_ports_are_left(ports: dict[str, int], severity: Severity, text: str) -> None:
-    (found,) = of("ports", make_facts(status=make_status(ports=ports)))
-    assert found.severity is severity
-    assert text in found.text
+    (finding,) = of("ports", make_facts(status=make_status(ports=ports)))
+    assert finding.severity is severity
+    assert text in finding.text
 
 
 def test_ports_that_other_programs_hold() -> None:
-    found = only(of("ports", make_facts(status=make_status(ports={"blocked": 1, "free": 99}))))
-    assert found.text == "1 port of the range 45000-45099 held by other programs"
-    assert "ss -ltnp 'sport >= :45000 and sport <= :45099'" in found.fix
+    finding = only(of("ports", make_facts(status=make_status(ports={"blocked": 1, "free": 99}))))
+    assert finding.text == "1 port of the range 45000-45099 held by other programs"
+    assert "ss -ltnp 'sport >= :45000 and sport <= :45099'" in finding.fix
 
 
 @pytest.mark.parametrize(
     ("attempt", "outcome", "severity"),
     [
-        (Attempt(Reach.ANSWERED), ("ok", "ok"), Severity.OK),
-        (Attempt(Reach.REFUSED), ("ok", "ok"), Severity.ERROR),
-        (Attempt(Reach.REFUSED), ("refused", "ok"), Severity.WARNING),
+        (Attempt(ReachOutcome.ANSWERED), ("ok", "ok"), Severity.OK),
+        (Attempt(ReachOutcome.REFUSED), ("ok", "ok"), Severity.ERROR),
+        (Attempt(ReachOutcome.REFUSED), ("refused", "ok"), Severity.WARNING),
     ],
 )
 def test_the_published_master(
@@ -220,6 +222,6 @@ def test_the_published_master(
 ) -> None:
     status = make_status(make_node(), settings={"publish_master": 11411})
     facts = make_facts(status=status, published_master=attempt, probe=probes(outcome, outcome))
-    (found,) = of("published master", facts)
-    assert found.severity is severity
-    assert "http://robot-host:11411" in found.text
+    (finding,) = of("published master", facts)
+    assert finding.severity is severity
+    assert "http://robot-host:11411" in finding.text

@@ -15,9 +15,9 @@ def test_graph() -> None:
 
 @pytest.mark.parametrize("state", [None, "x", 7, [], [1, 2, 3], [[["/t"]], [[1, []]], {}]])
 def test_a_broken_graph_is_an_empty_one(state: Any) -> None:
-    found = system_state(state)
-    assert not found.topics
-    assert not found.names()
+    graph = system_state(state)
+    assert not graph.topics
+    assert not graph.names()
 
 
 def test_words() -> None:
@@ -43,7 +43,7 @@ def test_a_connection_that_is_none_is_not_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "where"),
+    ("answer", "expected"),
     [
         (["TCPROS", "a", 5], HostPort("a", 5)),
         (["TCPROS", "a", 0], None),
@@ -54,5 +54,5 @@ def test_a_connection_that_is_none_is_not_counted() -> None:
         (0, None),
     ],
 )
-def test_data_port(answer: Any, where: HostPort | None) -> None:
-    assert data_port(answer) == where
+def test_data_port(answer: Any, expected: HostPort | None) -> None:
+    assert data_port(answer) == expected

@@ -21,7 +21,7 @@ INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
 OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")
 
 
-def found(
+def diagnose_domain(
     domain: DomainStatus,
     *names: str,
     heard: tuple[HeardParticipant, ...] = (),
@@ -43,24 +43,29 @@ def found(
         heard_participants=heard,
     )
     findings = diagnose(facts)
-    assert failed(findings) == any(one.severity is Severity.ERROR for one in findings)
-    return {(one.check, one.subject): (one.severity, one.text + one.fix) for one in findings}
+    assert failed(findings) == any(finding.severity is Severity.ERROR for finding in findings)
+    return {
+        (finding.check, finding.subject): (finding.severity, finding.text + finding.fix)
+        for finding in findings
+    }
 
 
 def test_all_is_well() -> None:
-    told = found(DomainStatus(peers=("robot",), inside=(INSIDE,), outside=(OUTSIDE,)))
+    told = diagnose_domain(DomainStatus(peers=("robot",), inside=(INSIDE,), outside=(OUTSIDE,)))
     assert {severity for severity, _ in told.values()} == {Severity.OK}
     assert "1 participant of Fast DDS" in told["inside", "domain 0"][1]
 
 
 def test_who_tells_nobody_is_told_what_to_give() -> None:
-    severity, text = found(DomainStatus(inside=(INSIDE,)))["announcing", "domain 0"]
+    severity, text = diagnose_domain(DomainStatus(inside=(INSIDE,)))["announcing", "domain 0"]
     assert severity is Severity.ERROR
     assert "--ros2-peer" in text
 
 
 def test_who_hears_nobody_is_told_where_to_look() -> None:
-    told = found(DomainStatus(domain=7, ear="172.30.0.1:7500", discovery="10.0.0.1:11400"))
+    told = diagnose_domain(
+        DomainStatus(domain=7, ear="172.30.0.1:7500", discovery="10.0.0.1:11400")
+    )
     assert "ROS_DOMAIN_ID=7" in told["inside", "domain 7"][1]
     assert "10.0.0.1:11400" in told["outside", "domain 7"][1]
 
@@ -68,7 +73,7 @@ def test_who_hears_nobody_is_told_where_to_look() -> None:
 def test_a_range_that_is_too_short_and_a_port_that_is_not_reached() -> None:
     short = ParticipantStatus("01.0f.cc", "172.30.0.6", problem="no port of 11400-11403 is free")
     unheard = ParticipantStatus("01.10.dd", "10.0.0.8", proven=False)
-    told = found(
+    told = diagnose_domain(
         DomainStatus(
             peers=("robot",), discovery="10.0.0.1:11400", inside=(short,), outside=(unheard,)
         )
@@ -87,14 +92,14 @@ MISMATCH = MismatchStatus(
 
 
 def test_a_topic_that_matches() -> None:
-    severity, text = found(BOTH, "/chatter")["topic", "/chatter"]
+    severity, text = diagnose_domain(BOTH, "/chatter")["topic", "/chatter"]
     assert severity is Severity.OK
-    for part in ("01.0f.aa at 172.30.0.5", "01.10.bb at 10.0.0.9", "they match"):
-        assert part in text
+    for expected in ("01.0f.aa at 172.30.0.5", "01.10.bb at 10.0.0.9", "they match"):
+        assert expected in text
 
 
 def test_a_topic_that_does_not_match() -> None:
-    told = found(replace(BOTH, mismatches=(MISMATCH,)), "/scan", "/chatter")
+    told = diagnose_domain(replace(BOTH, mismatches=(MISMATCH,)), "/scan", "/chatter")
     assert told["qos", "topic /scan"][0] is Severity.ERROR
     assert ("topic", "/scan") not in told
     assert ("topic", "/chatter") in told
@@ -102,7 +107,7 @@ def test_a_topic_that_does_not_match() -> None:
 
 def test_who_can_t_be_reached_matches_nobody() -> None:
     lost = replace(BOTH, inside=(replace(TALKER, locator_fault="tcp"),))
-    told = found(lost, "/chatter")
+    told = diagnose_domain(lost, "/chatter")
     assert told["transport", "01.0f.aa"][0] is Severity.ERROR
     assert ("topic", "/chatter") not in told
 
@@ -116,23 +121,23 @@ def test_who_can_t_be_reached_matches_nobody() -> None:
     ],
 )
 def test_a_topic_that_lacks_a_side(domain: DomainStatus, said: str) -> None:
-    severity, text = found(domain, "/chatter")["topic", "/chatter"]
+    severity, text = diagnose_domain(domain, "/chatter")["topic", "/chatter"]
     assert severity is Severity.INFO
     assert said in text
 
 
 def test_who_serves_a_service() -> None:
-    severity, text = found(BOTH, "/add")["service", "/add"]
+    severity, text = diagnose_domain(BOTH, "/add")["service", "/add"]
     assert severity is Severity.OK
     assert "served by 01.0f.aa at 172.30.0.5" in text
 
 
 def test_a_name_that_nobody_has() -> None:
-    assert found(BOTH, "/chater")["name", "/chater"][0] is Severity.ERROR
+    assert diagnose_domain(BOTH, "/chater")["name", "/chater"][0] is Severity.ERROR
 
 
 def test_who_is_on_a_network_inside_and_not_heard() -> None:
-    told = found(
+    told = diagnose_domain(
         BOTH,
         heard=(
             HeardParticipant(0, "01.0f.aa", "172.30.0.5", "Fast DDS"),
@@ -153,18 +158,20 @@ def test_who_is_on_a_network_inside_and_not_heard() -> None:
 
 def test_a_proxy_that_has_just_started_may_know_them_and_not_tell() -> None:
     unknown = HeardParticipant(0, "01.0f.cc", "172.30.0.6", "Fast DDS")
-    assert not any(name == "01.0f.cc" for _, name in found(BOTH, heard=(unknown,), uptime=3.0))
+    assert not any(
+        name == "01.0f.cc" for _, name in diagnose_domain(BOTH, heard=(unknown,), uptime=3.0)
+    )
 
 
 def test_what_was_refused_lately_is_told() -> None:
     text = "from 10.0.0.8: it announces no locator for discovery at 10.0.0.8 (tcp)"
     recent = ProblemStatus(10.0, "refused: no locator", text)
     old = ProblemStatus(1000.0, "refused: not a peer", "from 10.0.0.7")
-    told = found(BOTH, problems=(recent, old))
+    told = diagnose_domain(BOTH, problems=(recent, old))
     assert told["refused", "refused: no locator"][0] is Severity.WARNING
     assert ("refused", "refused: not a peer") not in told
 
 
 def test_nothing_is_heard_of_zenoh() -> None:
-    told = found(DomainStatus(peers=("robot",)))["inside", "domain 0"][1]
+    told = diagnose_domain(DomainStatus(peers=("robot",)))["inside", "domain 0"][1]
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in told

@@ -39,8 +39,8 @@ def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
 STEPS = st.tuples(st.integers(0, 1000), st.integers(0, 1000), st.integers(0, 10))
 
 
-def added(one: Counts, other: Iterable[int]) -> Counts:
-    return Counts(*map(sum, zip(one, other, strict=True)))
+def added(counts: Counts, other: Iterable[int]) -> Counts:
+    return Counts(*map(sum, zip(counts, other, strict=True)))
 
 
 @given(st.lists(STEPS))

@@ -81,10 +81,10 @@ def test_changes_lead_from_what_there_is_to_what_is_wanted(
     now: dict[int, HostPort], wanted: dict[int, HostPort]
 ) -> None:
     change = changes(now, wanted)
-    after = {port: where for port, where in now.items() if port not in change.removed}
+    after = {port: target for port, target in now.items() if port not in change.removed}
     assert not set(after) & set(change.added)
     assert {**after, **change.added} == wanted
-    assert all(now[port] == where for port, where in change.removed.items())
+    assert all(now[port] == target for port, target in change.removed.items())
     assert bool(change) == (now != wanted)
 
 

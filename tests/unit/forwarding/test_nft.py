@@ -30,16 +30,18 @@ FOUR, SIX = HostPort("10.0.0.5", 50000), HostPort("fd00::5", 50001)
 
 def elements(document: str, verb: str) -> dict[str, list[str]]:
     """The elements that a document adds or deletes, by map and set."""
-    found = re.findall(rf"^{verb} element inet rosproxy-11311 (\w+) {{ (.*) }}$", document, re.M)
-    return {name: text.split(", ") for name, text in found}
+    statements = re.findall(
+        rf"^{verb} element inet rosproxy-11311 (\w+) {{ (.*) }}$", document, re.M
+    )
+    return {name: text.split(", ") for name, text in statements}
 
 
 def listing(document: str) -> str:
     """What ``nft -j list table`` prints after a document that makes the whole table."""
-    held = elements(document, "add")
+    elements_by_name = elements(document, "add")
     objects: list[Any] = [{"metainfo": {"version": "1.0.6"}}]
     for kind, name in re.findall(r"^  (map|set) (\w+) ", document, re.M):
-        pairs = [text.split(" : ") for text in held.get(name, []) if kind == "map"]
+        pairs = [text.split(" : ") for text in elements_by_name.get(name, []) if kind == "map"]
         shown = [[int(key), int(v) if v.isdigit() else v] for key, v in pairs]
         objects.append({kind: {"name": name, "table": "rosproxy-11311", "elem": shown}})
     return json.dumps({"nftables": objects})

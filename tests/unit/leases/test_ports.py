@@ -90,20 +90,20 @@ STEPS = st.sampled_from(["take", "give", "block", "unblock"])
 
 @given(st.lists(st.tuples(STEPS, st.integers(0, 3))))
 def test_every_port_is_free_held_or_blocked(steps: list[tuple[str, int]]) -> None:
-    pool, held, blocked = PortPool(RANGE), set[int](), set[int]()
-    for what, index in steps:
+    pool, taken_ports, blocked = PortPool(RANGE), set[int](), set[int]()
+    for step, index in steps:
         port = RANGE.first + index
-        if what == "take" and (taken := pool.take(port)) is not None:
-            assert taken not in held | blocked
-            held.add(taken)
-        elif what == "give" and port in held:
+        if step == "take" and (taken := pool.take(port)) is not None:
+            assert taken not in taken_ports | blocked
+            taken_ports.add(taken)
+        elif step == "give" and port in taken_ports:
             pool.give_back(port)
-            held.discard(port)
-        elif what == "block":
+            taken_ports.discard(port)
+        elif step == "block":
             pool.block(port)
             blocked.add(port)
-        elif what == "unblock" and port in blocked - held:
+        elif step == "unblock" and port in blocked - taken_ports:
             pool.unblock(port)
             blocked.discard(port)
-        assert pool.free == len(RANGE) - len(held | blocked)
+        assert pool.free == len(RANGE) - len(taken_ports | blocked)
         assert pool.blocked == blocked

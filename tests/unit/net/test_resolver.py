@@ -50,9 +50,9 @@ async def server(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[NameServer]:
 async def find(host: str, source: str = "") -> list[str]:
     """What a name that is answered leads to, however busy the machine."""
     async with asyncio.timeout(30):
-        while not (found := await resolve(host, source)):
+        while not (addresses := await resolve(host, source)):
             pass
-    return found
+    return addresses
 
 
 async def hang(source: str, count: int) -> None:

@@ -7,24 +7,24 @@ from rosproxy.net.signs import MOST, Sign, overlapping_proxies, publish_sign
 
 
 def test_a_sign_is_read_while_it_stands_and_where_the_ports_overlap() -> None:
-    one, two = HostPort("127.0.0.1", 61312), HostPort("::1", 61313)
-    sign = publish_sign(("2", "1"), 61000, 61009, one)
+    own_admin, other_admin = HostPort("127.0.0.1", 61312), HostPort("::1", 61313)
+    sign = publish_sign(("2", "1"), 61000, 61009, own_admin)
     assert sign
     with closing(sign):
-        assert overlapping_proxies("1", 61009, 61020, two) == [
+        assert overlapping_proxies("1", 61009, 61020, other_admin) == [
             Sign("12", 61000, 61009, "127.0.0.1:61312")
         ]
-        assert overlapping_proxies("2", 60990, 61000, two)
-        assert overlapping_proxies("1", 61010, 61020, two) == []
-        assert overlapping_proxies("1", 61000, 61009, one) == [], "its own"
-        own = publish_sign(("1",), 61000, 61009, two)
+        assert overlapping_proxies("2", 60990, 61000, other_admin)
+        assert overlapping_proxies("1", 61010, 61020, other_admin) == []
+        assert overlapping_proxies("1", 61000, 61009, own_admin) == [], "its own"
+        own = publish_sign(("1",), 61000, 61009, other_admin)
         assert own
         with closing(own):
-            assert [each.admin for each in overlapping_proxies("1", 61000, 61009, one)] == [
+            assert [proxy.admin for proxy in overlapping_proxies("1", 61000, 61009, own_admin)] == [
                 "[::1]:61313"
             ]
             assert len(overlapping_proxies("2", 61000, 61009, HostPort("h", 1))) == 1
-    assert overlapping_proxies("1", 61000, 61009, two) == []
+    assert overlapping_proxies("1", 61000, 61009, other_admin) == []
 
 
 def test_whoever_puts_up_many_signs_is_not_told_at_length() -> None:
@@ -34,6 +34,6 @@ def test_whoever_puts_up_many_signs_is_not_told_at_length() -> None:
                 sign = publish_sign(("1",), 61100, 61109, HostPort(host, 61400 + number))
                 assert sign
                 stack.enter_context(closing(sign))
-        found = overlapping_proxies("1", 61100, 61109, HostPort("127.0.0.1", 1))
-        assert len(found) == MOST
-        assert {each.admin.partition(":")[0] for each in found} == {"127.0.0.1"}
+        proxies = overlapping_proxies("1", 61100, 61109, HostPort("127.0.0.1", 1))
+        assert len(proxies) == MOST
+        assert {proxy.admin.partition(":")[0] for proxy in proxies} == {"127.0.0.1"}

@@ -47,7 +47,7 @@ def test_the_first_range_that_is_free(
         return
     with pytest.raises(PortsExhausted) as error:
         negotiate(count, WINDOW, blocked, ranges)
-    singles = sum(free(one, blocked, ranges) for one in every(1))
+    singles = sum(free(ports, blocked, ranges) for ports in every(1))
     assert f"{singles} of 40 are free" in str(error.value)
     longest = next(
         (n for n in range(count, 0, -1) if any(free(r, blocked, ranges) for r in every(n))), 0
@@ -77,9 +77,9 @@ def test_free_means_that_no_port_is_held(
 
 
 @given(RANGE, RANGE)
-def test_overlap(one: PortRange, other: PortRange) -> None:
-    assert overlap(one, other) == bool(set(one.ports()) & set(other.ports()))
-    assert within(one, other) == (set(one.ports()) <= set(other.ports()))
+def test_overlap(first: PortRange, second: PortRange) -> None:
+    assert overlap(first, second) == bool(set(first.ports()) & set(second.ports()))
+    assert within(first, second) == (set(first.ports()) <= set(second.ports()))
 
 
 def test_the_error_says_how_many_there_are() -> None:

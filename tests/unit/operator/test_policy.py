@@ -87,23 +87,23 @@ async def proxy(*routes: web.RouteDef) -> AsyncIterator[tuple[ProxyClient, HostP
 
 async def test_a_proxy_is_told_all_layers() -> None:
     answers = Answers()
-    async with proxy(web.post("/policy", answers.policy)) as (client, where):
-        await client.policy(where, "token", [OWN])
+    async with proxy(web.post("/policy", answers.policy)) as (client, admin):
+        await client.policy(admin, "token", [OWN])
     assert answers.told == [("Bearer token", {"layers": layers_as_json([OWN])})]
 
 
 async def test_one_of_a_former_release_has_no_policy_at_all() -> None:
-    async with proxy() as (client, where):
-        await client.policy(where, "token", [])
+    async with proxy() as (client, admin):
+        await client.policy(admin, "token", [])
         with pytest.raises(PolicyRefused, match="its image is that of a former release"):
-            await client.policy(where, "token", [OWN])
+            await client.policy(admin, "token", [OWN])
 
 
 async def test_it_is_in_force_before_the_master_has_heard() -> None:
     answers = Answers()
     answers.status = 503
-    async with proxy(web.post("/policy", answers.policy)) as (client, where):
-        await client.policy(where, "token", [OWN])
+    async with proxy(web.post("/policy", answers.policy)) as (client, admin):
+        await client.policy(admin, "token", [OWN])
     assert len(answers.told) == 1
 
 
@@ -111,8 +111,8 @@ async def test_it_is_in_force_before_the_master_has_heard() -> None:
 async def test_one_that_does_not_take_it(status: int, kind: type[ProxyError]) -> None:
     answers = Answers()
     answers.status, answers.text = status, "layer 'x': too long"
-    async with proxy(web.post("/policy", answers.policy)) as (client, where):
+    async with proxy(web.post("/policy", answers.policy)) as (client, admin):
         with pytest.raises(ProxyError, match="layer 'x': too long") as error:
-            await client.policy(where, "token", [OWN])
+            await client.policy(admin, "token", [OWN])
     assert type(error.value) is kind
     assert error.value.status == status

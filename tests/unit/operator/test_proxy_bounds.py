@@ -43,11 +43,11 @@ def test_both_operators_have_the_options(command: str) -> None:
 
 def test_a_proxy_in_a_container_has_them() -> None:
     body = container_config(PROXY, replace(SETTINGS, proxy_bounds=BOUNDS), "t", "")
-    assert taken(settings_of(dict(one.split("=", 1) for one in body["Env"]))) == BOUNDS
+    assert taken(settings_of(dict(variable.split("=", 1) for variable in body["Env"]))) == BOUNDS
 
 
 def test_a_proxy_in_a_pod_has_them() -> None:
     settings = msgspec.structs.replace(objects.SETTINGS, proxy_bounds=BOUNDS)
     site = objects.site(objects.rosproxy(), objects.node())
     env = manifests.proxy_pod(site, settings)["spec"]["containers"][0]["env"]
-    assert taken(settings_of({one["name"]: one["value"] for one in env})) == BOUNDS
+    assert taken(settings_of({variable["name"]: variable["value"] for variable in env})) == BOUNDS

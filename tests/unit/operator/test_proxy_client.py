@@ -17,7 +17,7 @@ class Evil:
     def __init__(self) -> None:
         self.answer: Callable[[], web.Response] = web.Response
         self.asked: list[str] = []
-        self.where = HostPort("", 0)
+        self.admin = HostPort("", 0)
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         self.asked.append(request.path)
@@ -26,27 +26,27 @@ class Evil:
 
 @pytest.fixture
 async def evil() -> AsyncIterator[Evil]:
-    one, application = Evil(), web.Application()
-    application.router.add_route("*", "/{path:.*}", one.serve)
+    evil, application = Evil(), web.Application()
+    application.router.add_route("*", "/{path:.*}", evil.serve)
     runner = web.AppRunner(application)
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
-    one.where = HostPort(*runner.addresses[0])
-    yield one
+    evil.admin = HostPort(*runner.addresses[0])
+    yield evil
     await runner.cleanup()
 
 
 @pytest.fixture
 async def client() -> AsyncIterator[ProxyClient]:
-    one = ProxyClient()
-    yield one
-    await one.close()
+    client = ProxyClient()
+    yield client
+    await client.close()
 
 
 async def test_a_redirect_is_not_followed(evil: Evil, client: ProxyClient) -> None:
     evil.answer = lambda: web.Response(status=307, headers={"Location": "/secrets"})
     with pytest.raises(ProxyError, match="HTTP 307"):
-        await client.status(evil.where)
+        await client.status(evil.admin)
     assert evil.asked == ["/status"]
 
 
@@ -54,7 +54,7 @@ async def test_nothing_is_inflated(evil: Evil, client: ProxyClient) -> None:
     body = gzip.compress(b'{"nodes": []}')
     evil.answer = lambda: web.Response(body=body, headers={"Content-Encoding": "gzip"})
     with pytest.raises(ProxyError, match="as a rosproxy does"):
-        await client.status(evil.where)
+        await client.status(evil.admin)
 
 
 @pytest.mark.parametrize("status", [200, 500])
@@ -64,10 +64,10 @@ async def test_a_long_answer_is_not_read(
     monkeypatch.setattr(proxy_client, "LONGEST", 1000)
     evil.answer = lambda: web.Response(status=status, body=b"[" * 1001)
     with pytest.raises(ProxyError, match="as a rosproxy does"):
-        await client.status(evil.where)
+        await client.status(evil.admin)
 
 
 async def test_what_is_no_text_is_no_answer(evil: Evil, client: ProxyClient) -> None:
     evil.answer = lambda: web.Response(body=b"\xff\xfe", content_type="application/json")
     with pytest.raises(ProxyError, match="as a rosproxy does"):
-        await client.status(evil.where)
+        await client.status(evil.admin)

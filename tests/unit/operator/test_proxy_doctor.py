@@ -19,14 +19,14 @@ def test_findings_carry_the_proxys_name_and_the_operators_cure() -> None:
         error("advertised host", "advertised host", "leads nowhere", "--advertise-host ADDRESS"),
         error("node", "/talker", "is gone", "restart it"),
     ]
-    found = read_findings("proxy a", json.dumps(as_json(said)).encode(), CURES)
-    assert [one.subject for one in found] == [
+    findings = read_findings("proxy a", json.dumps(as_json(said)).encode(), CURES)
+    assert [finding.subject for finding in findings] == [
         "proxy a: proxy",
         "proxy a: advertised host",
         "proxy a: /talker",
     ]
-    assert "label rosproxy.advertise-host=ADDRESS" in found[1].fix
-    assert (found[2].severity, found[2].fix) == (Severity.ERROR, "restart it")
+    assert "label rosproxy.advertise-host=ADDRESS" in findings[1].fix
+    assert (findings[2].severity, findings[2].fix) == (Severity.ERROR, "restart it")
 
 
 @pytest.mark.parametrize(
@@ -37,14 +37,14 @@ def test_findings_carry_the_proxys_name_and_the_operators_cure() -> None:
     ],
 )
 def test_what_is_no_findings_is_told(said: bytes) -> None:
-    (found,) = read_findings("proxy a", said, {})
-    assert found.severity is Severity.WARNING
-    assert "nothing that can be read" in found.text
+    (finding,) = read_findings("proxy a", said, {})
+    assert finding.severity is Severity.WARNING
+    assert "nothing that can be read" in finding.text
 
 
 @given(st.binary() | st.recursive(st.none() | st.text(), st.lists).map(json.dumps).map(str.encode))
 def test_nothing_that_a_proxy_prints_makes_it_fail(said: bytes) -> None:
-    assert all(isinstance(one, DoctorFinding) for one in read_findings("a", said, {}))
+    assert all(isinstance(finding, DoctorFinding) for finding in read_findings("a", said, {}))
 
 
 def test_causes_of_a_host_come_before_what_follows_from_them() -> None:
@@ -58,8 +58,8 @@ def test_causes_of_a_host_come_before_what_follows_from_them() -> None:
         "containers": [{"name": "a", "proxy": "p"}],
         "actions": ["create p"],
     }
-    found = list(host_findings(status))
-    assert [one.subject for one in found] == [
+    findings = list(host_findings(status))
+    assert [finding.subject for finding in findings] == [
         "proxy image i",
         "network n",
         "master robot",
@@ -87,12 +87,12 @@ def test_a_cluster_tells_the_cause_and_no_text_twice() -> None:
         condition("Degraded", "True", "no master"),
         condition("MasterReachable", "False", "no master"),
     ]
-    found = cluster_findings([rosproxy(conditions=conditions)])
-    assert [one.text for one in found] == [
+    findings = cluster_findings([rosproxy(conditions=conditions)])
+    assert [finding.text for finding in findings] == [
         "MasterReachable is False: no master",
         "Ready is False: no proxy is ready",
     ]
-    assert found[0].fix == "kubectl -n lab describe rosproxy robot"
+    assert findings[0].fix == "kubectl -n lab describe rosproxy robot"
 
 
 def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:

@@ -14,7 +14,7 @@ def test_the_addresses_of_nodes() -> None:
         {},
         ended,
     ]
-    found = nodes_by_address(read_status({"nodes": nodes}))
-    names = {address: [one.nodes for one in there] for address, there in found.items()}
+    by_address = nodes_by_address(read_status({"nodes": nodes}))
+    names = {address: [node.nodes for node in statuses] for address, statuses in by_address.items()}
     assert names == {"172.18.0.6": [("/a",), ("/c",)], "fd00::1": [("/b",)]}
     assert not nodes_by_address(read_status({}))

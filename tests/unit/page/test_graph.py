@@ -7,8 +7,14 @@ from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import error
 from rosproxy.admin.status_document import ProxyStatus, read_status
-from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach, SlaveReport, SystemState
-from rosproxy.page.graph_document import Judged, graph_document, judge, relayed, topics_to_ask_about
+from rosproxy.doctor.facts import Attempt, DoctorFacts, ReachOutcome, SlaveReport, SystemState
+from rosproxy.page.graph_document import (
+    JudgedFacts,
+    graph_document,
+    judge,
+    relayed,
+    topics_to_ask_about,
+)
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import LONGEST, MOST_LINKS
 from tests.unit.doctor.cases import INSIDE_URI, by_name, listener, make_facts, talker
@@ -19,18 +25,20 @@ STRING = {"/chatter": "std_msgs/String"}
 KERNEL = {"plane": "kernel", "port": 45050, "connections": 1, "sent_rate": 10.0}
 
 
-def judged(**changes: Any) -> Judged:
+def judged(**changes: Any) -> JudgedFacts:
     """What the doctor says of a talker inside and a listener outside, asked about their topic."""
     facts = make_facts(names=("/chatter",), **changes)
     return judge(facts, judge(facts))
 
 
 def made(
-    found: Judged | None, status: dict[str, Any] | None = None, measures: Measures | None = None
+    judged: JudgedFacts | None,
+    status: dict[str, Any] | None = None,
+    measures: Measures | None = None,
 ) -> dict[str, Any]:
     """The document at the second 100, which was 1000 seconds since the epoch."""
-    known: ProxyStatus = read_status(status) if status else found.facts.proxy if found else ...  # type: ignore[assignment]
-    return graph_document(known, found, measures or Measures(), (), 100.0, 900.0)
+    proxy: ProxyStatus = read_status(status) if status else judged.facts.proxy if judged else ...  # type: ignore[assignment]
+    return graph_document(proxy, judged, measures or Measures(), (), 100.0, 900.0)
 
 
 def test_who_is_where() -> None:
@@ -81,12 +89,12 @@ def test_a_pair_that_is_apart_has_the_finding_and_the_command() -> None:
 
 def test_nodes_that_have_just_started_are_not_said_to_be_apart() -> None:
     silent = talker(report=SlaveReport(STRING))
-    found = judge(make_facts(names=("/chatter",), nodes=by_name(silent, listener())))
-    assert "state" not in made(found)["links"][LINK]
+    judgement = judge(make_facts(names=("/chatter",), nodes=by_name(silent, listener())))
+    assert "state" not in made(judgement)["links"][LINK]
 
 
 def test_a_node_that_is_wrong_is_the_first_cause_on_its_links() -> None:
-    gone = listener(attempt=Attempt(Reach.REFUSED), report=None)
+    gone = listener(attempt=Attempt(ReachOutcome.REFUSED), report=None)
     silent = talker(report=SlaveReport(STRING))
     document = made(judged(nodes=by_name(silent, gone)))
     assert document["nodes"]["/listener"]["state"] == "broken"
@@ -212,7 +220,11 @@ def test_a_master_that_is_away_is_told() -> None:
 )
 def test_names_are_short_and_harmless(hostile: str) -> None:
     status = make_status(make_node(publishes=[hostile]))
-    (link,) = [one for one in made(None, status)["links"].values() if one["kind"] == "topic"]
+    (link,) = [
+        candidate
+        for candidate in made(None, status)["links"].values()
+        if candidate["kind"] == "topic"
+    ]
     assert len(link["name"]) <= LONGEST
     assert link["name"].isprintable()
 

@@ -103,4 +103,4 @@ async def test_a_key_is_good_once_and_not_for_long() -> None:
 def test_so_many_are_good_at_a_time_and_the_oldest_goes() -> None:
     passes = ExpiringTokens(10.0, Clock())
     issued = [passes.issue() for _ in range(MOST + 1)]
-    assert [passes.is_good(one) for one in issued] == [False] + [True] * MOST
+    assert [passes.is_good(token) for token in issued] == [False] + [True] * MOST

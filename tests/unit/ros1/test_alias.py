@@ -137,8 +137,8 @@ def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
 
 
 def test_advice_says_what_to_do() -> None:
-    where, why = HostPort(ROBOT, 45000), "lies in --port-range 45000-45009"
-    text = make_stand_ins().advice(where, why, ADDRESS)
+    address, reason = HostPort(ROBOT, 45000), "lies in --port-range 45000-45009"
+    text = make_stand_ins().advice(address, reason, ADDRESS)
     assert "port 45000 lies in --port-range 45000-45009" in text
     assert "ROS_IP=192.0.2.7" in text
 
@@ -206,9 +206,9 @@ def test_other_methods_pass_unparsed() -> None:
 
 
 def test_of_many_topics_the_latest_are_remembered() -> None:
-    where = HostPort("robot", 40001)
+    address = HostPort("robot", 40001)
     stand_in = book.StandIn(
-        HostPort("172.30.0.2", 20001), f"http://{where}/", where, is_uri_kept=False
+        HostPort("172.30.0.2", 20001), f"http://{address}/", address, is_uri_kept=False
     )
     for number in range(book.MOST_TOPICS + 10):
         stand_in.note_topic_port(f"/topic{number}", 40000 + number % 7)

@@ -41,15 +41,15 @@ def test_nothing_is_wrong() -> None:
 def test_each_cause_has_its_cure(
     changes: dict[str, object], check: str, grave: bool, said: str
 ) -> None:
-    (found,) = with_inside(**changes)
-    assert (found.check, found.subject, found.grave) == (check, "01.0f.aa", grave)
-    assert said in found.text + found.fix
-    assert found.text.startswith("at 172.30.0.5 (")
+    (problem,) = with_inside(**changes)
+    assert (problem.check, problem.subject, problem.grave) == (check, "01.0f.aa", grave)
+    assert said in problem.text + problem.fix
+    assert problem.text.startswith("at 172.30.0.5 (")
 
 
 def test_of_a_participant_the_first_cause_alone_is_told() -> None:
-    (found,) = with_inside(security="protected", locator_fault="tcp", problem="no port", domain=4)
-    assert found.check == "domain"
+    (problem,) = with_inside(security="protected", locator_fault="tcp", problem="no port", domain=4)
+    assert problem.check == "domain"
 
 
 @pytest.mark.parametrize(
@@ -84,24 +84,24 @@ def test_what_another_version_says_is_passed_over() -> None:
 )
 def test_a_pair_that_does_not_match(policy: str, check: str, said: str) -> None:
     pair = replace(MISMATCH, policy=policy)
-    (found,) = domain_problems(replace(DOMAIN, mismatches=(pair,)))
-    assert (found.check, found.subject, found.grave) == (check, "topic /scan", True)
-    for part in (
+    (problem,) = domain_problems(replace(DOMAIN, mismatches=(pair,)))
+    assert (problem.check, problem.subject, problem.grave) == (check, "topic /scan", True)
+    for phrase in (
         f"{policy} differs",
         "01.0f.aa at 172.30.0.5 (Fast DDS, inside) offers BEST_EFFORT",
         "01.10.bb at 10.0.0.9 (Cyclone DDS, outside) requests RELIABLE",
         said,
     ):
-        assert part in found.text + found.fix, part
+        assert phrase in problem.text + problem.fix, phrase
 
 
 def test_a_pair_of_which_one_is_not_reached_at_all_says_nothing_more() -> None:
     bad = replace(DOMAIN, mismatches=(MISMATCH,), inside=(replace(INSIDE, security="protected"),))
-    assert [one.check for one in domain_problems(bad)] == ["security"]
+    assert [problem.check for problem in domain_problems(bad)] == ["security"]
     slow = replace(DOMAIN, mismatches=(MISMATCH,), outside=(replace(OUTSIDE, proven=False),))
-    assert [one.check for one in domain_problems(slow)] == ["reached", "qos"]
+    assert [problem.check for problem in domain_problems(slow)] == ["reached", "qos"]
 
 
 def test_pairs_that_are_left_out_are_counted() -> None:
-    (found,) = domain_problems(replace(DOMAIN, mismatches_left_out=7))
-    assert "7 more pairs" in found.text
+    (problem,) = domain_problems(replace(DOMAIN, mismatches_left_out=7))
+    assert "7 more pairs" in problem.text

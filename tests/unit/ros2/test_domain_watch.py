@@ -50,8 +50,8 @@ def test_what_lasts_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
 def test_what_is_mended_is_told_no_more() -> None:
     told, problems = Told(), Problems()
     watch = DomainWatch(told, problems)
-    for one in (TCP, TCP, GOOD):
-        look(watch, told, one)
+    for participant in (TCP, TCP, GOOD):
+        look(watch, told, participant)
     assert problems.all() == []
 
 
@@ -59,8 +59,8 @@ def test_another_cause_takes_the_place_of_the_first() -> None:
     told, problems = Told(), Problems()
     watch = DomainWatch(told, problems)
     secured = replace(GOOD, security="protected")
-    for one in (TCP, TCP, secured, secured):
-        look(watch, told, one)
+    for participant in (TCP, TCP, secured, secured):
+        look(watch, told, participant)
     (noted,) = problems.all()
     assert "DDS Security" in noted.text
 

@@ -16,7 +16,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import Lease
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.status import Ros2State
-from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, domain, spdp
+from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, make_domain, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload
 
 PUBLICATIONS, SUBSCRIPTIONS = 0x000003C2, 0x000004C2
@@ -46,39 +46,43 @@ def text(value: str) -> bytes:
 
 
 def sedp(prefix: bytes, writer: int, topic: str, kind: str, reliability: int) -> bytes:
-    held = [
+    parameters = [
         (Pid.ENDPOINT_GUID, prefix + bytes([0, 0, len(topic), 3])),
         (Pid.TOPIC_NAME, text(topic)),
         (Pid.TYPE_NAME, text(kind)),
         (Pid.RELIABILITY, struct.pack("<IiI", reliability, 0, 0)),
     ]
-    return message(data(payload(held), writer=writer), prefix=prefix)
+    return message(data(payload(parameters), writer=writer), prefix=prefix)
 
 
-def told(one: Domain) -> DomainStatus:
-    (found,) = Ros2State([cast(DomainServer, Served(one))], cast(DomainPlane, Copied())).status()
-    return found
+def told(domain: Domain) -> DomainStatus:
+    (status,) = Ros2State(
+        [cast(DomainServer, Served(domain))], cast(DomainPlane, Copied())
+    ).status()
+    return status
 
 
-def announce(one: Domain, reliability: int) -> None:
+def announce(domain: Domain, reliability: int) -> None:
     """A publisher inside that is not reliable, a server there, and a subscriber outside."""
-    one.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = one.outside.stand_ins
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = domain.outside.stand_ins
     string, trigger = "std_msgs::msg::dds_::String_", "std_srvs::srv::dds_::Trigger_Request_"
     for writer, topic, kind in (
         (PUBLICATIONS, "rt/scan", string),
         (SUBSCRIPTIONS, "rq/addRequest", trigger),
     ):
-        one.at_stand_in(stand_in, sedp(A, writer, topic, kind, 1), INSIDE, NOW)
-    port = next(port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410)
-    one.at_lease(port, sedp(B, SUBSCRIPTIONS, "rt/scan", string, reliability), ROBOT, NOW)
+        domain.at_stand_in(stand_in, sedp(A, writer, topic, kind, 1), INSIDE, NOW)
+    port = next(
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    )
+    domain.at_lease(port, sedp(B, SUBSCRIPTIONS, "rt/scan", string, reliability), ROBOT, NOW)
 
 
 def test_topics_and_their_types() -> None:
-    one = domain()
-    announce(one, 1)
-    (inside,), (outside,) = told(one).inside, told(one).outside
+    domain = make_domain()
+    announce(domain, 1)
+    (inside,), (outside,) = told(domain).inside, told(domain).outside
     assert (inside.publishes, inside.services, outside.subscribes) == (
         ("/scan",),
         ("/add",),
@@ -88,35 +92,35 @@ def test_topics_and_their_types() -> None:
         NamedTypeStatus("/add", "std_srvs/srv/Trigger"),
         NamedTypeStatus("/scan", "std_msgs/msg/String"),
     )
-    assert told(one).mismatches == ()
+    assert told(domain).mismatches == ()
 
 
 def test_who_does_not_match() -> None:
-    one = domain()
-    announce(one, 2)
-    (found,) = told(one).mismatches
-    assert (found.kind, found.name, found.policy) == ("topic", "/scan", "reliability")
-    (inside,), (outside,) = told(one).inside, told(one).outside
-    assert (found.writer, found.reader) == (inside.guid_prefix, outside.guid_prefix)
+    domain = make_domain()
+    announce(domain, 2)
+    (mismatch,) = told(domain).mismatches
+    assert (mismatch.kind, mismatch.name, mismatch.policy) == ("topic", "/scan", "reliability")
+    (inside,), (outside,) = told(domain).inside, told(domain).outside
+    assert (mismatch.writer, mismatch.reader) == (inside.guid_prefix, outside.guid_prefix)
 
 
 def test_the_rate_of_a_port() -> None:
-    one = domain()
-    announce(one, 1)
-    (_, lease), *_ = one.inside.leases.values()
+    domain = make_domain()
+    announce(domain, 1)
+    (_, lease), *_ = domain.inside.leases.values()
     lease.sample(NOW)
     lease.bytes += 3000
     lease.sample(NOW + 2)
-    (inside,) = told(one).inside
+    (inside,) = told(domain).inside
     assert 1500.0 in {locator.rate for locator in inside.leases}
 
 
 def test_metrics_tell_the_ports_that_are_left() -> None:
-    one = domain()
-    one.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
-    state = Ros2State([cast(DomainServer, Served(one))], cast(DomainPlane, Copied()))
-    found = {sample.name: sample.value for family in state.collect() for sample in family.samples}
-    used, free = (found[f"rosproxy_ros2_leases_{what}"] for what in ("used", "free"))
-    assert (used, free) == (len(one.inside.leases), one.ports.pool.free)
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    state = Ros2State([cast(DomainServer, Served(domain))], cast(DomainPlane, Copied()))
+    values = {sample.name: sample.value for family in state.collect() for sample in family.samples}
+    used, free = (values[f"rosproxy_ros2_leases_{use}"] for use in ("used", "free"))
+    assert (used, free) == (len(domain.inside.leases), domain.ports.pool.free)
     assert used > 0
-    assert found["rosproxy_ros2_participants_without_port"] == 0
+    assert values["rosproxy_ros2_participants_without_port"] == 0

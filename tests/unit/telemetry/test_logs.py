@@ -39,31 +39,31 @@ def line(message: str, *arguments: object, **more: Any) -> dict[str, Any]:
     text = JsonLines().format(record(message, *arguments, **more))
     assert text.isascii()
     assert "\n" not in text
-    found: dict[str, Any] = json.loads(text)
-    return found
+    fields: dict[str, Any] = json.loads(text)
+    return fields
 
 
 def test_a_line_has_time_level_logger_and_message() -> None:
-    found = line("node %s\n\u202e", "/a")
-    assert found.keys() == {"time", "level", "logger", "message"}
-    assert datetime.fromisoformat(found["time"]) == datetime.fromtimestamp(1_795_249_066.5, UTC)
-    assert found["time"].endswith(("Z", "+00:00"))
-    assert (found["level"], found["logger"]) == ("warning", "rosproxy.test")
-    assert found["message"] == "node /a\\n\\u202e"
+    fields = line("node %s\n\u202e", "/a")
+    assert fields.keys() == {"time", "level", "logger", "message"}
+    assert datetime.fromisoformat(fields["time"]) == datetime.fromtimestamp(1_795_249_066.5, UTC)
+    assert fields["time"].endswith(("Z", "+00:00"))
+    assert (fields["level"], fields["logger"]) == ("warning", "rosproxy.test")
+    assert fields["message"] == "node /a\\n\\u202e"
 
 
 def test_what_a_message_is_about_has_fields_of_its_own() -> None:
-    found = line("gone", node="/talker", port=45000, container="c1", proxy="p1")
-    assert (found["node"], found["port"]) == ("/talker", 45000)
-    assert (found["container"], found["proxy"]) == ("c1", "p1")
+    fields = line("gone", node="/talker", port=45000, container="c1", proxy="p1")
+    assert (fields["node"], fields["port"]) == ("/talker", 45000)
+    assert (fields["container"], fields["proxy"]) == ("c1", "p1")
 
 
 def test_an_exception_is_an_error() -> None:
     try:
         raise OSError("no route")
     except OSError as error:
-        found = line("failed", error=(OSError, error, error.__traceback__))
-    assert found["error"].endswith("OSError: no route")
+        fields = line("failed", error=(OSError, error, error.__traceback__))
+    assert fields["error"].endswith("OSError: no route")
 
 
 def raised(text: str, cause: str = "") -> Any:
@@ -81,9 +81,9 @@ def test_no_text_of_others_forges_a_line() -> None:
     text = TextLines().format(record("%s: %s", FORGED, FORGED))
     assert text.isprintable()
     assert text.endswith("\\x1b[2J\\u202e")
-    found = line("%s", FORGED, node=FORGED)
-    assert found["message"].isprintable()
-    assert found["node"].isprintable()
+    fields = line("%s", FORGED, node=FORGED)
+    assert fields["message"].isprintable()
+    assert fields["node"].isprintable()
 
 
 @pytest.mark.parametrize("form", [TextLines(), JsonLines()])
@@ -128,7 +128,7 @@ def clock() -> Clock:
 
 
 def written(floods: LogRateLimit, records: Iterable[logging.LogRecord]) -> list[logging.LogRecord]:
-    return [one for one in records if floods.filter(one)]
+    return [r for r in records if floods.filter(r)]
 
 
 def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) -> None:

@@ -35,7 +35,7 @@ def test_what_alerts_count_begins_with_nothing() -> None:
         assert value("rosproxy_relay_errors_total", {"reason": reason}) == 0
     for standing in STRANGERS:
         assert value("rosproxy_strangers_total", {"standing": standing}) == 0
-    assert {*STRANGERS} == {each.value for each in ClientKind} - {"admitted"}
+    assert {*STRANGERS} == {kind.value for kind in ClientKind} - {"admitted"}
 
 
 def test_every_reason_is_one_that_the_code_gives() -> None:

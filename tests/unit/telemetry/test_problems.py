@@ -20,10 +20,10 @@ def test_the_same_again_replaces_the_older_one() -> None:
 def test_texts_of_any_size_are_short_and_harmless() -> None:
     problems = Problems()
     problems.add("/a\n" + "x" * 8_000_000, "y" * 8_000_000 + "\x1b[2J", port=5)
-    (one,) = problems.at(5)
-    assert (len(one.subject), len(one.text)) == (LONGEST_SUBJECT, LONGEST_TEXT)
-    assert one.subject.startswith("/a\\nx")
-    assert one.text.endswith("y\\x1b[2J")
+    (problem,) = problems.at(5)
+    assert (len(problem.subject), len(problem.text)) == (LONGEST_SUBJECT, LONGEST_TEXT)
+    assert problem.subject.startswith("/a\\nx")
+    assert problem.text.endswith("y\\x1b[2J")
 
 
 def test_what_was_noted_of_a_long_name_is_forgotten_when_it_is_solved() -> None:

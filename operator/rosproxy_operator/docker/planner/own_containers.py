@@ -60,7 +60,7 @@ _SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
 
 
 @dataclass(frozen=True, slots=True)
-class Making:
+class CreationFacts:
     """How a container was made, in the engine's words.
 
     ``image`` is the id of its image, ``host`` its HostConfig. ``command`` are entry point and
@@ -78,7 +78,7 @@ def has_own_name(own: OwnLabels, name: str) -> bool:
     return re.fullmatch(re.escape(_name(own)) + _TEMPORARY, name) is not None
 
 
-def forgery_reason(own: OwnLabels, name: str, making: Making, image_id: str) -> str:
+def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: str) -> str:
     """What shows that a container is none of this operator's, though its labels say so.
 
     Empty if nothing does. ``image_id`` is that of the proxies' image now. A container of a former

@@ -106,7 +106,7 @@ class PlanContext:
 
 
 @dataclass(frozen=True, slots=True)
-class _Home:
+class _SandboxChoice:
     """The sandbox in which a proxy is to run.
 
     ``id`` is empty if it is yet to be created. ``starts``: the steps start it, so that a proxy
@@ -163,7 +163,7 @@ def _removed(actions: Iterable[Action]) -> set[str]:
     return {action.name for action in actions if isinstance(action, Remove)}
 
 
-def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | None]:
+def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxChoice | None]:
     """The actions for the sandbox, and which one it is then; None if none is going to run.
 
     No actions but None if one ought to be created but can't.
@@ -192,7 +192,7 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
             *creation_steps(selection, action, former, ended),
             *_connect(context, action.name),
         ]
-        return actions, _Home(action.name, starts=True)
+        return actions, _SandboxChoice(action.name, starts=True)
     # One that is restarting has no network namespace until it is up again: nothing can be joined,
     # and no proxy started in it (moby: daemon/container_operations.go, getNetworkedContainer).
     if kept is None or kept.state == "restarting":
@@ -202,7 +202,7 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     actions += _join_steps(context, kept) if serves else _start_steps(context, selection, kept)
     if kept.name != name:
         actions.append(Rename(kept.name, name))
-    return actions, _Home(name, kept.id, not serves, kept.started_at)
+    return actions, _SandboxChoice(name, kept.id, not serves, kept.started_at)
 
 
 def _usable(sandbox: Container, observed: HostState) -> bool:
@@ -274,7 +274,9 @@ def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
             yield Remove(proxy.container.name, "its sandbox is made anew", stop=True)
 
 
-def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> list[Action] | None:
+def _process_steps(
+    context: PlanContext, home: _SandboxChoice, gone: Collection[str]
+) -> list[Action] | None:
     """The actions for the container in which the proxy runs; None if one can't be created.
 
     ``gone`` are the names of containers that are removed before.
@@ -337,7 +339,7 @@ def keep_running_steps(
         yield Restart(kept.name)
 
 
-def _lost(kept: Container, home: _Home) -> bool:
+def _lost(kept: Container, home: _SandboxChoice) -> bool:
     """Whether a proxy runs in the namespace that its sandbox had before it was started anew."""
     if home.starts:
         return True

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.admin.status_document import EndpointStatus
-from rosproxy.doctor.facts import DoctorFacts, NodeFacts, Reach
+from rosproxy.doctor.facts import DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
@@ -136,7 +136,7 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
 
 def _is_of_another_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
     """Whether a node answers at a port of this proxy that no node here holds."""
-    answered = node.attempt.reach is Reach.ANSWERED
+    answered = node.attempt.reach is ReachOutcome.ANSWERED
     return answered and facts.is_ours(node.slave) and facts.lease(node.slave) is None
 
 
@@ -156,9 +156,9 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
             "(and no ROS_HOSTNAME=localhost), then restart it"
         )
         yield error(OUTSIDE, node.name, text, fix)
-    elif reach is Reach.UNRESOLVABLE:
+    elif reach is ReachOutcome.UNRESOLVABLE:
         yield _unresolvable(facts, node, slave)
-    elif reach is Reach.SILENT:
+    elif reach is ReachOutcome.SILENT:
         text = f"no answer at {node.uri}: it hangs, or its machine is off or cut off"
         fix = f"from here: nc -vz {slave.host} {slave.port}; if it is gone: {CLEANUP}"
         yield error(OUTSIDE, node.name, text, fix)
@@ -188,7 +188,7 @@ def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> Docto
 
 def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
     """Cleaning up would lose nodes that a proxy takes back when it starts again."""
-    if node.attempt.reach is Reach.UNRESOLVABLE:
+    if node.attempt.reach is ReachOutcome.UNRESOLVABLE:
         return f"start its proxy with --advertise-host ADDRESS instead of the name {slave.host}"
     if facts.status is None:
         return (

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from difflib import get_close_matches
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok
-from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach
+from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, size
@@ -178,6 +178,6 @@ def _service(facts: DoctorFacts, service: str) -> DoctorFinding:
     if not attempt.failed:
         return ok(PAIR, service, text)
     fix = f"restart {providers}; if it is gone: rosnode cleanup"
-    if attempt.reach is Reach.UNRESOLVABLE:
+    if attempt.reach is ReachOutcome.UNRESOLVABLE:
         fix = f"where {providers} runs: ROS_IP=ADDRESS, then restart it"
     return error(PAIR, service, text, fix)

@@ -5,7 +5,7 @@ from urllib.parse import urlsplit
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, published_range
-from rosproxy.doctor.facts import DoctorFacts, MasterFacts, Reach
+from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import duration
 
@@ -52,7 +52,7 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     elif master.is_this_proxy:
         text = f"{master.uri} leads back to this proxy itself"
         yield error("master", "master", text, _OTHER_URI)
-    elif master.attempt.reach is not Reach.ANSWERED:
+    elif master.attempt.reach is not ReachOutcome.ANSWERED:
         yield error("master", "master", *_unanswered(master))
     else:
         trip = f" in {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
@@ -73,23 +73,23 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
     host, port = split_uri.hostname or "", split_uri.port
     by_address = f"--master-uri http://ADDRESS:{port}"
     match master.attempt.reach:
-        case Reach.UNRESOLVABLE:
+        case ReachOutcome.UNRESOLVABLE:
             text = f"{uri}: the host name {host} can't be resolved here"
             add_host = f"docker run --add-host {host}:ADDRESS, in Kubernetes hostAliases"
             return text, f"{add_host}; or {by_address}"
-        case Reach.STRANGER if master.at_root:
+        case ReachOutcome.STRANGER if master.at_root:
             text = f"a master answers there, but not at the path {split_uri.path}"
             return (
                 f"{uri}: {text} (it knows only / and /RPC2)",
                 f"--master-uri http://{split_uri.netloc}/",
             )
-        case Reach.STRANGER:
+        case ReachOutcome.STRANGER:
             text = f"{uri}: what answers there is no ROS master ({master.attempt.reason})"
             return text, _OTHER_URI
-        case Reach.REFUSED if is_loopback(host):
+        case ReachOutcome.REFUSED if is_loopback(host):
             text = f"{uri} refuses connections. In a container {host} is the container itself"
             return text, f"{by_address} with an address of the master's machine"
-        case Reach.REFUSED:
+        case ReachOutcome.REFUSED:
             text = f"{uri} refuses connections: no roscore runs there"
             return text, f"on {host}: roscore -p {port}; or {_OTHER_URI}"
     text = "its machine is down or cut off, a firewall drops it, or the address is wrong"

@@ -58,7 +58,7 @@ class PassedFragments(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Gathered:
+class _PendingSample:
     """The fragments of a sample, by their numbers; ``whole`` is its payload once all are there.
 
     It is rewritten then, and empty if the announcement is to be hidden.
@@ -143,7 +143,7 @@ class FragmentStores:
 class FragmentStore:
     """Announcements of a participant of which fragments have come, and the datagrams that wait."""
 
-    _samples: dict[_Key, _Gathered] = field(default_factory=dict)
+    _samples: dict[_Key, _PendingSample] = field(default_factory=dict)
     _waiting_datagrams: list[_WaitingDatagram] = field(default_factory=list)
     _sample_bytes: int = 0
     _waiting_bytes: int = 0
@@ -218,13 +218,13 @@ class FragmentStore:
         gathered.fragments.clear()
         return True
 
-    def _gathered(self, port: int, sample: Sample, frags: Fragments) -> _Gathered:
+    def _gathered(self, port: int, sample: Sample, frags: Fragments) -> _PendingSample:
         """What has come of a fragment's sample. Raises RtpsError if the fragment can't be one."""
         if frags.size < SHORTEST or not 0 < frags.total <= LONGEST:
             raise RtpsError(f"an announcement of {frags.total} bytes in fragments of {frags.size}")
         gathered = self._samples.get(_key(port, sample))
         if gathered is None:
-            gathered = self._samples[_key(port, sample)] = _Gathered(frags.total, frags.size)
+            gathered = self._samples[_key(port, sample)] = _PendingSample(frags.total, frags.size)
             self._sample_bytes += gathered.cost
             while self._sample_bytes > MOST_BYTES:
                 self._sample_bytes -= self._samples.pop(next(iter(self._samples))).cost

@@ -245,31 +245,31 @@ class OutsideParticipant(Participant):
         return True
 
 
-Someone = TypeVar("Someone", bound=Participant)
+AnyParticipant = TypeVar("AnyParticipant", bound=Participant)
 
 
 @dataclass(slots=True, kw_only=True)
-class ParticipantTable(Generic[Someone]):
+class ParticipantTable(Generic[AnyParticipant]):
     """The participants of one side by GUID prefix, and how many there are at each address.
 
     ``notes`` holds how many readers and writers of theirs are remembered.
     """
 
-    by_prefix: dict[bytes, Someone] = field(default_factory=dict)
+    by_prefix: dict[bytes, AnyParticipant] = field(default_factory=dict)
     count_by_address: Counter[str] = field(default_factory=Counter)
     notes: EndpointNotes = field(default_factory=EndpointNotes)
 
-    def find(self, prefix: bytes, source: str) -> Someone | None:
+    def find(self, prefix: bytes, source: str) -> AnyParticipant | None:
         """The participant with a prefix, if it is at the address that a datagram came from."""
         participant = self.by_prefix.get(prefix)
         return participant if participant is not None and participant.address == source else None
 
-    def add(self, participant: Someone) -> None:
+    def add(self, participant: AnyParticipant) -> None:
         """Add a participant that has come."""
         self.by_prefix[participant.prefix] = participant
         self.count_by_address[participant.address] += 1
 
-    def remove(self, participant: Someone) -> None:
+    def remove(self, participant: AnyParticipant) -> None:
         """Forget a participant that has gone."""
         del self.by_prefix[participant.prefix]
         self.notes.forget(participant)

@@ -180,5 +180,5 @@ def read_members(
 ) -> tuple[tuple[Member, ...], list[Problem]]:
     """The containers that belong to proxies, and what is wrong with labels."""
     reading = read_labels(state, settings)
-    found, problems = find_members(reading, state, settings)
-    return found, [*reading.problems, *problems]
+    members, problems = find_members(reading, state, settings)
+    return members, [*reading.problems, *problems]

@@ -20,12 +20,12 @@ class Handler(BaseHTTPRequestHandler):
         call = f"{self.command} {path}"
         length = int(self.headers.get("Content-Length") or 0)
         self.server.calls[call] = json.loads(self.rfile.read(length) or "null")
-        found = {} if self.command != "GET" else self.server.knows.get(path)
-        missing = (404, f"no such container: {path}") if found is None else (200, "")
+        reply = {} if self.command != "GET" else self.server.knows.get(path)
+        missing = (404, f"no such container: {path}") if reply is None else (200, "")
         status, message = self.server.refuses.get(call, missing)
         self.send_response(status)
         self.end_headers()
-        self.wfile.write(json.dumps({"message": message} if message else found).encode())
+        self.wfile.write(json.dumps({"message": message} if message else reply).encode())
 
     do_GET = do_POST = do_DELETE = answer  # noqa: N815
 

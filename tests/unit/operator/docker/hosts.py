@@ -165,8 +165,8 @@ class Hosts(Invariants):
         """Another program listens; the operator may be unable to see it."""
         self.engine.names_ports = bool(m & 1)
         port = 11400 + n % 16
-        held = (box.ports | box.udp for box in self.engine.boxes if box.state in SERVING)
-        if not any(port in ports for ports in held):
+        taken = (box.ports | box.udp for box in self.engine.boxes if box.state in SERVING)
+        if not any(port in ports for ports in taken):
             (self.engine.hidden if m & 2 else self.engine.open).add(port)
 
     def take_own_port(self, n: int, m: int) -> None:
@@ -199,7 +199,9 @@ class Hosts(Invariants):
         if boxes := self.boxes("exited", "restarting"):
             box = pick(boxes, n)
             serving = self.own(*SERVING, role=box.role)
-            if box.own and box.own.key not in {own.key for one, own in serving if one is not box}:
+            if box.own and box.own.key not in {
+                own.key for other, own in serving if other is not box
+            }:
                 self.start(box)
 
     def engine_restarts(self, n: int, m: int) -> None:
@@ -250,34 +252,34 @@ class Hosts(Invariants):
 
     def look_and_be_killed(self, n: int, _: int) -> None:
         """The operator is killed after any of its actions and knows nothing any more."""
-        found = self.controller.look()
-        self.carry_out(found, n % (len(found.actions) + 1))
+        plan = self.controller.look()
+        self.carry_out(plan, n % (len(plan.actions) + 1))
         self.lose_memory()
 
     def look_and_stall(self, n: int, _: int) -> None:
         """Only some of the actions are carried out before the next look."""
-        found = self.controller.look()
-        self.carry_out(found, n % (len(found.actions) + 1))
+        plan = self.controller.look()
+        self.carry_out(plan, n % (len(plan.actions) + 1))
 
     def come_to_rest(self, _n: int = 0, _m: int = 0) -> None:
         """Nothing else happens: everything must be as wished after some looks."""
         self.engine.redirects_fail = False
         for _ in range(100):
-            found = self.controller.look()
-            failed = self.carry_out(found)
+            plan = self.controller.look()
+            failed = self.carry_out(plan)
             assert all(isinstance(error, Refused) for _, error in failed), failed
             self.check()
             for box in self.boxes("removing"):
                 self.engine.boxes.remove(box)
-            if not found.actions and found.again_in is None:
+            if not plan.actions and plan.again_in is None:
                 break
-            self.controller.now += found.again_in or 0.0
+            self.controller.now += plan.again_in or 0.0
         else:
-            raise AssertionError(f"never comes to rest: {found.actions}")
-        self.check_all_is_as_wished(found)
+            raise AssertionError(f"never comes to rest: {plan.actions}")
+        self.check_all_is_as_wished(plan)
 
-    def carry_out(self, found: DockerPlan, most: int | None = None) -> list[tuple[Action, Failed]]:
-        self.check_new_ranges(found)
+    def carry_out(self, plan: DockerPlan, most: int | None = None) -> list[tuple[Action, Failed]]:
+        self.check_new_ranges(plan)
         before = self.engine.observe()
         remembered = self.controller.memory.served
         self.may_move |= {
@@ -285,10 +287,10 @@ class Hosts(Invariants):
             for key, ports in self.served.items()
             if self.published(ports) or key not in remembered
         }
-        failed = self.controller.carry_out(found, most)
+        failed = self.controller.carry_out(plan, most)
         refused = {action.name for action, _ in failed if isinstance(action, Start)}
         self.may_move |= {own.key for box, own in self.own() if box.name in refused}
-        wanted = {one.key for one in found.desired if one.live}
+        wanted = {proxy.key for proxy in plan.desired if proxy.live}
         for key in before.keys - {own.key for _, own in self.own()} - wanted:
             self.served.pop(key, None)
         return failed
@@ -301,5 +303,5 @@ class Hosts(Invariants):
     def lose_memory(self) -> None:
         """Ports are then only known as long as there is a container that has had them."""
         self.controller.memory = DockerMemory()
-        kept = {own.key for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
-        self.served = {key: ports for key, ports in self.served.items() if key in kept}
+        started = {own.key for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
+        self.served = {key: ports for key, ports in self.served.items() if key in started}

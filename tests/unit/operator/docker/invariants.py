@@ -83,34 +83,34 @@ class Invariants:
             self.may_move.discard(own.key)
         # One that was never started has no ports yet: it gives way to who has served on them.
         boxes = self.own(role=ROLE_SANDBOX)
-        held = [(own.key, own.range) for box, own in boxes if box.state != "created"]
-        for key, ports in held:
-            others = [other for one, other in held if one != key]
-            assert not any(overlap(ports, other) for other in others), "ports are one's own"
+        ranges = [(own.key, own.range) for box, own in boxes if box.state != "created"]
+        for key, ports in ranges:
+            other_ranges = [other for owner, other in ranges if owner != key]
+            assert not any(overlap(ports, other) for other in other_ranges), "ports are one's own"
 
-    def check_new_ranges(self, found: DockerPlan) -> None:
+    def check_new_ranges(self, plan: DockerPlan) -> None:
         """Ports of new sandboxes are nobody else's; who has ports keeps them."""
         seen = self.engine.observe()
-        for action in found.actions:
+        for action in plan.actions:
             if not isinstance(action, CreateSandbox):
                 continue
             key, ports = action.key, action.range
             had = [own.range for _, own in self.own() if own.key == key]
             had += [self.served[key]] if key in self.served else []
-            new = {port for port in ports.ports() if not any(port in one for one in had)}
-            held = seen.listening_udp if key.is_ros2 else seen.listening
+            new = {port for port in ports.ports() if not any(port in old for old in had)}
+            listening = seen.listening_udp if key.is_ros2 else seen.listening
             strangers = {
                 port
-                for one in seen.containers
-                for port in (one.udp_ports if key.is_ros2 else one.host_ports)
+                for container in seen.containers
+                for port in (container.udp_ports if key.is_ros2 else container.host_ports)
             }
-            assert not new & (strangers | held)
+            assert not new & (strangers | listening)
             assert not any(port in EPHEMERAL or port in reserved_ports(key) for port in new)
-            for one in seen.sandboxes:
-                others = one.key != key and one.container.state != "created"
-                assert not (others and overlap(one.range, ports))
+            for sandbox in seen.sandboxes:
+                foreign = sandbox.key != key and sandbox.container.state != "created"
+                assert not (foreign and overlap(sandbox.range, ports))
 
-    def check_all_is_as_wished(self, found: DockerPlan) -> None:
+    def check_all_is_as_wished(self, plan: DockerPlan) -> None:
         members, _ = read_members(self.engine.observe(), SETTINGS)
         fine = frozenset(
             name
@@ -122,8 +122,8 @@ class Invariants:
         stays = "" if self.engine.image else ROLE_REDIRECT
         keys = {own.key for _, own in self.own() if own.role != stays}
         assert keys <= {member.key for member in live}
-        fatal = {problem.subject for problem in found.problems if problem.fatal}
-        told = {problem.subject for problem in found.problems}
+        fatal = {problem.subject for problem in plan.problems if problem.fatal}
+        told = {problem.subject for problem in plan.problems}
         for key in sorted({member.key for member in live}):
             if not fatal & {f"proxy image {SETTINGS.proxy_image}", f"proxy {proxy_name(key)}"}:
                 mine = [member for member in live if member.key == key]
@@ -157,11 +157,13 @@ class Invariants:
             for proxy, own in self.own("running", role=ROLE_PROXY)
             if (box := self.engine.home(proxy)) and box.state == "running"
         }
-        there = {home.namespace: home.id for home in boxes.values() if home.state in STARTED}
+        live_namespaces = {
+            home.namespace: home.id for home in boxes.values() if home.state in STARTED
+        }
         if self.engine.image:
             for (namespace, key), rule in self.engine.rules.items():
-                known = (namespace, key) in wanted or (namespace, key) in self.forgotten
-                assert namespace not in there or known, rule
+                expected = (namespace, key) in wanted or (namespace, key) in self.forgotten
+                assert namespace not in live_namespaces or expected, rule
         for (namespace, key), given in wanted.items():
             if sandbox := runs.get(key):  # else it stays as it is, or comes later
                 master, proxy = self.engine.rules[namespace, key]
@@ -188,7 +190,7 @@ class Invariants:
         roles = [own.role for _, own in own]
         has_ear = key.is_ros2 and (bool(self.engine.image) or ROLE_EAR in roles)
         assert sorted(roles) == [ROLE_EAR] * has_ear + [ROLE_SANDBOX, ROLE_PROXY]
-        *ears, (sandbox, is_), (proxy, runs) = sorted(own, key=lambda one: one[0].role)
+        *ears, (sandbox, is_), (proxy, runs) = sorted(own, key=lambda pair: pair[0].role)
         assert sandbox.state == "running"
         assert proxy.state in ("running", "restarting")
         assert set(sandbox.networks) == {SETTINGS.uplink, *wanted}
@@ -218,12 +220,12 @@ class Invariants:
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""
-        return (box.name == name) != any(one.name == name for one in self.strangers())
+        return (box.name == name) != any(stranger.name == name for stranger in self.strangers())
 
     def check_names(self, member: Member, networks: frozenset[str]) -> None:
         """By the name that a container uses it finds its own proxy and nobody else."""
         for network in networks if member.wanted_alias else ():
-            found = [
+            answering = [
                 box.own.key if box.own else box.name
                 for box in self.engine.boxes
                 if network in box.networks
@@ -231,4 +233,4 @@ class Invariants:
                 and box.state not in ("dead", "removing")
             ]
             restarting = [own.key for _, own in self.own("restarting", role=ROLE_SANDBOX)]
-            assert found == [member.key] or member.key in restarting
+            assert answering == [member.key] or member.key in restarting

@@ -91,8 +91,8 @@ class Box:
     @property
     def own(self) -> OwnLabels | None:
         """What its labels say, if its name agrees: nothing else gives one away here."""
-        found = read_own(self.labels)
-        return found if found and has_own_name(found, self.name) else None
+        labels = read_own(self.labels)
+        return labels if labels and has_own_name(labels, self.name) else None
 
     @property
     def role(self) -> str:
@@ -134,14 +134,14 @@ class Engine:
 
     def add(self, name: str, **more: object) -> Box:
         box = Box(f"box-{next(self.ids)}", name)
-        for word, value in more.items():
-            setattr(box, word, value)
+        for attribute, value in more.items():
+            setattr(box, attribute, value)
         self.boxes.append(box)
         return box
 
     def join(self, box: Box, network: str, *names: str) -> None:
-        known = self.networks[network].id if box.state in SERVING | {"exited"} else ""
-        box.networks[network] = known, frozenset({box.name, *names})
+        network_id = self.networks[network].id if box.state in SERVING | {"exited"} else ""
+        box.networks[network] = network_id, frozenset({box.name, *names})
 
     def active(self, network: str) -> bool:
         """Whether a network can't be removed: something that runs is on it."""
@@ -149,18 +149,18 @@ class Engine:
 
     def conflicts(self, box: Box) -> set[int]:
         """The ports of a container that something else holds."""
-        others = [one for one in self.boxes if one is not box and one.state in SERVING]
-        tcp = {port for one in others for port in one.ports} | self.open | self.hidden
-        udp = {port for one in others for port in one.udp} | self.open | self.hidden
+        others = [other for other in self.boxes if other is not box and other.state in SERVING]
+        tcp = {port for other in others for port in other.ports} | self.open | self.hidden
+        udp = {port for other in others for port in other.udp} | self.open | self.hidden
         return set(box.ports) & tcp | set(box.udp) & udp
 
     # what the operator sees
 
     def observe(self) -> HostState:
         started = [box for box in self.boxes if box.state in STARTED]
-        held = {port for box in started for port in box.ports}
-        # As in `snapshot.strangers`, the port of an ear is not told.
-        held_udp = {port for box in started if box.role != ROLE_EAR for port in box.udp}
+        tcp_ports = {port for box in started for port in box.ports}
+        # As in `snapshot.foreign_ports`, the port of an ear is not told.
+        udp_ports = {port for box in started if box.role != ROLE_EAR for port in box.udp}
         own = [(box, box.own) for box in self.boxes]
         return HostState(
             containers=tuple(self._container(box) for box, role in own if role is None),
@@ -171,8 +171,8 @@ class Engine:
                 if is_ and is_.role == ROLE_PROXY
             ),
             ephemeral=self.ephemeral,
-            listening=frozenset(self.open | held),
-            listening_udp=frozenset(self.open | held_udp),
+            listening=frozenset(self.open | tcp_ports),
+            listening_udp=frozenset(self.open | udp_ports),
             ears=tuple(
                 EarContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
@@ -194,8 +194,8 @@ class Engine:
     def _container(self, box: Box) -> Container:
         running = box.state in STARTED
         places = tuple(
-            Attachment(name, box.address if running else "", names | {box.name}, known)
-            for name, (known, names) in box.networks.items()
+            Attachment(name, box.address if running else "", names | {box.name}, network_id)
+            for name, (network_id, names) in box.networks.items()
         )
         return Container(
             id=box.id,
@@ -254,12 +254,12 @@ class Engine:
 
     def own(self, name: str) -> Box:
         """A container to do something to, which must be the operator's own."""
-        found = self.named(name)
-        if not found:
+        boxes = self.named(name)
+        if not boxes:
             raise Failed(f"no container {name}")
-        assert found[0].own is not None, f"{name} is not the operator's"
-        assert found[0].state != "removing"
-        return found[0]
+        assert boxes[0].own is not None, f"{name} is not the operator's"
+        assert boxes[0].state != "removing"
+        return boxes[0]
 
     def named(self, name: str) -> list[Box]:
         return [box for box in self.boxes if box.name == name]
@@ -272,8 +272,8 @@ class Engine:
             if uplink not in self.networks:
                 raise Failed("no uplink")
             published = published_ports(action.key, action.range, action.udp)
-            tcp = frozenset(port for what, port in published if what.endswith("/tcp"))
-            udp = frozenset(port for what, port in published if what.endswith("/udp"))
+            tcp = frozenset(port for exposed, port in published if exposed.endswith("/tcp"))
+            udp = frozenset(port for exposed, port in published if exposed.endswith("/udp"))
             self.join(self.add(name, labels=labels, ports=tcp, udp=udp), uplink)
         elif isinstance(action, CreateEar):
             self.add(name, labels=labels, udp=frozenset({action.bind.port}), mode="host")
@@ -289,8 +289,8 @@ class Engine:
     def start(self, box: Box) -> None:
         if box.state not in {"created", "exited"}:
             raise Failed(f"{box.name} is {box.state}")
-        for name, (known, _) in box.networks.items():
-            if name not in self.networks or known not in ("", self.networks[name].id):
+        for name, (network_id, _) in box.networks.items():
+            if name not in self.networks or network_id not in ("", self.networks[name].id):
                 raise Failed(f"network {name} not found")
         taken = self.conflicts(box)
         if box.role == ROLE_REDIRECT:
@@ -332,7 +332,7 @@ class Engine:
 
     def home(self, box: Box) -> Box | None:
         """The container whose network namespace another one shares."""
-        return next((one for one in self.boxes if box.mode == f"container:{one.id}"), None)
+        return next((owner for owner in self.boxes if box.mode == f"container:{owner.id}"), None)
 
     def _connect(self, box: Box, network: str, aliases: tuple[str, ...]) -> None:
         if network not in self.networks:
@@ -343,15 +343,15 @@ class Engine:
         assert box.role == ROLE_SANDBOX
         assert self.networks[network].internal or network >= uplink, "moves the published ports"
         for alias in aliases:
-            others = [
-                one.name
-                for one in self.boxes
-                if one.own is None
-                and network in one.networks
-                and alias in one.networks[network][1]
-                and one.state not in ("dead", "removing")
+            strangers = [
+                stranger.name
+                for stranger in self.boxes
+                if stranger.own is None
+                and network in stranger.networks
+                and alias in stranger.networks[network][1]
+                and stranger.state not in ("dead", "removing")
             ]
-            assert not others, f"{alias} on {network} is that of {others}"
+            assert not strangers, f"{alias} on {network} is that of {strangers}"
         self.join(box, network, *aliases)
 
 
@@ -364,15 +364,15 @@ class Controller:
         self.now = 1000.0
 
     def look(self) -> DockerPlan:
-        found = planned(self.engine.observe(), self.settings, self.memory, self.now)
-        self.memory = found.memory
-        return found
+        plan = planned(self.engine.observe(), self.settings, self.memory, self.now)
+        self.memory = plan.memory
+        return plan
 
-    def carry_out(self, found: DockerPlan, most: int | None = None) -> list[tuple[Action, Failed]]:
+    def carry_out(self, plan: DockerPlan, most: int | None = None) -> list[tuple[Action, Failed]]:
         """Carry out a plan's actions, or the first few. What fails is returned."""
         failed: list[tuple[Action, Failed]] = []
-        left = len(found.actions) if most is None else most
-        for group in found.groups:
+        left = len(plan.actions) if most is None else most
+        for group in plan.groups:
             for action in group.actions:
                 if left <= 0:
                     return failed

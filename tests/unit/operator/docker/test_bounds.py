@@ -29,8 +29,8 @@ def read(settings: PlanSettings = SETTINGS, env: str = "", **labels: str) -> tup
 ]:  # fmt: skip
     """The member of one container with these labels, and what it is told."""
     names = {f"rosproxy.{name.replace('_', '-')}": value for name, value in labels.items()}
-    one = container(labels={**ENABLED, **names}, env=env)
-    members, problems = read_members(observed(one), settings)
+    talker = container(labels={**ENABLED, **names}, env=env)
+    members, problems = read_members(observed(talker), settings)
     return next(iter(members), None), problems
 
 
@@ -91,8 +91,8 @@ def test_a_master_that_is_not_allowed() -> None:
         env = "http://api.example.com:8080" if "env" in given else ""
         labels = {} if env else given
         names = {f"rosproxy.{name.replace('_', '-')}": value for name, value in labels.items()}
-        one = container(labels={"rosproxy.enable": "true", **names}, env=env)
-        members, (problem,) = read_members(observed(one), allowing("robot", "arm*:11311"))
+        talker = container(labels={"rosproxy.enable": "true", **names}, env=env)
+        members, (problem,) = read_members(observed(talker), allowing("robot", "arm*:11311"))
         assert members == ()
         assert (problem.subject, problem.fatal) == ("container talker", True)
         source = "its variable ROS_MASTER_URI" if env else "label rosproxy.master-uri"
@@ -121,10 +121,10 @@ def test_by_default_no_master_is_below_port_1024(uri: str) -> None:
 
 
 def test_nothing_is_made_and_no_name_taken_for_a_master_that_is_not_allowed() -> None:
-    one = container(labels={**ENABLED, "rosproxy.master-uri": "http://api.example.com:443"})
-    found = planned(observed(one), SETTINGS, DockerMemory(), 0.0)
-    assert found.actions == ()
-    assert found.members == ()
+    talker = container(labels={**ENABLED, "rosproxy.master-uri": "http://api.example.com:443"})
+    plan = planned(observed(talker), SETTINGS, DockerMemory(), 0.0)
+    assert plan.actions == ()
+    assert plan.members == ()
 
 
 def test_a_label_takes_no_name_that_a_neighbour_answers_to() -> None:
@@ -132,8 +132,8 @@ def test_a_label_takes_no_name_that_a_neighbour_answers_to() -> None:
     labels = {**ENABLED, "rosproxy.master-uri": "http://db:5432"}
     for neighbour in (container("db", {}), container("x-db-1", {}, [place("app", "x-db-1", "DB")])):
         seen = observed(container(labels=labels), neighbour)
-        found = planned(seen, SETTINGS, DockerMemory(), 0.0)
-        (joined,) = [one for one in found.actions if isinstance(one, Connect)]
+        plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
+        (joined,) = [action for action in plan.actions if isinstance(action, Connect)]
         assert "db" not in joined.aliases
 
 
@@ -152,8 +152,8 @@ def test_more_ports_than_labels_may_ask_for(option: int, label: int, gets: int) 
         f"start the operator with --max-ports {label} if it is to have them"
     )
     seen = observed(container(labels={**ENABLED, "rosproxy.ports": str(label)}))
-    found = planned(seen, replace(SETTINGS, max_ports=option), DockerMemory(), 0.0)
-    (box,) = [one for one in found.actions if isinstance(one, CreateSandbox)]
+    plan = planned(seen, replace(SETTINGS, max_ports=option), DockerMemory(), 0.0)
+    (box,) = [action for action in plan.actions if isinstance(action, CreateSandbox)]
     assert len(box.range) == max(gets, SETTINGS.ports)
 
 
@@ -211,8 +211,8 @@ def test_slave_control(option: SlaveControl, label: str | None, gets: str, told:
     names = {"rosproxy.slave-control": label} if label else {}
     others = container("other")
     seen = observed(container(labels={**ENABLED, **names}), others)
-    found = planned(seen, settings, DockerMemory(), 0.0)
-    (made,) = [one for one in found.actions if isinstance(one, Create)]
+    plan = planned(seen, settings, DockerMemory(), 0.0)
+    (made,) = [action for action in plan.actions if isinstance(action, Create)]
     assert made.slave_control == gets
 
 

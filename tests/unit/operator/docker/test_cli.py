@@ -88,11 +88,11 @@ def test_lists_in_variables_and_a_secret_in_a_file(
     options = (
         main.commands["docker"].make_context("docker", [], auto_envvar_prefix="ROSPROXY").params
     )
-    found = make_plan_settings(options)
-    assert found.allow_master == ("robot:*", "arm*:11311")
-    assert found.allow_peer == ("robot:*", "*:11400")
-    assert found.allow_data_plane == ("kernel", "copy")
-    assert (found.proxy_memory, found.secret) == (512 * 1024**2, "s" * 32)
+    settings = make_plan_settings(options)
+    assert settings.allow_master == ("robot:*", "arm*:11311")
+    assert settings.allow_peer == ("robot:*", "*:11400")
+    assert settings.allow_data_plane == ("kernel", "copy")
+    assert (settings.proxy_memory, settings.secret) == (512 * 1024**2, "s" * 32)
     file.write_text("short")
     result = run("docker", "plan", ROSPROXY_SECRET_FILE=str(file))
     assert "must hold at least 32 characters: openssl rand -hex 32" in result.stderr
@@ -131,8 +131,8 @@ def test_once_is_for_the_controller_itself() -> None:
 
 
 def test_a_problem_with_an_odd_name_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [Problem("container a\nforged", "\x1b[2J is no port")]
-    monkeypatch.setattr("rosproxy_operator.docker.controller.run_once", lambda *_: found)
+    problems = [Problem("container a\nforged", "\x1b[2J is no port")]
+    monkeypatch.setattr("rosproxy_operator.docker.controller.run_once", lambda *_: problems)
     result = run("docker", "--once")
     assert result.exit_code == 1
     assert result.stderr == "rosproxy-operator: container a\\nforged: \\x1b[2J is no port\n"

@@ -9,7 +9,7 @@ import urllib3
 from rosproxy_operator.docker.errors import (
     Conflict,
     EngineError,
-    Gone,
+    NoSuchObject,
     PortTaken,
     refusal,
     unreachable,
@@ -65,7 +65,7 @@ def test_an_address_that_is_not_this_hosts() -> None:
     "text", ["No such container: nope", "network nope not found", "No such image: nope:latest"]
 )
 def test_gone(text: str) -> None:
-    assert isinstance(refusal(404, text, ""), Gone)
+    assert isinstance(refusal(404, text, ""), NoSuchObject)
 
 
 def test_a_conflict_without_the_long_ids() -> None:

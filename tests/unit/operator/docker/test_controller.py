@@ -121,12 +121,14 @@ async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, nam
     assert not look.state.own
     assert not look.state.busy
     assert not look.access
-    found = next(one for one in look.state.containers if one.name == name)
-    assert found.host_ports == {18080, 11400}
+    container = next(c for c in look.state.containers if c.name == name)
+    assert container.host_ports == {18080, 11400}
     planned = plan(look.state, look.labels, SETTINGS, DockerMemory(), 0.0)
     assert CreateSandbox in map(type, planned.actions)
-    assert name not in {one.name for one in planned.actions}
-    (told,) = [one.text for one in planned.problems if one.subject == f"container {name}"]
+    assert name not in {action.name for action in planned.actions}
+    (told,) = [
+        problem.text for problem in planned.problems if problem.subject == f"container {name}"
+    ]
     assert "left alone" in told
     assert f"docker rm -f {name}" in told
     assert not any(11400 in ports for ports in planned.memory.planned.values())
@@ -224,16 +226,16 @@ async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngi
     """The list shows it as ended before and after."""
     looking = observer()
     seen = replace((await looking.look(5.0)).state, image_id=IMAGE)
-    there = HostPort("192.0.2.7", 11311)
-    made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", there, HostPort("172.18.0.9", 11311))
+    master = HostPort("192.0.2.7", 11311)
+    made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", master, HostPort("172.18.0.9", 11311))
     made = _with_fingerprint(made, seen, SETTINGS)
     row = own(made, "r" * 64, f"container:{'c' * 64}", "") | {"State": "exited"}
     state = {"Status": "exited", "StartedAt": "1", "ExitCode": 1}
     engine.add(row, inspection(redirect_config(made, SETTINGS)) | {"State": state})
-    assert [one.done for one in (await looking.look(5.0)).state.redirects] == [False]
+    assert [redirect.done for redirect in (await looking.look(5.0)).state.redirects] == [False]
     state["ExitCode"] = 0
     looking.mark_doubtful("r" * 64)
-    assert [one.done for one in (await looking.look(5.0)).state.redirects] == [True]
+    assert [redirect.done for redirect in (await looking.look(5.0)).state.redirects] == [True]
 
 
 async def test_the_list_tells_that_a_proxy_has_ended(engine: FakeEngine) -> None:
@@ -257,9 +259,9 @@ async def test_a_start_that_no_event_told_is_found(
     looking = DockerObserver(DockerClient(), SETTINGS, resolver, lambda: told.append(True))
 
     async def look() -> str:
-        found = await looking.look(5.0)
+        host_snapshot = await looking.look(5.0)
         assert not looking.waiting
-        return found.access[proxy_name(KEY)].run
+        return host_snapshot.access[proxy_name(KEY)].run
 
     first = await look()
     assert inspected_again(engine) >= {"p"}

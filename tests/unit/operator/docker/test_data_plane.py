@@ -45,18 +45,18 @@ def asking(name: str, plane: str, state: str = "running") -> Container:
 
 def look(
     *containers: Container,
-    there: tuple[Sandbox, Proxy] | None = None,
+    existing_pair: tuple[Sandbox, Proxy] | None = None,
     settings: PlanSettings = SETTINGS,
     memory: DockerMemory | None = None,
     now: float = 0.0,
 ) -> DockerPlan:
-    boxes, proxies = ([there[0]], [there[1]]) if there else ([], [])
+    boxes, proxies = ([existing_pair[0]], [existing_pair[1]]) if existing_pair else ([], [])
     seen = observed(*containers, sandboxes=boxes, proxies=proxies)
     return planned(seen, settings, memory or DockerMemory(), now)
 
 
-def given(found: DockerPlan) -> DataPlane:
-    return found.desired[0].data_plane
+def given(plan: DockerPlan) -> DataPlane:
+    return plan.desired[0].data_plane
 
 
 def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
@@ -83,19 +83,19 @@ def test_nobody_asks_for_anything() -> None:
 @pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy", " Kernel "])
 def test_a_label_goes_before_the_option(plane: str) -> None:
     for option in ("auto", "kernel", "copy"):
-        found = look(asking("a", plane), settings=replace(SETTINGS, data_plane=option))
-        assert given(found) == plane.strip().lower()
-        assert found.problems == ()
+        plan = look(asking("a", plane), settings=replace(SETTINGS, data_plane=option))
+        assert given(plan) == plane.strip().lower()
+        assert plan.problems == ()
 
 
 def test_who_is_outvoted_is_told() -> None:
-    found = look(asking("a", "copy"), asking("b", "kernel"), container("c"), asking("d", "auto"))
-    assert given(found) == "kernel"
-    assert [(p.subject, p.fatal) for p in found.problems] == [
+    plan = look(asking("a", "copy"), asking("b", "kernel"), container("c"), asking("d", "auto"))
+    assert given(plan) == "kernel"
+    assert [(p.subject, p.fatal) for p in plan.problems] == [
         ("container a", False),
         ("container d", False),
     ]
-    assert found.problems[0].text == (
+    assert plan.problems[0].text == (
         "label rosproxy.data-plane=copy is ignored: its proxy also serves b, which asks for "
         "kernel; give both the same"
     )
@@ -153,32 +153,32 @@ def test_the_plan_names_the_capability() -> None:
 
 
 def test_all_is_as_it_ought_to_be() -> None:
-    assert look(asking("a", "kernel"), there=own("kernel", forwards=True)).actions == ()
-    assert look(asking("a", "splice"), there=own("splice", forwards=False)).actions == ()
+    assert look(asking("a", "kernel"), existing_pair=own("kernel", forwards=True)).actions == ()
+    assert look(asking("a", "splice"), existing_pair=own("splice", forwards=False)).actions == ()
 
 
 def test_the_kernel_plane_makes_both_anew() -> None:
-    found = look(asking("a", "kernel"), there=own("auto", forwards=False))
-    assert made(found.actions) == ([True], ["kernel"])
+    plan = look(asking("a", "kernel"), existing_pair=own("auto", forwards=False))
+    assert made(plan.actions) == ([True], ["kernel"])
 
 
 @pytest.mark.parametrize("plane", ["auto", "splice", "copy"])
 def test_who_gives_the_kernel_plane_up_leaves_no_rules_behind(plane: DataPlane) -> None:
     """A proxy that was killed has not taken them away, and its successor can't."""
-    found = look(asking("a", plane), there=own("kernel", forwards=True))
-    assert made(found.actions) == ([False], [plane])
+    plan = look(asking("a", plane), existing_pair=own("kernel", forwards=True))
+    assert made(plan.actions) == ([False], [plane])
 
 
 def test_between_other_planes_the_sandbox_stays() -> None:
-    found = look(asking("a", "copy"), there=own("splice", forwards=False))
-    assert made(found.actions) == ([], ["copy"])
+    plan = look(asking("a", "copy"), existing_pair=own("splice", forwards=False))
+    assert made(plan.actions) == ([], ["copy"])
 
 
 def test_a_container_that_is_restarted_does_not_change_the_plane() -> None:
-    there = own("kernel", forwards=True)
+    pair = own("kernel", forwards=True)
     who = container("b"), asking("a", "kernel", state="exited")
-    first = look(*who, there=there)
+    first = look(*who, existing_pair=pair)
     assert first.actions == ()
-    assert look(*who, there=there, memory=first.memory, now=59.0).actions == ()
-    found = look(*who, there=there, memory=first.memory, now=60.0)
-    assert made(found.actions) == ([False], ["auto"])
+    assert look(*who, existing_pair=pair, memory=first.memory, now=59.0).actions == ()
+    plan = look(*who, existing_pair=pair, memory=first.memory, now=60.0)
+    assert made(plan.actions) == ([False], ["auto"])

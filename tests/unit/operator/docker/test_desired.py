@@ -41,8 +41,8 @@ def want(
     members, _ = read_members(seen, settings)
     memory = with_exited(memory or DockerMemory(), members, now)
     desired, problems = desire(seen, settings, members, memory, now)
-    assert list(desired) == sorted(desired, key=lambda one: one.key)
-    return {one.key: one for one in desired}, problems
+    assert list(desired) == sorted(desired, key=lambda proxy: proxy.key)
+    return {proxy.key: proxy for proxy in desired}, problems
 
 
 def names(*containers: Container, **more: Any) -> tuple[dict[tuple[Key, str], set[str]], list[str]]:
@@ -50,7 +50,7 @@ def names(*containers: Container, **more: Any) -> tuple[dict[tuple[Key, str], se
     seen = observed(*containers, **more)
     given, problems = assign_aliases([*want(seen)[0].values()], seen)
     told = [problem.subject.removeprefix("container ") for problem in problems]
-    places = {(key, name): set(found) for key in given for name, found in given[key].items()}
+    places = {(key, name): set(aliases) for key in given for name, aliases in given[key].items()}
     return places, told
 
 
@@ -97,8 +97,8 @@ LATER = [Network("n3", name) for name in ("00", "0-zoo", "Lab", "_x", "1")]
 @pytest.mark.parametrize("network", [*EARLY, *LATER, Network("n3", "0-app", internal=True)])
 def test_a_network_that_would_take_the_published_ports_is_not_joined(network: Network) -> None:
     """Its name would sort first. An internal one takes nothing."""
-    one = container(networks=("app", network.name))
-    desired, problems = want(observed(one, networks=(UPLINK, APP, network)))
+    talker = container(networks=("app", network.name))
+    desired, problems = want(observed(talker, networks=(UPLINK, APP, network)))
     if network not in EARLY:
         assert desired[KEY].networks == {"app", network.name}
         assert problems == ()
@@ -117,8 +117,8 @@ def test_an_early_network_that_nobody_asks_for_is_no_problem() -> None:
 
 def test_networks_of_who_has_exited_stay_joined_for_the_grace() -> None:
     gone = container("b", networks=("lab",), state="exited")
-    there = [sandbox(networks=("app", "lab"))]
-    seen = observed(container("a"), gone, networks=(UPLINK, APP, LAB), sandboxes=there)
+    sandboxes = [sandbox(networks=("app", "lab"))]
+    seen = observed(container("a"), gone, networks=(UPLINK, APP, LAB), sandboxes=sandboxes)
     assert want(seen)[0][KEY].networks == {"app", "lab"}
     since = DockerMemory(exited={gone.id: 0.0})
     assert want(seen, since, 59.0)[0][KEY].networks == {"app", "lab"}
@@ -145,7 +145,7 @@ def test_a_master_that_is_an_address_gives_no_name() -> None:
     labels = {**ENABLED, "rosproxy.master-uri": "http://192.0.2.7:11311"}
     given, told = names(container(labels=labels))
     assert told == []
-    assert [len(found) for found in given.values()] == [2]
+    assert [len(aliases) for aliases in given.values()] == [2]
 
 
 def test_a_masters_name_that_another_container_has_is_not_taken() -> None:
@@ -217,7 +217,7 @@ def test_the_one_who_lingers_keeps_it_as_long() -> None:
 
 
 @pytest.mark.parametrize(
-    ("there", "has_it", "told"),
+    ("sandboxes", "has_it", "told"),
     [
         ([sandbox(ARM)], True, []),
         ([sandbox(ARM, state="restarting")], False, ["a"]),
@@ -226,11 +226,11 @@ def test_the_one_who_lingers_keeps_it_as_long() -> None:
     ids=["it leaves", "it can't leave now", "it can't leave now, but the other one has it, too"],
 )
 def test_a_proxy_that_nobody_wants_keeps_its_name_until_it_has_left(
-    there: list, has_it: bool, told: list[str]
+    sandboxes: list, has_it: bool, told: list[str]
 ) -> None:
     """One that the engine is restarting answers again in a moment, and then both would."""
-    given, found = names(container("a"), sandboxes=there)
-    assert (("rosproxy" in given[KEY, "app"]), found) == (has_it, told)
+    given, told_names = names(container("a"), sandboxes=sandboxes)
+    assert (("rosproxy" in given[KEY, "app"]), told_names) == (has_it, told)
     assert given[KEY, "app"] >= {"robot", NAME}
 
 

@@ -30,8 +30,8 @@ CELL = Network("n2", "cell", internal=True)
 PROXY = Create("p", KEY, RANGE, "s")
 
 
-def labelled(name: str, word: str, network: str = "app", state: str = "running") -> Container:
-    return container(name, {**ENABLED, LABEL: word}, [network], state)
+def labelled(name: str, direction: str, network: str = "app", state: str = "running") -> Container:
+    return container(name, {**ENABLED, LABEL: direction}, [network], state)
 
 
 def inside(name: str) -> Container:
@@ -42,10 +42,10 @@ def direction_of(
     *containers: Container, option: Direction = "out", now: float = 0.0, memory: DockerMemory
 ) -> Direction:
     seen = observed(*containers, networks=[UPLINK, APP, CELL])
-    found = planned(seen, replace(SETTINGS, direction=option), memory, now)
-    made = [one.direction for one in found.actions if isinstance(one, Create)]
-    assert made in ([], [found.desired[0].direction])
-    return found.desired[0].direction
+    plan = planned(seen, replace(SETTINGS, direction=option), memory, now)
+    made = [action.direction for action in plan.actions if isinstance(action, Create)]
+    assert made in ([], [plan.desired[0].direction])
+    return plan.desired[0].direction
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_the_proxy_is_told(direction: Direction) -> None:
 
 def test_another_direction_makes_a_proxy_anew() -> None:
     digests = {
-        proxy_fingerprint(structs.replace(PROXY, direction=one), SETTINGS, IMAGE, SECRET)
-        for one in ("out", "both")
+        proxy_fingerprint(structs.replace(PROXY, direction=direction), SETTINGS, IMAGE, SECRET)
+        for direction in ("out", "both")
     }
     assert len(digests) == 2

@@ -74,7 +74,7 @@ def own(made: Any, places: tuple[Attachment, ...] = (), mode: str = "host") -> C
     )  # fmt: skip
 
 
-def there(near: str = NEAR, ear: CreateEar | None = MADE) -> dict[str, Any]:
+def running_proxy(near: str = NEAR, ear: CreateEar | None = MADE) -> dict[str, Any]:
     """A proxy for ROS 2 that runs, with its ear."""
     box = structs.replace(BOX, fingerprint=sandbox_fingerprint(BOX, SETTINGS))
     made = proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET)
@@ -102,28 +102,28 @@ TALKER = container(labels=TWO)
 
 
 def test_a_proxy_waits_for_the_uplink_where_its_ear_is_to_listen() -> None:
-    found = look(observed(TALKER, networks=[APP]))
-    assert list(found.actions) == [CreateNetwork(SETTINGS.uplink)]
-    assert isinstance(found.deferred[0].actions[0], CreateSandbox)
+    plan = look(observed(TALKER, networks=[APP]))
+    assert list(plan.actions) == [CreateNetwork(SETTINGS.uplink)]
+    assert isinstance(plan.deferred[0].actions[0], CreateSandbox)
 
 
 def test_the_ear_is_made_once_its_proxy_has_an_address() -> None:
     made = actions(observed(TALKER))
-    assert [type(one) for one in made] == [CreateSandbox, Start, *map(type, made[2:])]
-    assert not any(isinstance(one, CreateEar) for one in made)
-    assert next(one for one in made if isinstance(one, Create)).ear == EAR
+    assert [type(action) for action in made] == [CreateSandbox, Start, *map(type, made[2:])]
+    assert not any(isinstance(action, CreateEar) for action in made)
+    assert next(action for action in made if isinstance(action, Create)).ear == EAR
 
-    create, start = actions(observed(TALKER, **there(ear=None)))
+    create, start = actions(observed(TALKER, **running_proxy(ear=None)))
 
     fingerprint = ear_fingerprint(MADE, SETTINGS, IMAGE)
     assert create == structs.replace(MADE, fingerprint=fingerprint)
     assert start == Start(MADE.name)
-    assert actions(observed(TALKER, **there())) == []
+    assert actions(observed(TALKER, **running_proxy())) == []
 
 
 def test_the_ear_is_made_anew_when_its_proxy_has_another_address() -> None:
     old = f"{MADE.name}-old"
-    rename, create, remove, start = actions(observed(TALKER, **there("172.30.0.7")))
+    rename, create, remove, start = actions(observed(TALKER, **running_proxy("172.30.0.7")))
     assert (rename.name, remove, start) == (
         MADE.name, Remove(old, "made anew"), Start(MADE.name),
     )  # fmt: skip
@@ -133,23 +133,23 @@ def test_the_ear_is_made_anew_when_its_proxy_has_another_address() -> None:
 
 def test_the_ear_goes_before_its_sandbox_is_made_anew() -> None:
     more = container(labels={**TWO, "rosproxy.ports": "40"})
-    found = actions(observed(more, **there()))
-    assert found[0] == Remove(MADE.name, "its proxy gets another address")
-    assert any(isinstance(one, CreateSandbox) and len(one.range) == 40 for one in found)
-    assert not any(isinstance(one, CreateEar) for one in found)
+    steps = actions(observed(more, **running_proxy()))
+    assert steps[0] == Remove(MADE.name, "its proxy gets another address")
+    assert any(isinstance(action, CreateSandbox) and len(action.range) == 40 for action in steps)
+    assert not any(isinstance(action, CreateEar) for action in steps)
 
 
 def test_all_three_go_when_nobody_wants_them() -> None:
-    found = look(observed(**there()), replace(SETTINGS, grace=0.0))
-    assert [one.name for one in found.actions] == [MADE.name, PROXY.name, BOX.name]
+    plan = look(observed(**running_proxy()), replace(SETTINGS, grace=0.0))
+    assert [action.name for action in plan.actions] == [MADE.name, PROXY.name, BOX.name]
 
 
 def test_no_lan_no_ear() -> None:
     deaf = replace(SETTINGS, ros2_lan="none")
-    found = look(observed(TALKER, **there()), deaf)
-    assert Remove(MADE.name, "the LAN is not to be heard") in found.actions
-    assert not found.problems
-    (create,) = (one for one in actions(observed(TALKER), deaf) if isinstance(one, Create))
+    plan = look(observed(TALKER, **running_proxy()), deaf)
+    assert Remove(MADE.name, "the LAN is not to be heard") in plan.actions
+    assert not plan.problems
+    (create,) = (action for action in actions(observed(TALKER), deaf) if isinstance(action, Create))
     assert create.ear is None
 
 
@@ -164,9 +164,9 @@ def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_ar
             TALKER, far=far,
             sandboxes=[Sandbox(key, own(box, place, "app"), RANGE, box.fingerprint)],
         )  # fmt: skip
-        found = look(state, settings)
-        told = [p.text for p in found.problems if "does not hear the LAN" in p.text]
-        return [one.lan for one in found.actions if isinstance(one, CreateEar)] or told
+        plan = look(state, settings)
+        told = [p.text for p in plan.problems if "does not hear the LAN" in p.text]
+        return [action.lan for action in plan.actions if isinstance(action, CreateEar)] or told
 
     assert lan(HERE, "192.0.2.77") == ["192.0.2.77"]
     assert lan(HERE, "", "192.0.2.99") == [HERE]
@@ -181,32 +181,32 @@ def test_udp_ports_alone_are_in_its_way() -> None:
         listening=[11411, 11412],
         listening_udp=frozenset({11420}),
     )
-    (box,) = (one for one in actions(state) if isinstance(one, CreateSandbox))
+    (box,) = (action for action in actions(state) if isinstance(action, CreateSandbox))
     assert box.range == PortRange(11421, 11452)
 
 
 def test_its_own_well_known_ports_are_not_in_its_range() -> None:
     labels = {**TWO, "rosproxy.domain": "16"}  # 7400 + 250 * 16 = 11400
-    (box,) = (one for one in actions(observed(container(labels=labels)))
-              if isinstance(one, CreateSandbox))  # fmt: skip
+    (box,) = (action for action in actions(observed(container(labels=labels)))
+              if isinstance(action, CreateSandbox))  # fmt: skip
     assert box.range.first == 11411
 
 
 def test_both_versions_have_ports_of_their_own() -> None:
     labels = {**TWO, "rosproxy.ros": "1,2", "rosproxy.master-uri": "http://192.0.2.7:11311"}
-    boxes = [one for one in actions(observed(container(labels=labels)))
-             if isinstance(one, CreateSandbox)]  # fmt: skip
+    boxes = [action for action in actions(observed(container(labels=labels)))
+             if isinstance(action, CreateSandbox)]  # fmt: skip
     assert {(box.key.domain, str(box.range)) for box in boxes} == {
         (0, "11400-11431"), (None, "11432-11463"),
     }  # fmt: skip
 
 
 def test_peers_of_all_containers_are_told() -> None:
-    one = container("one", {**TWO, "rosproxy.peers": "robot"})
-    other = container("other", {**TWO, "rosproxy.peers": "arm:11400"})
+    first = container("one", {**TWO, "rosproxy.peers": "robot"})
+    second = container("other", {**TWO, "rosproxy.peers": "arm:11400"})
     settings = replace(SETTINGS, ros2_peer=("laptop",))
-    (made,) = (each for each in actions(observed(one, other), settings)
-               if isinstance(each, Create))  # fmt: skip
+    (made,) = (action for action in actions(observed(first, second), settings)
+               if isinstance(action, Create))  # fmt: skip
     assert made.peers == ("arm:11400", "laptop", "robot")
 
 
@@ -263,8 +263,8 @@ def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
     making = inspection(ear_config(MADE, SETTINGS))
     making["HostConfig"][field] = value
     own = OwnLabels("ear", KEY, RANGE, "")
-    found = forgery_reason(own, MADE.name, read_making(making), IMAGE)
-    assert found == f"its HostConfig.{field} is not the operator's"
+    reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)
+    assert reason == f"its HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(

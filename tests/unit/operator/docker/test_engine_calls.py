@@ -89,10 +89,12 @@ async def test_the_documentation_lists_exactly_what_is_called(engine: FakeEngine
         await carry_out(action)
     listed = re.findall(r"^(?:GET|POST|DELETE) /\S+$", PERMISSIONS.read_text(), re.M)
     assert [
-        call for call in listed if not any(re.fullmatch(call, one) for one in engine.calls)
+        pattern
+        for pattern in listed
+        if not any(re.fullmatch(pattern, call) for call in engine.calls)
     ] == []
     assert [
-        one for one in engine.calls if not any(re.fullmatch(call, one) for call in listed)
+        call for call in engine.calls if not any(re.fullmatch(pattern, call) for pattern in listed)
     ] == []
 
 
@@ -174,15 +176,15 @@ async def test_anything_else_is_an_error(engine: FakeEngine, action: Action) -> 
 
 
 @pytest.mark.parametrize(
-    "found",
+    "inspected",
     [
         {"Config": {"Labels": None}},
         {"Config": {"Labels": own_labels(BOX), "User": "root"}, "HostConfig": {}},
     ],
     ids=["without labels", "with forged ones"],
 )
-async def test_a_name_that_a_stranger_has(engine: FakeEngine, found: dict[str, Any]) -> None:
+async def test_a_name_that_a_stranger_has(engine: FakeEngine, inspected: dict[str, Any]) -> None:
     engine.refuses["POST /containers/create"] = (409, "in use")
-    engine.knows[f"/containers/{BOX.name}/json"] = found
+    engine.knows[f"/containers/{BOX.name}/json"] = inspected
     with pytest.raises(EngineError, match=f"{BOX.name} that this operator did not make; rename it"):
         await carry_out(ACTIONS[1])

@@ -41,11 +41,11 @@ class Host:
         return self.time
 
     async def carry_out(self, action: Action) -> None:
-        what = self.does.get(action)
-        if isinstance(what, asyncio.Event):
-            await what.wait()
-        elif what is not None:
-            raise what
+        behaviour = self.does.get(action)
+        if isinstance(behaviour, asyncio.Event):
+            await behaviour.wait()
+        elif behaviour is not None:
+            raise behaviour
         self.done.append(action)
 
     async def start(self, *groups: Group) -> None:
@@ -75,12 +75,12 @@ async def test_a_group_is_carried_out_in_order(host: Host) -> None:
 
 
 async def test_the_uplink_comes_first(host: Host) -> None:
-    there = asyncio.Event()
-    host.does[UPLINK.actions[0]] = there
+    uplink_ready = asyncio.Event()
+    host.does[UPLINK.actions[0]] = uplink_ready
     host.begin(UPLINK, Group(ONE, (Start("a"),)))
     await asyncio.sleep(0.01)
     assert host.done == []
-    there.set()
+    uplink_ready.set()
     while host.work.busy:
         await asyncio.sleep(0.01)
     assert host.done == [UPLINK.actions[0], Start("a")]

@@ -51,9 +51,9 @@ def test_own_addresses() -> None:
 @pytest.fixture
 def routes(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """The address that connections to an address come from; far ones from 10.0.0.7."""
-    known: dict[str, str] = {}
-    monkeypatch.setattr(host, "address_towards", lambda to: known.get(to, "10.0.0.7"))
-    return known
+    source_addresses: dict[str, str] = {}
+    monkeypatch.setattr(host, "address_towards", lambda to: source_addresses.get(to, "10.0.0.7"))
+    return source_addresses
 
 
 def test_the_address_towards_a_master(routes: dict[str, str]) -> None:

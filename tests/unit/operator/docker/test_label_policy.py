@@ -40,9 +40,11 @@ def layer(name: str, *addresses: str, rules: tuple[Rule, ...] = RULES) -> Policy
 
 
 def read(text: str) -> tuple[tuple[Member, ...], str]:
-    one = container(labels={**ENABLED, "rosproxy.policy": text})
-    members, problems = read_members(observed(one))
-    assert all((one.subject, one.fatal) == ("container talker", True) for one in problems)
+    talker = container(labels={**ENABLED, "rosproxy.policy": text})
+    members, problems = read_members(observed(talker))
+    assert all(
+        (problem.subject, problem.fatal) == ("container talker", True) for problem in problems
+    )
     return members, "".join(problem.text for problem in problems)
 
 
@@ -89,25 +91,25 @@ def test_a_layer_is_for_the_addresses_of_its_container() -> None:
     seen = observed(
         talker, guest, soon, ended, **{**own, "sandboxes": [replace(box, container=home)]}
     )
-    members = [Member(one, KEY, policy=RULES) for one in (talker, guest, soon, ended)]
+    members = [Member(c, KEY, policy=RULES) for c in (talker, guest, soon, ended)]
     plain = Member(container("plain", networks=[Attachment("app", B)]), KEY)
     other = Member(talker, Key("http://other:11311", "192.0.2.10"), policy=RULES)
-    known = network_facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
-    assert known.policy == (*COMMON, layer("talker", A), layer("guest", A))
+    facts = network_facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
+    assert facts.policy == (*COMMON, layer("talker", A), layer("guest", A))
 
 
 def test_a_proxy_is_made_with_the_layers_of_its_containers() -> None:
     """Its nodes may register before the operator has told it anything."""
     labels = {**ENABLED, "rosproxy.policy": "deny publish /camera/*"}
     seen = observed(container("talker", labels, [Attachment("app", A)]))
-    found = planned(seen, replace(SETTINGS, policy=COMMON), DockerMemory(), 0.0)
-    (made,) = [one for one in found.actions if isinstance(one, Create)]
+    plan = planned(seen, replace(SETTINGS, policy=COMMON), DockerMemory(), 0.0)
+    (made,) = [action for action in plan.actions if isinstance(action, Create)]
     assert made.policy == (layer("talker", A),)
     body = container_config(made, replace(SETTINGS, policy=COMMON), "t", "")
-    variables = dict(one.split("=", 1) for one in body["Env"])
+    variables = dict(variable.split("=", 1) for variable in body["Env"])
     assert settings_of(variables).policy_layers == (*COMMON, layer("talker", A))
     plain = structs.replace(made, policy=())
-    assert len({proxy_fingerprint(one, SETTINGS, "", "") for one in (made, plain)}) == 1
+    assert len({proxy_fingerprint(create, SETTINGS, "", "") for create in (made, plain)}) == 1
 
 
 def test_what_a_container_that_has_gone_hid_stays_hidden_until_its_nodes_are_gone() -> None:
@@ -139,8 +141,8 @@ def test_the_same_look_is_the_same_policy() -> None:
     first, second = ProxyNews(), ProxyNews()
     for news, order in ((first, layers), (second, layers[::-1])):
         seen = observed(**both())
-        known = replace(network_facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
-        news.look(known, 0.0)
+        facts = replace(network_facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
+        news.look(facts, 0.0)
     assert first.policy == second.policy
     assert first.policy[0] == COMMON[0]
 
@@ -156,7 +158,7 @@ def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
     settings = replace(SETTINGS, policy=administrators_policy([RULES * 400], "enforce"))
     members = crowd(a=100, b=100, c=1, d=100, e=100, f=100, g=100, h=0)
     left, (problem,) = within_bounds(members, settings)
-    assert {one.container.name for one in left} == set("abcdefh")
+    assert {member.container.name for member in left} == set("abcdefh")
     assert (problem.subject, problem.fatal) == ("container g", True)
     assert "can't hold its rules besides those of others (at most 1000" in problem.text
     assert within_bounds(members, SETTINGS) == (tuple(members), ())
@@ -164,7 +166,7 @@ def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
 
 def test_proxies_are_bounded_each_for_itself() -> None:
     other = Key("http://other:11311", "192.0.2.10")
-    more = [replace(one, key=other) for one in crowd(x=100)]
+    more = [replace(member, key=other) for member in crowd(x=100)]
     members = [*crowd(**{f"c{number}": 100 for number in range(10)}), *more]
     assert within_bounds(members, SETTINGS)[1] == ()
 
@@ -172,8 +174,8 @@ def test_proxies_are_bounded_each_for_itself() -> None:
 def test_the_plan_leaves_out_whom_a_proxy_can_not_hold() -> None:
     label = {"rosproxy.policy": "; ".join(["deny publish /a"] * MOST_LABEL_RULES)}
     seen = observed(*(container(f"c{n:02}", labels={**ENABLED, **label}) for n in range(11)))
-    found = planned(seen, SETTINGS, DockerMemory(), 0.0)
-    assert [one.container.name for one in found.members] == [f"c{n:02}" for n in range(10)]
-    assert [one.subject for one in found.problems if "rosproxy.policy" in one.text] == [
+    plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
+    assert [member.container.name for member in plan.members] == [f"c{n:02}" for n in range(10)]
+    assert [problem.subject for problem in plan.problems if "rosproxy.policy" in problem.text] == [
         "container c10"
     ]

@@ -31,33 +31,35 @@ EXPOSING = replace(SETTINGS, expose_by_default=True)
 
 
 def read(
-    one: Container, settings: PlanSettings = SETTINGS, *others: Container, **more
+    container: Container, settings: PlanSettings = SETTINGS, *others: Container, **more
 ) -> tuple[Member | None, list[Problem]]:
     """The member of one container, if any, and its problems."""
-    members, problems = read_members(observed(one, *others, **more), settings)
-    mine = [problem for problem in problems if problem.subject == f"container {one.name}"]
-    return next((member for member in members if member.container == one), None), mine
+    members, problems = read_members(observed(container, *others, **more), settings)
+    mine = [problem for problem in problems if problem.subject == f"container {container.name}"]
+    return next((member for member in members if member.container == container), None), mine
 
 
-def refusal(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
+def refusal(container: Container, settings: PlanSettings = SETTINGS, **more) -> str:
     """Why a container is left out."""
-    member, problems = read(one, settings, **more)
+    member, problems = read(container, settings, **more)
     assert member is None
     assert problems[-1].fatal
     return problems[-1].text
 
 
-def warning(one: Container) -> str:
+def warning(container: Container) -> str:
     """What a container is told that has its member nevertheless."""
-    member, problems = read(one)
+    member, problems = read(container)
     assert member is not None
     assert [problem.fatal for problem in problems] == [False]
     return problems[0].text
 
 
-def good(one: Container, settings: PlanSettings = SETTINGS, *others: Container, **more) -> Member:
+def good(
+    container: Container, settings: PlanSettings = SETTINGS, *others: Container, **more
+) -> Member:
     """The member of a container with which nothing is wrong."""
-    member, problems = read(one, settings, *others, **more)
+    member, problems = read(container, settings, *others, **more)
     assert member is not None
     assert problems == []
     return member
@@ -65,9 +67,9 @@ def good(one: Container, settings: PlanSettings = SETTINGS, *others: Container, 
 
 def test_a_labelled_container_wishes_for_a_proxy() -> None:
     labels = {**ENABLED, "rosproxy.ports": "40", "rosproxy.advertise-host": "Host.lab"}
-    one = container(labels=labels, networks=("app", "lab"))
-    assert good(one) == Member(
-        one, Key(ROBOT, "host.lab"), 40, frozenset({"app", "lab"}), "rosproxy"
+    talker = container(labels=labels, networks=("app", "lab"))
+    assert good(talker) == Member(
+        talker, Key(ROBOT, "host.lab"), 40, frozenset({"app", "lab"}), "rosproxy"
     )
 
 
@@ -254,13 +256,13 @@ def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
 
 def test_who_says_what_this_host_is_called() -> None:
     labelled = container(labels={**ENABLED, "rosproxy.advertise-host": "[2001:db8::5]"})
-    found = {"robot": "192.0.2.99"}
-    for one, settings, host in (
+    addresses = {"robot": "192.0.2.99"}
+    for talker, settings, host in (
         (labelled, SETTINGS, "2001:db8::5"),
         (container(), SETTINGS, HERE),
         (container(), PlanSettings(), "192.0.2.99"),
     ):
-        assert good(one, settings, advertise=found).key.advertise_host == host
+        assert good(talker, settings, advertise=addresses).key.advertise_host == host
 
 
 def test_loopback_is_no_address_for_others() -> None:
@@ -333,8 +335,8 @@ def test_one_network_of_several(
 
 
 def test_a_network_that_it_is_not_on() -> None:
-    one = container(labels={**ENABLED, "rosproxy.network": "app2"}, networks=("lab", "app"))
-    assert refusal(one) == (
+    talker = container(labels={**ENABLED, "rosproxy.network": "app2"}, networks=("lab", "app"))
+    assert refusal(talker) == (
         "label rosproxy.network='app2' names no network of the container; it has: app, lab"
     )
 
@@ -357,16 +359,16 @@ def test_networks_where_no_proxy_is_found(networks: tuple[str, ...], mode: str, 
 
 def test_the_network_of_another_container() -> None:
     pod = container("pod", {}, ("app", "lab"))
-    one = container("talker", networks=(), mode="container:id-pod")
+    talker = container("talker", networks=(), mode="container:id-pod")
     two = container("two", networks=(), mode="container:id-talker")
-    for each, other in ((one, two), (two, one)):
-        assert good(each, SETTINGS, pod, other).networks == {"app", "lab"}
+    for guest, other in ((talker, two), (two, talker)):
+        assert good(guest, SETTINGS, pod, other).networks == {"app", "lab"}
 
 
 def test_the_network_of_a_container_that_is_gone() -> None:
-    one = container(networks=(), mode="container:id-pod")
-    assert "shares the network of a container ('id-pod') that is not there" in refusal(one)
-    assert "not there" in refusal(replace(one, network_mode="container:id-talker"))
+    talker = container(networks=(), mode="container:id-pod")
+    assert "shares the network of a container ('id-pod') that is not there" in refusal(talker)
+    assert "not there" in refusal(replace(talker, network_mode="container:id-talker"))
 
 
 # states
@@ -398,8 +400,8 @@ def test_everybody_with_a_master_is_exposed() -> None:
 
 
 def test_who_has_not_asked_is_no_failure() -> None:
-    one = container(labels={}, env=ROBOT, networks=("host",))
-    member, problems = read(one, EXPOSING)
+    talker = container(labels={}, env=ROBOT, networks=("host",))
+    member, problems = read(talker, EXPOSING)
     assert member is None
     assert [problem.fatal for problem in problems] == [False]
 
@@ -427,14 +429,14 @@ def test_a_container_with_the_operators_own_label() -> None:
 
 
 def test_whose_address_is_needed() -> None:
-    there = Key("http://left:11311", HERE)
+    proxy_key = Key("http://left:11311", HERE)
     seen = observed(
         container("a"),
         container("b", ON, env="http://arm:11311"),
         container("c", ON, env="http://gone:11311", state="exited"),
         container("d", ON),
         container("e", {**ON, "rosproxy.enable": "maybe"}, env="http://no:11311"),
-        **both(key=there),
+        **both(key=proxy_key),
     )
     assert master_hosts(read_labels(seen, SETTINGS), seen) == ("arm", "left", "robot")
 
@@ -442,8 +444,8 @@ def test_whose_address_is_needed() -> None:
 def test_a_proxy_of_whatever_name_is_no_master() -> None:
     odd = {"sandboxes": [sandbox(name="odd")], "proxies": [proxy(name="strange")]}
     for host in ("odd", "strange"):
-        one = container(labels=ON, env=f"http://{host}:11311")
-        member, _ = read(one, replace(SETTINGS, master_uri=ROBOT), **odd)
+        talker = container(labels=ON, env=f"http://{host}:11311")
+        member, _ = read(talker, replace(SETTINGS, master_uri=ROBOT), **odd)
         assert member is not None
         assert member.key == KEY
 
@@ -462,9 +464,9 @@ LABELS = st.dictionaries(
 def test_labels_of_whatever_kind_are_read_or_told(
     labels: dict[str, str], env: str, mode: str, expose: bool
 ) -> None:
-    one = container("odd", labels, [place("app")], env=env, mode=mode)
+    odd = container("odd", labels, [place("app")], env=env, mode=mode)
     settings = replace(SETTINGS, expose_by_default=expose)
-    member, problems = read(one, settings)
+    member, problems = read(odd, settings)
     asked = labels.get("rosproxy.enable", "").strip().lower()
     if asked == "true":
         assert member or any(problem.fatal for problem in problems)

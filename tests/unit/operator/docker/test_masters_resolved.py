@@ -10,12 +10,12 @@ class Names:
     """A name server: ``known`` are its names; ``asked`` those that it was asked for."""
 
     def __init__(self) -> None:
-        self.known: dict[str, list[str]] = {}
+        self.addresses: dict[str, list[str]] = {}
         self.asked: list[str] = []
 
     async def resolve(self, host: str) -> list[str]:
         self.asked.append(host)
-        return self.known.get(host, [])
+        return self.addresses.get(host, [])
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ async def test_an_address_needs_no_name_server(masters: MasterResolver, names: N
 
 
 async def test_a_name_is_asked_for_when_it_is_new(masters: MasterResolver, names: Names) -> None:
-    names.known["robot"] = ["192.0.2.7"]
+    names.addresses["robot"] = ["192.0.2.7"]
     for _ in range(2):
         await masters.learn(["robot"], {}, [])
     assert masters.address("robot") == "192.0.2.7"
@@ -54,21 +54,21 @@ async def test_a_name_is_asked_for_when_it_is_new(masters: MasterResolver, names
 async def test_the_last_good_address_is_kept(
     masters: MasterResolver, names: Names, changes: list[int]
 ) -> None:
-    names.known["robot"] = ["192.0.2.7"]
+    names.addresses["robot"] = ["192.0.2.7"]
     await masters.learn(["robot"], {}, [])
-    names.known.clear()
+    names.addresses.clear()
     await masters.refresh()
     assert masters.address("robot") == "192.0.2.7"
     assert changes == []
 
 
 async def test_a_change_is_told(masters: MasterResolver, names: Names, changes: list[int]) -> None:
-    names.known["robot"] = ["192.0.2.7", "192.0.2.8"]
+    names.addresses["robot"] = ["192.0.2.7", "192.0.2.8"]
     await masters.learn(["robot"], {}, [])
-    names.known["robot"].reverse()  # the one in use is still good
+    names.addresses["robot"].reverse()  # the one in use is still good
     await masters.refresh()
     assert (masters.address("robot"), changes) == ("192.0.2.7", [])
-    names.known["robot"] = ["192.0.2.9"]
+    names.addresses["robot"] = ["192.0.2.9"]
     await masters.refresh()
     assert (masters.address("robot"), changes) == ("192.0.2.9", [1])
 
@@ -76,7 +76,7 @@ async def test_a_change_is_told(masters: MasterResolver, names: Names, changes: 
 async def test_neither_loopback_nor_a_proxy_is_a_master(
     masters: MasterResolver, names: Names
 ) -> None:
-    names.known["robot"] = ["127.0.1.1", "172.18.0.2", "192.0.2.7"]
+    names.addresses["robot"] = ["127.0.1.1", "172.18.0.2", "192.0.2.7"]
     await masters.learn(["robot"], {}, ["172.18.0.2"])
     assert masters.address("robot") == "192.0.2.7"
 
@@ -92,7 +92,7 @@ async def test_what_the_engine_knows_helps_where_no_name_server_does(
 async def test_names_that_nobody_uses_any_more_are_forgotten(
     masters: MasterResolver, names: Names
 ) -> None:
-    names.known["robot"] = ["192.0.2.7"]
+    names.addresses["robot"] = ["192.0.2.7"]
     await masters.learn(["robot"], {}, [])
     await masters.learn([], {}, [])
     assert masters.address("robot") == ""

@@ -39,13 +39,13 @@ def wrong(inspected: dict[str, Any], name: str, image: str = IMAGE) -> str:
 
 def changed(role: str, *path: str, value: object) -> dict[str, Any]:
     """A container as it is made but for one thing."""
-    found = {key: dict(inner) if isinstance(inner, dict) else inner
-             for key, inner in MADE[role].items()}  # fmt: skip
-    at = found
+    inspected = {key: dict(inner) if isinstance(inner, dict) else inner
+                 for key, inner in MADE[role].items()}  # fmt: skip
+    at = inspected
     for key in path[:-1]:
         at = at[key]
     at[path[-1]] = value
-    return found
+    return inspected
 
 
 @pytest.mark.parametrize("role", MADE)
@@ -131,10 +131,10 @@ FORGED: list[tuple[str, str, list[Any]]] = [
 @pytest.mark.parametrize(
     ("role", "name", "value"),
     [
-        (each, name, value)
+        (forged_role, name, value)
         for role, name, values in FORGED
         for value in values
-        for each in ([role] if role != "both" else MADE)
+        for forged_role in ([role] if role != "both" else MADE)
     ],
 )
 def test_whoever_makes_one_by_hand_gives_himself_away(role: str, name: str, value: object) -> None:

@@ -86,8 +86,8 @@ def actions(seen: HostState, **more: Any) -> list[Action]:
     return list(look(seen, **more).actions)
 
 
-def texts(found: DockerPlan) -> list[str]:
-    return [problem.text for problem in found.problems]
+def texts(plan: DockerPlan) -> list[str]:
+    return [problem.text for problem in plan.problems]
 
 
 FIRST = [
@@ -105,22 +105,22 @@ ANEW = [
 
 
 def test_the_first_container_on_a_host() -> None:
-    found = look(observed(container(), networks=[APP]))
-    assert list(found.actions) == [CreateNetwork("0-rosproxy"), *FIRST]
-    assert [group.key for group in found.groups] == [None, KEY]
-    assert (found.problems, found.again_in) == ((), None)
+    plan = look(observed(container(), networks=[APP]))
+    assert list(plan.actions) == [CreateNetwork("0-rosproxy"), *FIRST]
+    assert [group.key for group in plan.groups] == [None, KEY]
+    assert (plan.problems, plan.again_in) == ((), None)
 
 
 def test_another_secret_makes_the_process_anew_in_its_sandbox() -> None:
     """Its nodes keep their ports, and its master's address and networks stay."""
-    found = look(observed(container(), **both(), secret="another"))
-    assert [(type(one), one.name) for one in found.actions] == [
+    plan = look(observed(container(), **both(), secret="another"))
+    assert [(type(action), action.name) for action in plan.actions] == [
         (Rename, NAME),
         (Create, NAME),
         (Remove, f"{NAME}-old"),
         (Start, NAME),
     ]
-    assert [one.range for one in found.actions if isinstance(one, Create)] == [RANGE]
+    assert [action.range for action in plan.actions if isinstance(action, Create)] == [RANGE]
 
 
 @pytest.mark.parametrize(
@@ -129,8 +129,8 @@ def test_another_secret_makes_the_process_anew_in_its_sandbox() -> None:
     ids=["all is as it ought to be", "nobody wants anything"],
 )
 def test_nothing_is_to_be_done(seen: HostState) -> None:
-    found = look(seen)
-    assert (found.actions, found.problems, found.again_in) == ((), (), None)
+    plan = look(seen)
+    assert (plan.actions, plan.problems, plan.again_in) == ((), (), None)
 
 
 def test_a_controller_killed_after_any_step_goes_on() -> None:
@@ -138,14 +138,14 @@ def test_a_controller_killed_after_any_step_goes_on() -> None:
     created = sandbox(networks=(), state="created", started_at="")
     started = sandbox(networks=())
     made = proxy(state="created", started_at="")
-    for there, left in (
+    for existing, left in (
         ({}, FIRST),
         ({"sandboxes": [created]}, FIRST[1:]),
         ({"sandboxes": [started]}, FIRST[2:]),
         ({"sandboxes": [sandbox()]}, FIRST[3:]),
         ({"sandboxes": [sandbox()], "proxies": [made]}, FIRST[4:]),
     ):
-        assert actions(observed(container(), **there)) == left
+        assert actions(observed(container(), **existing)) == left
 
 
 # networks
@@ -153,16 +153,16 @@ def test_a_controller_killed_after_any_step_goes_on() -> None:
 
 def test_networks_are_joined_and_left() -> None:
     seen = observed(container(networks=("lab",)), networks=[UPLINK, APP, LAB], **both())
-    found = look(seen)
-    assert list(found.actions) == [Disconnect(PORTS, "app"), Connect(PORTS, "lab", ALIASES)]
-    assert len(found.groups) == 2
+    plan = look(seen)
+    assert list(plan.actions) == [Disconnect(PORTS, "app"), Connect(PORTS, "lab", ALIASES)]
+    assert len(plan.groups) == 2
 
 
 def test_the_last_one_leaves() -> None:
     """`docker compose down` can then remove the network; the proxy itself has its grace."""
-    found = look(observed(**both()))
-    assert list(found.actions) == [Disconnect(PORTS, "app")]
-    assert found.again_in == 60.0
+    plan = look(observed(**both()))
+    assert list(plan.actions) == [Disconnect(PORTS, "app")]
+    assert plan.again_in == 60.0
 
 
 def test_the_uplink_is_joined_again() -> None:
@@ -173,10 +173,10 @@ def test_the_uplink_is_joined_again() -> None:
 
 
 def test_a_missing_name_that_somebody_looks_for() -> None:
-    there: Any = {"sandboxes": [sandbox(networks=[place("app", "robot")])], "proxies": [proxy()]}
+    existing: Any = {"sandboxes": [sandbox(networks=[place("app", "robot")])], "proxies": [proxy()]}
     again = [Disconnect(PORTS, "app"), Connect(PORTS, "app", ALIASES)]
-    assert actions(observed(container(), **there)) == again
-    assert actions(observed(container(env=KEY.master_uri), **there)) == []
+    assert actions(observed(container(), **existing)) == again
+    assert actions(observed(container(env=KEY.master_uri), **existing)) == []
 
 
 def test_a_name_that_another_one_has_now_is_not_taken_again() -> None:
@@ -215,7 +215,7 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
 
 
 @pytest.mark.parametrize(
-    ("there", "done", "again_in", "told"),
+    ("existing", "done", "again_in", "told"),
     [
         ([sandbox(state="paused"), proxy()], [Unpause(PORTS)], None, []),
         (
@@ -230,10 +230,10 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
     ids=["paused", "restarting", "removing", "dead"],
 )
 def test_a_sandbox_that_does_not_run(
-    there: list, done: list[Action], again_in: float | None, told: list[str]
+    existing: list, done: list[Action], again_in: float | None, told: list[str]
 ) -> None:
-    found = look(observed(container(), sandboxes=there[:1], proxies=there[1:]))
-    assert (list(found.actions), found.again_in, texts(found)) == (done, again_in, told)
+    plan = look(observed(container(), sandboxes=existing[:1], proxies=existing[1:]))
+    assert (list(plan.actions), plan.again_in, texts(plan)) == (done, again_in, told)
 
 
 # proxies that do not run
@@ -251,9 +251,9 @@ def test_a_sandbox_that_does_not_run(
     ],
 )
 def test_a_proxy_that_does_not_run(state: str, done: list[Action]) -> None:
-    found = look(observed(container(), sandboxes=[sandbox()], proxies=[proxy(state=state)]))
-    assert list(found.actions) == done
-    assert found.again_in == (1.0 if state == "removing" else None)
+    plan = look(observed(container(), sandboxes=[sandbox()], proxies=[proxy(state=state)]))
+    assert list(plan.actions) == done
+    assert plan.again_in == (1.0 if state == "removing" else None)
 
 
 @pytest.mark.parametrize(
@@ -301,12 +301,12 @@ def test_what_replaces_the_proxy_and_not_the_sandbox() -> None:
 def test_a_controller_killed_while_replacing_goes_on() -> None:
     old = proxy(name=f"{NAME}-old")
     new = proxy(image="new", state="created", started_at="")
-    for there, left in (
+    for proxies, left in (
         ([old], [new_proxy(replaces=f"{NAME}-old", image="new"), *replacement()[2:]]),
         ([old, new], [Remove(f"{NAME}-old", "another one takes over"), Start(NAME)]),
         ([new], [Start(NAME)]),
     ):
-        seen = observed(container(), image="new", sandboxes=[sandbox()], proxies=there)
+        seen = observed(container(), image="new", sandboxes=[sandbox()], proxies=proxies)
         assert actions(seen) == left
 
 
@@ -323,8 +323,8 @@ def test_what_a_controller_that_was_killed_leaves(proxies: list[Proxy], done: Ac
 
 
 def test_other_ports_replace_both() -> None:
-    found = actions(observed(container(labels=ASKS_FOR_40), **both()))
-    assert found == [Rename(PORTS, f"{PORTS}-old"), new_sandbox(LONGER), *ANEW]
+    steps = actions(observed(container(labels=ASKS_FOR_40), **both()))
+    assert steps == [Rename(PORTS, f"{PORTS}-old"), new_sandbox(LONGER), *ANEW]
 
 
 def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
@@ -339,37 +339,37 @@ def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
 
 def test_another_publish_address_replaces_both() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10",))
-    found = actions(observed(container(), **both()), settings=settings)
-    assert found[0] == Rename(PORTS, f"{PORTS}-old")
-    assert found[2] == Remove(NAME, "its sandbox is made anew", stop=True)
+    steps = actions(observed(container(), **both()), settings=settings)
+    assert steps[0] == Rename(PORTS, f"{PORTS}-old")
+    assert steps[2] == Remove(NAME, "its sandbox is made anew", stop=True)
 
 
 def test_names_of_strangers_are_left_to_them() -> None:
     strangers = [container(PORTS, {}), container(NAME, {})]
-    found = actions(observed(container(), *strangers))
-    assert found[0] == new_sandbox(name=f"{PORTS}-2")
-    assert found[1] == Start(f"{PORTS}-2")
-    assert Start(f"{NAME}-2") in found
+    steps = actions(observed(container(), *strangers))
+    assert steps[0] == new_sandbox(name=f"{PORTS}-2")
+    assert steps[1] == Start(f"{PORTS}-2")
+    assert Start(f"{NAME}-2") in steps
 
 
 # image and uplink
 
 
 def test_without_an_image_nothing_is_created() -> None:
-    found = look(observed(container(), image=""))
-    assert found.actions == ()
-    assert [(problem.subject, problem.fatal) for problem in found.problems] == [
+    plan = look(observed(container(), image=""))
+    assert plan.actions == ()
+    assert [(problem.subject, problem.fatal) for problem in plan.problems] == [
         ("proxy image rosproxy:latest", True)
     ]
-    assert "not on this host: docker pull rosproxy:latest" in texts(found)[0]
-    assert "docker build --target proxy" in texts(found)[0]
+    assert "not on this host: docker pull rosproxy:latest" in texts(plan)[0]
+    assert "docker build --target proxy" in texts(plan)[0]
 
 
 def test_without_an_image_everything_is_kept() -> None:
     settings = replace(SETTINGS, publish_address=("::",), ports=40)
-    found = look(observed(container(), image="", **both()), settings=settings)
-    assert found.actions == ()
-    assert [problem.fatal for problem in found.problems] == [False]
+    plan = look(observed(container(), image="", **both()), settings=settings)
+    assert plan.actions == ()
+    assert [problem.fatal for problem in plan.problems] == [False]
     stopped: Any = {"sandboxes": [sandbox(state="exited")], "proxies": [proxy(state="exited")]}
     assert actions(observed(container(), image="", **stopped)) == [
         Disconnect(PORTS, "app"),
@@ -383,9 +383,9 @@ def test_without_an_image_everything_is_kept() -> None:
     "uplink", [replace(UPLINK, internal=True), replace(UPLINK, driver="ipvlan")]
 )
 def test_an_uplink_that_is_none(uplink: Network) -> None:
-    found = look(observed(container(), networks=[uplink, APP]))
-    assert found.actions == ()
-    assert "can't be the proxies' uplink" in texts(found)[0]
+    plan = look(observed(container(), networks=[uplink, APP]))
+    assert plan.actions == ()
+    assert "can't be the proxies' uplink" in texts(plan)[0]
 
 
 # the end
@@ -416,9 +416,9 @@ def test_the_grace_begins_anew_with_each_container() -> None:
 def test_what_does_not_run_goes_too(state: str) -> None:
     settings = replace(SETTINGS, grace=0.0)
     seen = observed(sandboxes=[sandbox(networks=(), state=state)], proxies=[proxy(state=state)])
-    found = actions(seen, settings=settings)
+    steps = actions(seen, settings=settings)
     removals = [Remove(NAME, UNWANTED, retire=state == "paused"), Remove(PORTS, UNWANTED)]
-    assert found == ([Unpause(NAME), *removals] if state == "paused" else removals)
+    assert steps == ([Unpause(NAME), *removals] if state == "paused" else removals)
 
 
 def test_a_container_that_has_exited_keeps_its_network_for_the_grace() -> None:
@@ -432,16 +432,16 @@ def test_a_container_that_has_exited_keeps_its_network_for_the_grace() -> None:
 # ports
 
 
-def port_problem(found: DockerPlan) -> str:
-    return next(problem.text for problem in found.problems if problem.subject == f"proxy {NAME}")
+def port_problem(plan: DockerPlan) -> str:
+    return next(problem.text for problem in plan.problems if problem.subject == f"proxy {NAME}")
 
 
-def created(found: DockerPlan) -> PortRange:
-    return next(iter(ranges(found).values()))
+def created(plan: DockerPlan) -> PortRange:
+    return next(iter(ranges(plan).values()))
 
 
-def ranges(found: DockerPlan) -> dict[Key, PortRange]:
-    return {a.key: a.range for a in found.actions if isinstance(a, CreateSandbox)}
+def ranges(plan: DockerPlan) -> dict[Key, PortRange]:
+    return {a.key: a.range for a in plan.actions if isinstance(a, CreateSandbox)}
 
 
 @pytest.mark.parametrize(
@@ -468,29 +468,29 @@ def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
 
 def test_two_new_proxies_do_not_get_the_same() -> None:
     """Who has been promised some keeps them: its container is being created."""
-    found = look(observed(container(), container("b", ON_ARM)))
-    assert ranges(found) == {ARM: RANGE, KEY: NEXT}
+    plan = look(observed(container(), container("b", ON_ARM)))
+    assert ranges(plan) == {ARM: RANGE, KEY: NEXT}
     memory = look(observed(container())).memory
-    found = look(observed(container(), container("a", ON_ARM)), memory=memory)
-    assert ranges(found) == {ARM: NEXT, KEY: RANGE}
+    plan = look(observed(container(), container("a", ON_ARM)), memory=memory)
+    assert ranges(plan) == {ARM: NEXT, KEY: RANGE}
 
 
 def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
     """It is not seen to run yet, but its ports are listened on already."""
-    there = sandbox(state="created", networks=())
+    starting = sandbox(state="created", networks=())
     for memory in (None, look(observed(container())).memory):
-        found = look(
-            observed(container(), sandboxes=[there], listening=RANGE.ports()), memory=memory
+        plan = look(
+            observed(container(), sandboxes=[starting], listening=RANGE.ports()), memory=memory
         )
-        assert found.actions[0] == Start(PORTS)
-        assert found.problems == ()
+        assert plan.actions[0] == Start(PORTS)
+        assert plan.problems == ()
 
 
 def test_ports_are_kept_when_everything_was_removed_by_hand() -> None:
     """What listens there may be what is left of it."""
     memory = look(observed(container(), **both(ports=ELSEWHERE))).memory
-    found = look(observed(container(), listening=ELSEWHERE.ports()), memory=memory)
-    assert created(found) == ELSEWHERE
+    plan = look(observed(container(), listening=ELSEWHERE.ports()), memory=memory)
+    assert created(plan) == ELSEWHERE
 
 
 def test_ports_are_kept_when_one_was_removed_and_nothing_is_remembered() -> None:
@@ -501,13 +501,13 @@ def test_ports_are_kept_when_one_was_removed_and_nothing_is_remembered() -> None
 
 
 def test_a_stopped_sandbox_tells_more_than_memory_only_if_it_has_more_ports() -> None:
-    for ports, kept in (
+    for ports, expected in (
         (PortRange(11400, 11439), PortRange(11400, 11439)),
         (PortRange(11500, 11531), RANGE),
     ):
         seen = observed(container(), sandboxes=[sandbox(ports=ports, state="exited")])
-        found = look(seen, memory=DockerMemory(served={KEY: RANGE}))
-        assert found.memory.planned == {KEY: kept}
+        plan = look(seen, memory=DockerMemory(served={KEY: RANGE}))
+        assert plan.memory.planned == {KEY: expected}
 
 
 def test_never_fewer_ports() -> None:
@@ -515,17 +515,17 @@ def test_never_fewer_ports() -> None:
 
 
 def test_more_ports_that_can_not_be_had() -> None:
-    found = look(observed(container(labels=ASKS_FOR_40), listening=[11435], **both()))
-    assert found.actions == ()
-    assert "40 ports are wanted" in port_problem(found)
-    assert "it keeps its 32 at 11400-11431, since 11432-11439 are not free" in port_problem(found)
+    plan = look(observed(container(labels=ASKS_FOR_40), listening=[11435], **both()))
+    assert plan.actions == ()
+    assert "40 ports are wanted" in port_problem(plan)
+    assert "it keeps its 32 at 11400-11431, since 11432-11439 are not free" in port_problem(plan)
 
 
 def test_exhausted() -> None:
     settings = replace(SETTINGS, port_window=PortRange(11400, 11430))
-    found = look(observed(container()), settings=settings)
-    assert found.actions == ()
-    assert port_problem(found) == (
+    plan = look(observed(container()), settings=settings)
+    assert plan.actions == ()
+    assert port_problem(plan) == (
         "no 32 free ports in a row between 11400 and 11430: 31 of 31 are free, 31 at most in a "
         "row: lower --ports or the label rosproxy.ports (32), widen --port-window (11400-11430), "
         "or stop what holds ports there"
@@ -543,16 +543,16 @@ def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
     port: int | None, then: PortRange
 ) -> None:
     seen = observed(container(), sandboxes=[sandbox(state="created", networks=())])
-    found = refused(seen, port, DockerMemory(), 0.0)
-    assert found.actions[:4] == (
+    plan = refused(seen, port, DockerMemory(), 0.0)
+    assert plan.actions[:4] == (
         Rename(PORTS, f"{PORTS}-old"),
         new_sandbox(then),
         Remove(f"{PORTS}-old", "made anew"),
         Start(PORTS),
     )
-    forgets = replace(found.memory, planned={})
-    assert look(seen, memory=forgets, now=299.0).actions == found.actions
-    assert look(seen, memory=forgets, now=300.0).actions != found.actions
+    forgets = replace(plan.memory, planned={})
+    assert look(seen, memory=forgets, now=299.0).actions == plan.actions
+    assert look(seen, memory=forgets, now=300.0).actions != plan.actions
 
 
 @pytest.mark.parametrize("port", [11410, None])
@@ -577,23 +577,23 @@ def test_added_ports_that_are_refused_are_given_up() -> None:
     longer = sandbox(ports=LONGER, state="created", networks=())
     seen = observed(container(labels=ASKS_FOR_40), sandboxes=[longer])
     for port in (11435, None):
-        found = refused(seen, port, memory, 1.0)
-        assert created(found) == RANGE
-        assert "it keeps its 32" in port_problem(found)
+        plan = refused(seen, port, memory, 1.0)
+        assert created(plan) == RANGE
+        assert "it keeps its 32" in port_problem(plan)
 
 
 def test_ports_that_a_stranger_publishes_now_are_left() -> None:
     web = container("web", {}, ports=[11400])
-    found = look(observed(container(), web, sandboxes=[sandbox(state="exited")]))
-    assert created(found) == PortRange(11401, 11432)
-    assert "HAS LEFT ITS PORTS" in port_problem(found)
+    plan = look(observed(container(), web, sandboxes=[sandbox(state="exited")]))
+    assert created(plan) == PortRange(11401, 11432)
+    assert "HAS LEFT ITS PORTS" in port_problem(plan)
 
 
 def test_a_start_that_went_well_is_the_end_of_it() -> None:
     memory = DockerMemory().port_taken(PORTS, None, 0.0)
-    found = look(observed(container(), **both()), memory=memory, now=30.0)
-    assert (found.actions, found.again_in) == ((), None)
-    assert found.memory == DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE})
+    plan = look(observed(container(), **both()), memory=memory, now=30.0)
+    assert (plan.actions, plan.again_in) == ((), None)
+    assert plan.memory == DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE})
 
 
 # all together
@@ -609,8 +609,8 @@ def test_problems_of_one_key_do_not_touch_another() -> None:
         container("a", networks=("gone",)),
     ):
         settings = replace(SETTINGS, port_window=PortRange(11400, 11463))
-        found = look(observed(bad, container("b", ON_ARM), **arm), settings=settings)
-        assert [group for group in found.groups if group.key == ARM] == list(alone.groups)
+        plan = look(observed(bad, container("b", ON_ARM), **arm), settings=settings)
+        assert [group for group in plan.groups if group.key == ARM] == list(alone.groups)
 
 
 def test_what_lets_names_go_comes_first() -> None:
@@ -620,9 +620,9 @@ def test_what_lets_names_go_comes_first() -> None:
         networks=[UPLINK, APP],
         sandboxes=[sandbox(Key("http://zoo:11311", HERE), ports=NEXT)],
     )
-    found = look(seen)
-    assert isinstance(found.actions[0], Disconnect)
-    assert Connect(PORTS, "app", ALIASES) in found.actions
+    plan = look(seen)
+    assert isinstance(plan.actions[0], Disconnect)
+    assert Connect(PORTS, "app", ALIASES) in plan.actions
 
 
 def test_nothing_is_done_for_a_key_while_one_of_its_containers_is_busy() -> None:
@@ -635,10 +635,10 @@ def test_nothing_is_done_for_a_key_while_one_of_its_containers_is_busy() -> None
 
 
 def test_a_proxy_is_not_made_before_the_address_of_its_master_is_known() -> None:
-    found = look(observed(container(), masters={"robot": ""}))
-    assert not any(isinstance(action, Create) for action in found.actions)
-    assert any(isinstance(action, Create) for group in found.deferred for action in group.actions)
-    (problem,) = [each for each in found.problems if each.subject == "master robot"]
+    plan = look(observed(container(), masters={"robot": ""}))
+    assert not any(isinstance(action, Create) for action in plan.actions)
+    assert any(isinstance(action, Create) for group in plan.deferred for action in group.actions)
+    (problem,) = [p for p in plan.problems if p.subject == "master robot"]
     assert "--add-host robot:ADDRESS" in problem.text
     assert problem.fatal
     other = look(observed(container(), masters={"robot": "192.0.2.7", "arm": ""}))

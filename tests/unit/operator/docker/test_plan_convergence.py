@@ -73,7 +73,7 @@ def test_a_bad_object_does_not_change_what_is_done_for_others(
     bad = replace(bad, labels={**bad.labels, "rosproxy.advertise-host": more + " "})
     with_bad = replace(seen, containers=(bad, *seen.containers))
     alone = planned(seen, SETTINGS, memory, now)
-    found = planned(with_bad, SETTINGS, memory, now)
-    assert found.groups == alone.groups
-    assert (found.memory, found.again_in) == (alone.memory, alone.again_in)
-    assert set(alone.problems) <= set(found.problems)
+    plan = planned(with_bad, SETTINGS, memory, now)
+    assert plan.groups == alone.groups
+    assert (plan.memory, plan.again_in) == (alone.memory, alone.again_in)
+    assert set(alone.problems) <= set(plan.problems)

@@ -63,8 +63,8 @@ def member(container: Container) -> Member:
 
 
 def test_a_running_container_has_arrived_under_all_its_names() -> None:
-    one = replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),))
-    (arrival,) = told(look(one), member(one)).arrivals
+    container = replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),))
+    (arrival,) = told(look(container), member(container)).arrivals
     assert (arrival.address, arrival.network, arrival.endpoint) == ("172.18.0.5", "app", "e1")
     assert arrival.names == {"talker", "t" * 12, "web", "bhost"}
 
@@ -79,10 +79,10 @@ def test_only_those_that_run_and_want_this_proxy_arrive() -> None:
 
 def test_networks_that_the_proxy_is_not_on_do_not_count() -> None:
     away = replace(talker(), attachments=(at("172.19.0.5", "other"),))
-    known = told(look(away), member(away))
-    assert not known.arrivals
-    assert not known.addresses
-    assert known.subnets == (SUBNET,)
+    facts = told(look(away), member(away))
+    assert not facts.arrivals
+    assert not facts.addresses
+    assert facts.subnets == (SUBNET,)
 
 
 def test_a_container_in_anothers_network_arrives_at_its_address() -> None:
@@ -110,19 +110,19 @@ def test_selected_are_all_that_may_use_it_on_its_networks() -> None:
     plain = Container("n" * 20, "plain", "running", attachments=(at("172.18.0.10"),))
     others = Container("o" * 20, "others", "running", attachments=(at("172.18.0.11"),))
     seen = look(talker(), starting, ended, pod, guest, away, plain, others)
-    members = [member(one) for one in (talker(), starting, ended, guest, away)]
-    known = told(seen, *members, Member(others, Key("http://other:11311", "192.0.2.10")))
-    assert known.selected == {"172.18.0.5", "172.18.0.7", "172.18.0.9"}
+    members = [member(container) for container in (talker(), starting, ended, guest, away)]
+    facts = told(seen, *members, Member(others, Key("http://other:11311", "192.0.2.10")))
+    assert facts.selected == {"172.18.0.5", "172.18.0.7", "172.18.0.9"}
 
 
 def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
     nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
-    for known, addresses in (
+    for facts, addresses in (
         (told(look(talker())), {"gone": ["172.18.0.6"]}),
         (replace(told(look(talker())), subnets=()), {}),
     ):
         news = ProxyNews()
-        news.look(known, 0.0)
+        news.look(facts, 0.0)
         assert news.body(nodes, 0.0) == addresses
 
 
@@ -139,34 +139,34 @@ HERE, AWAY, THERE, NOBODY = (
 
 
 def places(*looks: tuple[float, NetworkFacts]) -> AddressHistory:
-    found = AddressHistory()
-    for when, known in looks:
-        found.look(known, when)
-    return found
+    history = AddressHistory()
+    for when, facts in looks:
+        history.look(facts, when)
+    return history
 
 
 def test_a_container_with_another_address_has_moved_until_its_proxy_knows() -> None:
-    found = places((0.0, HERE), (1.0, THERE))
-    assert found.moved({OLD}) == {OLD: NEW}
-    assert found.moved({NEW}) == {}
-    assert found.reserved_addresses == {OLD}
-    assert found.next_expiry == 6.0
+    history = places((0.0, HERE), (1.0, THERE))
+    assert history.moved({OLD}) == {OLD: NEW}
+    assert history.moved({NEW}) == {}
+    assert history.reserved_addresses == {OLD}
+    assert history.next_expiry == 6.0
 
 
 def test_a_move_is_given_up_in_the_end() -> None:
-    found = places((0.0, HERE), (1.0, THERE), (6.0, THERE))
-    assert not found.moved({OLD})
-    assert not found.reserved_addresses
-    assert found.next_expiry is None
+    history = places((0.0, HERE), (1.0, THERE), (6.0, THERE))
+    assert not history.moved({OLD})
+    assert not history.reserved_addresses
+    assert history.next_expiry is None
 
 
 def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> None:
-    found = places((0.0, HERE), (1.0, AWAY))
-    assert not found.moved({OLD})
-    assert found.reserved_addresses == {OLD}
-    assert found.next_expiry == 3.0
-    found.look(THERE, 2.0)
-    assert found.moved({OLD}) == {OLD: NEW}
+    history = places((0.0, HERE), (1.0, AWAY))
+    assert not history.moved({OLD})
+    assert history.reserved_addresses == {OLD}
+    assert history.next_expiry == 3.0
+    history.look(THERE, 2.0)
+    assert history.moved({OLD}) == {OLD: NEW}
 
 
 def test_a_container_that_stays_away_is_gone() -> None:
@@ -174,15 +174,15 @@ def test_a_container_that_stays_away_is_gone() -> None:
 
 
 def test_a_container_that_does_not_run_is_gone_at_once() -> None:
-    found = places((0.0, HERE), (1.0, NOBODY))
-    assert not found.reserved_addresses
-    assert found.next_expiry is None
+    history = places((0.0, HERE), (1.0, NOBODY))
+    assert not history.reserved_addresses
+    assert history.next_expiry is None
 
 
 def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> None:
     other = Container("o", "other", "running", attachments=(at(OLD),))
-    found = places((0.0, HERE), (1.0, told(look(talker(NEW), other))))
-    assert found.moved({OLD}) == {}
+    history = places((0.0, HERE), (1.0, told(look(talker(NEW), other))))
+    assert history.moved({OLD}) == {}
 
 
 def test_container_that_changes_networks_takes_its_nodes_along() -> None:
@@ -190,20 +190,20 @@ def test_container_that_changes_networks_takes_its_nodes_along() -> None:
     between = NetworkFacts(running=frozenset("t"))
     after = NetworkFacts(addresses={("t", "other"): "172.19.0.9"}, running=frozenset("t"))
 
-    found = places((0.0, before), (0.1, between), (1.0, after))
+    history = places((0.0, before), (0.1, between), (1.0, after))
 
-    assert found.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
-    assert found.reserved_addresses == {"172.18.0.5"}
-    found.look(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
-    assert found.moved({"172.19.0.9"}) == {"172.19.0.9": "172.19.0.3"}
+    assert history.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
+    assert history.reserved_addresses == {"172.18.0.5"}
+    history.look(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
+    assert history.moved({"172.19.0.9"}) == {"172.19.0.9": "172.19.0.3"}
 
 
 def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> None:
     app, other = ("t", "app"), ("t", "other")
     both = NetworkFacts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
-    one = replace(both, addresses={other: "172.19.0.9"})
+    after = replace(both, addresses={other: "172.19.0.9"})
 
-    assert places((0.0, both), (0.1, one)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
+    assert places((0.0, both), (0.1, after)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
 
 
 def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None:

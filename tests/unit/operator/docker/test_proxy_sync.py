@@ -32,7 +32,7 @@ FIRST, SECOND = ProxyAccess(WHERE, "token", "run 1"), ProxyAccess(WHERE, "token"
 
 
 class Proxies(ProxyClient):
-    """A proxy that notes whom it is told of, and answers nothing else but what is ``known`` of it.
+    """A proxy that notes whom it is told of, and answers nothing else but its ``known_status``.
 
     ``calls`` are all that came, in order: addresses, or the names of layers.
     """
@@ -41,35 +41,35 @@ class Proxies(ProxyClient):
         super().__init__()
         self.told: list[list[str]] = []
         self.former: Mapping[str, Sequence[int]] | None = None
-        self.known: ProxyStatus | None = None
+        self.known_status: ProxyStatus | None = None
         self.calls: list[list[str]] = []
         self.refuses: ProxyError | None = None
         self.heard = asyncio.Event()
         self.errors: list[ProxyError] = []
 
-    async def status(self, where: HostPort) -> Any:
-        if self.known is None:
+    async def status(self, admin: HostPort) -> Any:
+        if self.known_status is None:
             await asyncio.Event().wait()
-        return self.known
+        return self.known_status
 
-    async def containers(self, where: HostPort, token: str, body: Mapping[str, Any]) -> Any:
+    async def containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Any:
         return {}
 
-    async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
-        assert (where, token) == (WHERE, "token")
+    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+        assert (admin, token) == (WHERE, "token")
         self.calls.append([layer.name for layer in layers])
         if self.refuses:
             raise self.refuses
 
     async def selected(
         self,
-        where: HostPort,
+        admin: HostPort,
         token: str,
         addresses: Collection[str],
         peers: Collection[str] | None = None,
         former: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
-        assert (where, token) == (WHERE, "token")
+        assert (admin, token) == (WHERE, "token")
         if self.errors:
             raise self.errors.pop()
         self.former = former
@@ -139,16 +139,16 @@ async def test_a_proxy_that_had_to_leave_its_ports_is_told_who_had_some(
 ) -> None:
     proxies = Proxies()
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
-    one = ParticipantStatus(
+    participant = ParticipantStatus(
         guid_prefix="01.0f", address="172.18.0.5", leases=(LocatorStatus(port=11401),)
     )
-    proxies.known = ProxyStatus(domains=(DomainStatus(inside=(one,)),))
+    proxies.known_status = ProxyStatus(domains=(DomainStatus(inside=(participant,)),))
     seen, members = look("172.18.0.5")
     sync.update(seen, members)
     await proxies.next()
     while not sync.answers(seen.state.proxies[0].container.name):
         await asyncio.sleep(0)
-    proxies.known = None
+    proxies.known_status = None
 
     sync.update(*look("172.18.0.5", access=SECOND, ports=ports))
 
@@ -207,5 +207,5 @@ async def test_without_its_policy_nobody_new_is_let_in(
     assert proxies.told == []
     proxies.refuses = None
     assert await proxies.next() == ["172.18.0.5"]
-    found = silence("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
-    assert (found.subject, found.text, found.fatal) == ("proxy p", "knows no policies", True)
+    problem = silence("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
+    assert (problem.subject, problem.text, problem.fatal) == ("proxy p", "knows no policies", True)

@@ -58,10 +58,10 @@ def node(name: str = "talker", env: str = MASTER, mode: str = "", **labels: str)
     return replace(made, attachments=() if mode else places, started_at="2026-01-01T09:00:00Z")
 
 
-def there(near: str = NEAR, proxy: str = "running", key: Key = KEY) -> dict[str, Any]:
+def nodes_proxy(near: str = NEAR, proxy: str = "running", key: Key = KEY) -> dict[str, Any]:
     """The proxy of these nodes, with an address on their network."""
-    found = both(key=key)
-    (box,), (process,) = found["sandboxes"], found["proxies"]
+    pair = both(key=key)
+    (box,), (process,) = pair["sandboxes"], pair["proxies"]
     places = [replace(p, address=near if p.network == "app" else "") for p in
               box.container.attachments]  # fmt: skip
     box = Sandbox(key, replace(box.container, attachments=tuple(places)), box.range,
@@ -97,25 +97,25 @@ def record(made: CreateRedirect, state: str = "exited", code: int = 0) -> Redire
 
 
 def test_it_is_set_once_where_the_proxy_is_met() -> None:
-    made = wanted(observed(node(), **there()))
+    made = wanted(observed(node(), **nodes_proxy()))
     assert (str(made.master), str(made.proxy)) == (f"{ADDRESS}:11311", f"{NEAR}:11311")
     assert (made.target, made.started) == ("id-talker", "2026-01-01T09:00:00Z")
 
-    found = look(observed(node(), **there(), redirects=(record(made),)))
-    assert (found.actions, found.problems) == ((), ())
+    plan = look(observed(node(), **nodes_proxy(), redirects=(record(made),)))
+    assert (plan.actions, plan.problems) == ((), ())
 
 
 @pytest.mark.parametrize("state", ["exited", "created", "running"])
 def test_one_that_has_failed_or_not_run_is_run(state: str) -> None:
-    made = wanted(observed(node(), **there()))
-    one = record(made, state, int(state == "exited"))
-    assert steps(observed(node(), **there(), redirects=(one,))) == [Run(made.name)]
+    made = wanted(observed(node(), **nodes_proxy()))
+    redirect = record(made, state, int(state == "exited"))
+    assert steps(observed(node(), **nodes_proxy(), redirects=(redirect,))) == [Run(made.name)]
 
 
 def test_it_is_set_anew_for_another_start_and_another_address() -> None:
-    old = wanted(observed(node(), **there()))
+    old = wanted(observed(node(), **nodes_proxy()))
     later = replace(node(), started_at="2026-01-01T10:00:00Z")
-    for state in (observed(later, **there()), observed(node(), **there("172.18.0.77"))):
+    for state in (observed(later, **nodes_proxy()), observed(node(), **nodes_proxy("172.18.0.77"))):
         new = wanted(state)
         assert new.name != old.name
         assert steps(replace(state, redirects=(record(old),))) == [
@@ -125,15 +125,15 @@ def test_it_is_set_anew_for_another_start_and_another_address() -> None:
 
 def test_it_is_not_set_without_a_proxy_and_stays_while_that_is_away() -> None:
     assert steps(observed(node())) == []
-    assert steps(observed(node(), **there(proxy="exited"))) == []
-    made = wanted(observed(node(), **there()))
-    for state in (observed(node()), observed(node(), **there(proxy="exited"))):
+    assert steps(observed(node(), **nodes_proxy(proxy="exited"))) == []
+    made = wanted(observed(node(), **nodes_proxy()))
+    for state in (observed(node()), observed(node(), **nodes_proxy(proxy="exited"))):
         assert steps(replace(state, redirects=(record(made),))) == []
 
 
 def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:
-    made = wanted(observed(node(), **there()))
-    state = observed(node(), **there(), redirects=(record(made),))
+    made = wanted(observed(node(), **nodes_proxy()))
+    state = observed(node(), **nodes_proxy(), redirects=(record(made),))
     by_label = replace(state, containers=(node(redirect="false"),))
     undo, *then = steps(state, OFF)
     assert steps(by_label) == [undo, *then]
@@ -146,51 +146,51 @@ def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:
 
 
 def test_what_is_left_of_a_network_that_is_gone_is_removed() -> None:
-    made = wanted(observed(node(), **there()))
+    made = wanted(observed(node(), **nodes_proxy()))
     gone = [Remove(made.name, "its network is gone")]
-    assert steps(observed(**there(), redirects=(record(made),))) == gone
+    assert steps(observed(**nodes_proxy(), redirects=(record(made),))) == gone
     ended = replace(node(), state="exited")
-    assert steps(observed(ended, **there(), redirects=(record(made),))) == gone
+    assert steps(observed(ended, **nodes_proxy(), redirects=(record(made),))) == gone
 
 
 def test_nothing_is_done_to_what_the_engine_is_at() -> None:
-    made = wanted(observed(node(), **there()))
-    assert steps(observed(**there(), redirects=(record(made, "removing"),))) == []
+    made = wanted(observed(node(), **nodes_proxy()))
+    assert steps(observed(**nodes_proxy(), redirects=(record(made, "removing"),))) == []
     busy = frozenset({made.name})
-    assert steps(observed(**there(), redirects=(record(made),), busy=busy)) == []
+    assert steps(observed(**nodes_proxy(), redirects=(record(made),), busy=busy)) == []
 
 
 def test_one_that_is_dead_is_made_anew() -> None:
-    made = wanted(observed(node(), **there()))
-    state = observed(node(), **there(), redirects=(record(made, "dead"),))
+    made = wanted(observed(node(), **nodes_proxy()))
+    state = observed(node(), **nodes_proxy(), redirects=(record(made, "dead"),))
     assert steps(state) == [Remove(made.name, "dead"), made, Run(made.name)]
 
 
 def test_without_an_image_all_stays() -> None:
-    made = wanted(observed(node(), **there()))
-    state = observed(node(), **there(), redirects=(record(made),), image="")
+    made = wanted(observed(node(), **nodes_proxy()))
+    state = observed(node(), **nodes_proxy(), redirects=(record(made),), image="")
     assert (steps(state), steps(state, OFF)) == ([], [])
 
 
 def test_containers_that_share_a_network_have_it_once() -> None:
     owner = replace(node("box"), labels={}, master_uri="")
     guests = [node(name, mode="container:id-box") for name in ("one", "other")]
-    made = wanted(observed(owner, *guests, **there()))
+    made = wanted(observed(owner, *guests, **nodes_proxy()))
     assert made.target == "id-box"
 
 
 def test_a_masters_name_may_be_known_by_the_address() -> None:
     by_name = Key("http://robot:11311", HERE)
-    one = node(master_uri="http://robot:11311")
+    talker = node(master_uri="http://robot:11311")
     masters = {"robot": ADDRESS}
-    assert str(wanted(observed(one, **there(key=by_name), masters=masters)).master) == (
+    assert str(wanted(observed(talker, **nodes_proxy(key=by_name), masters=masters)).master) == (
         f"{ADDRESS}:11311"
     )
-    assert steps(observed(one, **there(key=by_name), masters={"robot": "192.0.2.8"})) == []
+    assert steps(observed(talker, **nodes_proxy(key=by_name), masters={"robot": "192.0.2.8"})) == []
 
 
 @pytest.mark.parametrize(
-    ("one", "settings", "text"),
+    ("talker", "settings", "text"),
     [
         (node(env="http://192.0.2.8:11311", master_uri=MASTER), SETTINGS, "name of the master"),
         (node(env="http://192.0.2.7:11399", master_uri=MASTER), SETTINGS, "name of the master"),
@@ -200,8 +200,10 @@ def test_a_masters_name_may_be_known_by_the_address() -> None:
         (node(redirect="perhaps"), SETTINGS, "neither true nor false: write rosproxy.redirect="),
     ],
 )
-def test_who_is_not_redirected_is_told(one: Container, settings: PlanSettings, text: str) -> None:
-    members, problems = read_members(observed(one), settings)
+def test_who_is_not_redirected_is_told(
+    talker: Container, settings: PlanSettings, text: str
+) -> None:
+    members, problems = read_members(observed(talker), settings)
     assert text in " ".join(problem.text for problem in problems)
     assert not any(member.redirected_master for member in members)
 
@@ -225,18 +227,18 @@ def test_a_master_that_is_not_allowed_is_not_redirected() -> None:
 
 
 def test_its_nodes_arrive_once_more_when_it_is_there() -> None:
-    made = wanted(observed(node(), **there()))
-    members, _ = read_members(observed(node(), **there()))
+    made = wanted(observed(node(), **nodes_proxy()))
+    members, _ = read_members(observed(node(), **nodes_proxy()))
 
     def arrivals(*records: RedirectContainer) -> Any:
-        state = observed(node(), **there(), redirects=records)
+        state = observed(node(), **nodes_proxy(), redirects=records)
         return network_facts(state, state.proxies[0], members).arrivals
 
     assert len(arrivals() | arrivals(record(made))) == 2
     assert arrivals() == arrivals(record(made, code=1))
 
 
-MADE = structs.replace(wanted(observed(node(), **there())), range=RANGE)
+MADE = structs.replace(wanted(observed(node(), **nodes_proxy())), range=RANGE)
 
 
 def test_it_has_one_capability_and_bounds() -> None:
@@ -277,8 +279,8 @@ def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
     making["HostConfig"][field] = value
     own = read_own(own_labels(MADE))
     assert own is not None
-    found = forgery_reason(own, MADE.name, read_making(making), IMAGE)
-    assert found == f"its HostConfig.{field} is not the operator's"
+    reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)
+    assert reason == f"its HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(

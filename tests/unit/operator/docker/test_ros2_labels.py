@@ -27,7 +27,7 @@ TWO = {**ON, "rosproxy.ros": "2"}
 DOMAIN = Key("", HERE, 0)
 
 
-def one(
+def labelled_container(
     labels: Mapping[str, str] | None = None,
     variables: Mapping[str, str] | None = None,
     env: str = "",
@@ -36,19 +36,19 @@ def one(
 
 
 def read(
-    found: Container, settings: PlanSettings = SETTINGS, **more
+    container: Container, settings: PlanSettings = SETTINGS, **more
 ) -> tuple[list[Member], list[str]]:
     """What a container gets, and what it is told."""
-    members, problems = read_members(observed(found, **more), settings)
+    members, problems = read_members(observed(container, **more), settings)
     return list(members), [problem.text for problem in problems]
 
 
-def keys(found: Container, settings: PlanSettings = SETTINGS) -> list[Key]:
-    return [member.key for member in read(found, settings)[0]]
+def keys(container: Container, settings: PlanSettings = SETTINGS) -> list[Key]:
+    return [member.key for member in read(container, settings)[0]]
 
 
-def refusal(found: Container, settings: PlanSettings = SETTINGS) -> str:
-    members, problems = read_members(observed(found), settings)
+def refusal(container: Container, settings: PlanSettings = SETTINGS) -> str:
+    members, problems = read_members(observed(container), settings)
     assert not members
     assert [type(problem) for problem in problems] == [Problem]
     assert problems[0].fatal
@@ -60,64 +60,74 @@ def refusal(found: Container, settings: PlanSettings = SETTINGS) -> str:
     [{"ROS_VERSION": "2"}, {"ROS_DISTRO": "jazzy"}, {"ROS_DISTRO": "not yet thought of"}],
 )
 def test_its_variables_say_that_it_is_of_ros_2(variables: Mapping[str, str]) -> None:
-    assert read(one(variables=variables)) == ([Member(one(variables=variables), DOMAIN,
-                                               networks=frozenset({"app"}))], [])  # fmt: skip
+    assert read(labelled_container(variables=variables)) == (
+        [Member(labelled_container(variables=variables), DOMAIN, networks=frozenset({"app"}))],
+        [],
+    )
 
 
 @pytest.mark.parametrize(
     "variables", [{"ROS_VERSION": "1"}, {"ROS_DISTRO": "noetic"}, {"ROS_DISTRO": "Melodic"}]
 )
 def test_its_variables_say_that_it_is_of_ros_1(variables: Mapping[str, str]) -> None:
-    assert keys(one({**ON, "rosproxy.master-uri": ROBOT}, variables)) == [KEY]
+    assert keys(labelled_container({**ON, "rosproxy.master-uri": ROBOT}, variables)) == [KEY]
 
 
 def test_the_label_says_it_whatever_the_variables_say() -> None:
-    assert keys(one({**ON, "rosproxy.ros": "1", "rosproxy.master-uri": ROBOT},
-                    {"ROS_VERSION": "2"})) == [KEY]  # fmt: skip
-    assert keys(one(TWO, {"ROS_DISTRO": "noetic"})) == [DOMAIN]
-    assert "is none of 1, 2 and 1,2" in refusal(one({**ON, "rosproxy.ros": "foxy"}))
+    assert keys(labelled_container({**ON, "rosproxy.ros": "1", "rosproxy.master-uri": ROBOT},
+                                   {"ROS_VERSION": "2"})) == [KEY]  # fmt: skip
+    assert keys(labelled_container(TWO, {"ROS_DISTRO": "noetic"})) == [DOMAIN]
+    assert "is none of 1, 2 and 1,2" in refusal(labelled_container({**ON, "rosproxy.ros": "foxy"}))
 
 
 def test_a_container_with_both_versions_gets_both() -> None:
     labels = {**ON, "rosproxy.ros": "1,2", "rosproxy.master-uri": ROBOT, "rosproxy.ports": "40"}
-    members, told = read(one(labels))
+    members, told = read(labelled_container(labels))
     assert [(member.key, member.ports) for member in members] == [(KEY, 40), (DOMAIN, 40)]
     assert not told
-    state = observed(one(labels))
+    state = observed(labelled_container(labels))
     assert master_hosts(read_labels(state, SETTINGS), state) == ("robot",)
 
 
 def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
     settings = replace(SETTINGS, master_uri=ROBOT)
-    members, told = read(one(), settings)
+    members, told = read(labelled_container(), settings)
     assert [member.key for member in members] == [KEY]
     assert told == [
         "nothing says which ROS it is, so it is taken for ROS 1: add the label rosproxy.ros=1 or 2"
     ]
-    assert read(one(env=ROBOT), settings)[1] == []
+    assert read(labelled_container(env=ROBOT), settings)[1] == []
 
 
 def test_the_domain_is_that_of_the_label_or_the_variable() -> None:
     variables = {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": "7"}
-    assert keys(one(ON, variables)) == [Key("", HERE, 7)]
-    assert keys(one({**ON, "rosproxy.domain": "42"}, variables)) == [Key("", HERE, 42)]
-    assert keys(one(ON, {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": ""})) == [DOMAIN]
-    text = refusal(one({**TWO, "rosproxy.domain": "233"}))
+    assert keys(labelled_container(ON, variables)) == [Key("", HERE, 7)]
+    assert keys(labelled_container({**ON, "rosproxy.domain": "42"}, variables)) == [
+        Key("", HERE, 42)
+    ]
+    assert keys(labelled_container(ON, {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": ""})) == [DOMAIN]
+    text = refusal(labelled_container({**TWO, "rosproxy.domain": "233"}))
     assert text.startswith("label rosproxy.domain='233' is not a domain from 0 to 232")
-    assert "its variable ROS_DOMAIN_ID='x'" in refusal(one(TWO, {"ROS_DOMAIN_ID": "x"}))
+    assert "its variable ROS_DOMAIN_ID='x'" in refusal(
+        labelled_container(TWO, {"ROS_DOMAIN_ID": "x"})
+    )
 
 
 def test_peers() -> None:
-    (member,), told = read(one({**TWO, "rosproxy.peers": "Robot, 192.0.2.7:11400"}))
+    (member,), told = read(labelled_container({**TWO, "rosproxy.peers": "Robot, 192.0.2.7:11400"}))
     assert sorted(member.peers) == ["192.0.2.7:11400", "robot"]
     assert not told
-    assert "rosproxy.peers" in refusal(one({**TWO, "rosproxy.peers": "no/host"}))
+    assert "rosproxy.peers" in refusal(labelled_container({**TWO, "rosproxy.peers": "no/host"}))
     many = " ".join(f"robot{number}" for number in range(33))
-    assert "names more than 32 hosts" in refusal(one({**TWO, "rosproxy.peers": many}))
+    assert "names more than 32 hosts" in refusal(
+        labelled_container({**TWO, "rosproxy.peers": many})
+    )
 
 
 def test_peers_that_are_not_allowed_are_left_out() -> None:
-    asked = one({**TWO, "rosproxy.peers": "robot, victim, arm:11400, base:11400, base"})
+    asked = labelled_container(
+        {**TWO, "rosproxy.peers": "robot, victim, arm:11400, base:11400, base"}
+    )
     patterns = tuple(map(read_host_pattern, ("robot", "*:11400")))
     settings = replace(SETTINGS, allow_peer=patterns, ros2_peer=("base",))
 
@@ -131,11 +141,11 @@ def test_peers_that_are_not_allowed_are_left_out() -> None:
 
 
 def test_labels_of_the_other_version_are_told() -> None:
-    assert read(one({**TWO, "rosproxy.slave-control": "master"}))[1] == [
+    assert read(labelled_container({**TWO, "rosproxy.slave-control": "master"}))[1] == [
         "label rosproxy.slave-control is for ROS 1, which this is not: ignored"
     ]
     labels = {**ON, "rosproxy.master-uri": ROBOT, "rosproxy.peers": "robot"}
-    told = read(one(labels))[1]
+    told = read(labelled_container(labels))[1]
     assert told == ["label rosproxy.peers is for ROS 2, which this is not: ignored"]
 
 
@@ -146,15 +156,15 @@ def test_plane_direction_and_rules_are_its_own() -> None:
         "rosproxy.direction": "both",
         "rosproxy.policy": "deny publish /camera/*",
     }
-    (member,), told = read(one(labels))
+    (member,), told = read(labelled_container(labels))
     assert (member.data_plane, member.direction) == ("splice", "both")
     assert member.policy == parse_rules("deny publish /camera/*")
     assert not told
 
 
 def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
-    assert "is no DDS" in refusal(one(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
-    text = refusal(one(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
+    assert "is no DDS" in refusal(labelled_container(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
+    text = refusal(labelled_container(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
     assert text.endswith("give an IPv4 address")
 
 
@@ -162,13 +172,13 @@ def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
     "variables", [{"ROS_LOCALHOST_ONLY": "1"}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}]
 )
 def test_participants_that_keep_to_themselves_are_told(variables: Mapping[str, str]) -> None:
-    (text,) = read(one(TWO, variables))[1]
+    (text,) = read(labelled_container(TWO, variables))[1]
     assert text.endswith("keeps its participants from being found: unset it")
 
 
 def test_on_an_internal_network_it_reaches_outside_through_the_proxy() -> None:
     inner = (UPLINK, Network("n1", "app", internal=True))
-    (member,), told = read(one(TWO), networks=inner)
+    (member,), told = read(labelled_container(TWO), networks=inner)
     assert (member.direction, told) == ("both", [])
 
 
@@ -181,8 +191,8 @@ def test_it_is_exposed_by_default_as_it_is_by_its_variables() -> None:
 
 def test_the_advertised_host_is_the_address_for_far_hosts() -> None:
     settings = replace(SETTINGS, advertise_host=None)
-    members, told = read(one(TWO), settings, far=HERE)
+    members, told = read(labelled_container(TWO), settings, far=HERE)
     assert ([member.key for member in members], told) == ([DOMAIN], [])
-    members, told = read(one(TWO), settings)
+    members, told = read(labelled_container(TWO), settings)
     assert not members
     assert told[0].startswith("this host's address is not known: add the label rosproxy.advert")

@@ -17,39 +17,43 @@ def own(name: str, state: str = "running") -> Proxy:
 
 @given(SOME, st.booleans())
 def test_everybody_has_one_part(some: list[tuple[str, bool]], creatable: bool) -> None:
-    there = [own(f"name-{n}" if n else "name", state) for n, (state, _) in enumerate(some)]
-    every = [one.container for one in there]
-    right = {one.id for one, (_, is_right) in zip(every, some, strict=True) if is_right}
-    found = select(there, "name", right, creatable)
-    runs = [one for one in every if one.state in SERVING]
-    ready = [one for one in every if one.state in IDLE and one.id in right]
-    if any(one.state == "removing" for one in every):
-        assert found.waiting
-        assert (found.kept is None) == (not runs)
-        assert (found.predecessor, found.surplus) == (None, ())
+    proxies = [own(f"name-{n}" if n else "name", state) for n, (state, _) in enumerate(some)]
+    every = [proxy.container for proxy in proxies]
+    right = {container.id for container, (_, is_right) in zip(every, some, strict=True) if is_right}
+    selection = select(proxies, "name", right, creatable)
+    runs = [container for container in every if container.state in SERVING]
+    ready = [container for container in every if container.state in IDLE and container.id in right]
+    if any(container.state == "removing" for container in every):
+        assert selection.waiting
+        assert (selection.kept is None) == (not runs)
+        assert (selection.predecessor, selection.surplus) == (None, ())
         return
-    assert found.stuck == (not runs and not ready and not creatable)
-    if found.stuck:
+    assert selection.stuck == (not runs and not ready and not creatable)
+    if selection.stuck:
         return
-    parts = [one for one in (found.kept, found.predecessor) if one] + list(found.surplus)
-    assert sorted(one.name for one in parts) == sorted(one.name for one in every)
-    if any(one.id in right for one in runs) or (runs and not creatable):
-        assert found.kept in runs
-        assert found.predecessor is None
+    assigned = [
+        container for container in (selection.kept, selection.predecessor) if container
+    ] + list(selection.surplus)
+    assert sorted(container.name for container in assigned) == sorted(
+        container.name for container in every
+    )
+    if any(container.id in right for container in runs) or (runs and not creatable):
+        assert selection.kept in runs
+        assert selection.predecessor is None
     elif ready:
-        assert found.kept in ready
-        assert found.predecessor in runs or (found.predecessor is None and not runs)
+        assert selection.kept in ready
+        assert selection.predecessor in runs or (selection.predecessor is None and not runs)
     else:
-        assert found.kept is None
-        assert found.predecessor is None or found.predecessor in runs or not runs
-    assert not found.predecessor or found.predecessor.state != "dead"
+        assert selection.kept is None
+        assert selection.predecessor is None or selection.predecessor in runs or not runs
+    assert not selection.predecessor or selection.predecessor.state != "dead"
 
 
 def test_the_one_with_the_name_is_preferred() -> None:
     every = [own(name) for name in ("a", "name", "z")]
-    found = select(every, "name", {one.container.id for one in every}, True)
-    assert found.kept == every[1].container
-    assert [one.name for one in found.surplus] == ["a", "z"]
+    selection = select(every, "name", {proxy.container.id for proxy in every}, True)
+    assert selection.kept == every[1].container
+    assert [container.name for container in selection.surplus] == ["a", "z"]
 
 
 def test_free_names() -> None:

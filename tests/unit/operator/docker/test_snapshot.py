@@ -34,24 +34,28 @@ def container(inspected: dict[str, Any] | None = None, **row: Any) -> Container:
 
 
 def test_a_running_container() -> None:
-    found = container(captured.inspected())
-    assert (found.id, found.name, found.state) == (captured.ID, "talker", "running")
-    assert found.labels == {"rosproxy.enable": "true"}
-    assert (found.network_mode, found.hostname) == ("app", "bhost")
-    assert found.master_uri == "http://robot:11311"
-    assert found.host_ports == {18080, 18000, 18001, 18002}
-    assert found.started_at == "2026-11-21T10:27:24.131326951Z"
-    (place,) = found.attachments
+    talker = container(captured.inspected())
+    assert (talker.id, talker.name, talker.state) == (captured.ID, "talker", "running")
+    assert talker.labels == {"rosproxy.enable": "true"}
+    assert (talker.network_mode, talker.hostname) == ("app", "bhost")
+    assert talker.master_uri == "http://robot:11311"
+    assert talker.host_ports == {18080, 18000, 18001, 18002}
+    assert talker.started_at == "2026-11-21T10:27:24.131326951Z"
+    (place,) = talker.attachments
     assert (place.network, place.address, place.network_id) == ("app", "172.29.0.2", APP.id)
     assert place.names == {"talker", "45afed2aea6c", "web", "bhost"}
 
 
 def test_a_created_container_on_the_default_network() -> None:
-    found = read_container(captured.created(), None)
-    assert (found.name, found.state, found.network_mode) == ("listener", "created", "bridge")
-    assert found.networks == {"bridge"}
-    assert found.attachments[0].address == found.attachments[0].network_id == ""
-    assert found.started_at == ""
+    listener = read_container(captured.created(), None)
+    assert (listener.name, listener.state, listener.network_mode) == (
+        "listener",
+        "created",
+        "bridge",
+    )
+    assert listener.networks == {"bridge"}
+    assert listener.attachments[0].address == listener.attachments[0].network_id == ""
+    assert listener.started_at == ""
 
 
 def test_names() -> None:
@@ -67,8 +71,8 @@ def test_variables() -> None:
 
 def test_newer_engines_keep_the_containers_own_names_apart() -> None:
     ends = {"app": {"Aliases": ["web"], "DNSNames": ["own", "web", "45afed2aea6c"]}}
-    found = container({"NetworkSettings": {"Networks": ends}})
-    assert found.attachments[0].names == {"talker", "own", "web", "45afed2aea6c"}
+    talker = container({"NetworkSettings": {"Networks": ends}})
+    assert talker.attachments[0].names == {"talker", "own", "web", "45afed2aea6c"}
 
 
 def test_a_container_that_was_never_started() -> None:

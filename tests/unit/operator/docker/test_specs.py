@@ -92,8 +92,11 @@ def test_a_policy_is_there_from_the_start_and_makes_no_proxy_anew() -> None:
     rules = parse_rules("deny publish /camera/*")
     other = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
     body = container_config(PROXY, other, SECRET, "")
-    assert settings_of(dict(one.split("=", 1) for one in body["Env"])).policy_layers == other.policy
-    made = (proxy_fingerprint(PROXY, each, IMAGE, SECRET) for each in (other, SETTINGS))
+    assert (
+        settings_of(dict(variable.split("=", 1) for variable in body["Env"])).policy_layers
+        == other.policy
+    )
+    made = (proxy_fingerprint(PROXY, settings, IMAGE, SECRET) for settings in (other, SETTINGS))
     assert len({*made}) == 1
 
 
@@ -130,7 +133,7 @@ def test_a_proxy_is_told_who_may_control_its_nodes() -> None:
 def test_ports_are_published_on_each_address_asked_for() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10", "::"))
     bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]
-    assert [each["HostIp"] for each in bindings["11400/tcp"]] == ["192.0.2.10", "::"]
+    assert [binding["HostIp"] for binding in bindings["11400/tcp"]] == ["192.0.2.10", "::"]
 
 
 @pytest.mark.parametrize("port", [11311, 11312, 11500])

@@ -33,10 +33,10 @@ BOX = CreateSandbox("s", KEY, PortRange(11400, 11401))
 
 
 def labelled(name: str, *labels: Mapping[str, str]) -> Container:
-    found = dict(ENABLED)
-    for each in labels:
-        found |= each
-    return container(name, found)
+    merged = dict(ENABLED)
+    for addition in labels:
+        merged |= addition
+    return container(name, merged)
 
 
 @pytest.mark.parametrize(
@@ -51,14 +51,14 @@ def labelled(name: str, *labels: Mapping[str, str]) -> Container:
     ],
 )
 def test_who_asks(containers: list[Container], option: bool, gets: bool) -> None:
-    found = planned(observed(*containers), replace(SETTINGS, udp=option), DockerMemory(), 0.0)
-    made = [one.udp for one in found.actions if isinstance(one, Create | CreateSandbox)]
+    plan = planned(observed(*containers), replace(SETTINGS, udp=option), DockerMemory(), 0.0)
+    made = [action.udp for action in plan.actions if isinstance(action, Create | CreateSandbox)]
     assert made == [gets, gets]
 
 
 def test_who_asks_for_it_alone_is_told() -> None:
-    found = planned(observed(labelled("a", ASKED)), SETTINGS, DockerMemory(), 0.0)
-    (problem,) = found.problems
+    plan = planned(observed(labelled("a", ASKED)), SETTINGS, DockerMemory(), 0.0)
+    (problem,) = plan.problems
     assert problem.subject == "container a"
     assert "rosproxy.direction=both" in problem.text
     assert not problem.fatal
@@ -85,7 +85,7 @@ def test_what_is_published_and_told(udp: bool) -> None:
 
 def test_the_sandbox_is_made_anew_for_it() -> None:
     either = (structs.replace(BOX, udp=udp) for udp in (False, True))
-    assert len({sandbox_fingerprint(one, SETTINGS) for one in either}) == 2
+    assert len({sandbox_fingerprint(box, SETTINGS) for box in either}) == 2
 
 
 @pytest.mark.parametrize(("udp", "first"), [({}, 11400), (ASKED, 11406)])
@@ -94,7 +94,7 @@ def test_udp_ports_that_others_have_are_in_the_way_of_those_that_ask(
 ) -> None:
     taken = replace(container("dns", {}), udp_ports=frozenset({11402}))
     seen = replace(observed(labelled("a", BOTH, udp), taken), listening_udp=frozenset({11405}))
-    found = planned(seen, SETTINGS, DockerMemory(), 0.0)
-    (box,) = [one for one in found.actions if isinstance(one, CreateSandbox)]
+    plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
+    (box,) = [action for action in plan.actions if isinstance(action, CreateSandbox)]
     assert box.range.first == first
     assert len(published_ports(KEY, box.range, box.udp)) == len(box.range) * (1 + box.udp)

@@ -46,7 +46,7 @@ class ApiServer:
         self.requests: list[tuple[str, str, dict[str, str]]] = []
         self.bodies: list[Any] = []
         self.refusals: dict[tuple[str, str], tuple[int, str]] = {}
-        self.held = Counter[str]()  # how often addresses are refused
+        self.address_refusals = Counter[str]()  # how often each is still to be refused
         self.gone_for_watches = False
         self.retry_after = ""
         self.url = ""
@@ -144,9 +144,9 @@ class ApiServer:
         return web.json_response(self.objects[key])
 
     def _delete(self, key: tuple[str, str, str], sub: str, body: Any) -> web.Response:
-        there = self.objects[key]["metadata"]
+        metadata = self.objects[key]["metadata"]
         for name, value in (body or {}).get("preconditions", {}).items():
-            if value != there[name]:
+            if value != metadata[name]:
                 return _status(409, f"Precondition failed: {name} in precondition: {value}")
         self.drop(key[0], key[2], key[1])
         return web.json_response({"kind": "Status", "status": "Success"})
@@ -157,8 +157,8 @@ class ApiServer:
             return _status(409, f'{kind} "{key[2]}" already exists')
         if kind == "services":
             address = body["spec"].setdefault("clusterIP", "10.96.0.7")
-            if self.held[address] > 0:
-                self.held[address] -= 1
+            if self.address_refusals[address] > 0:
+                self.address_refusals[address] -= 1
                 return _status(422, f"spec.clusterIPs: failed to allocate IP {address}: in use")
         return web.json_response(self.put(kind, body, namespace), status=201)
 
@@ -174,9 +174,9 @@ class ApiServer:
     def _list(self, kind: str, namespace: str, query: Any) -> web.Response:
         items = [
             obj
-            for (its, where, _), obj in self.objects.items()
-            if its == kind
-            and namespace in ("", where)
+            for (stored_kind, stored_namespace, _), obj in self.objects.items()
+            if stored_kind == kind
+            and namespace in ("", stored_namespace)
             and _labelled(query.get("labelSelector", ""), obj["metadata"].get("labels", {}))
             and _has_fields(query.get("fieldSelector", ""), obj)
         ]
@@ -195,8 +195,8 @@ class ApiServer:
             error = {"kind": "Status", "code": 410, "message": "too old resource version"}
             queue.put_nowait({"type": "ERROR", "object": error})
         since = int(request.query.get("resourceVersion", "0"))
-        for version, its, where, event in self._past:
-            if version > since and its == kind and namespace in ("", where):
+        for version, event_kind, event_namespace, event in self._past:
+            if version > since and event_kind == kind and namespace in ("", event_namespace):
                 queue.put_nowait(event)
         entry = kind, namespace, queue
         self._watches.append(entry)
@@ -276,17 +276,17 @@ def _status(code: int, message: str) -> web.Response:
 
 def _labelled(selector: str, labels: dict[str, str]) -> bool:
     """Whether a selector fits: ``a=b``, ``a in (b,c)`` and ``a notin (b,c)`` are known."""
-    for part in filter(None, _parts(selector)):
-        if " notin " in part:
-            key, values = part.split(" notin ")
+    for requirement in filter(None, _parts(selector)):
+        if " notin " in requirement:
+            key, values = requirement.split(" notin ")
             if labels.get(key) in values.strip("()").split(","):
                 return False
-        elif " in " in part:
-            key, values = part.split(" in ")
+        elif " in " in requirement:
+            key, values = requirement.split(" in ")
             if labels.get(key) not in values.strip("()").split(","):
                 return False
         else:
-            key, _, value = part.partition("=")
+            key, _, value = requirement.partition("=")
             if labels.get(key) != value:
                 return False
     return True
@@ -304,12 +304,12 @@ def _parts(selector: str) -> list[str]:
 
 
 def _has_fields(selector: str, obj: Object) -> bool:
-    for part in filter(None, selector.split(",")):
-        path, _, value = part.partition("=")
-        found: Any = obj
+    for requirement in filter(None, selector.split(",")):
+        path, _, value = requirement.partition("=")
+        field: Any = obj
         for step in path.split("."):
-            found = found.get(step, {}) if isinstance(found, dict) else {}
-        if (found or "") != value:
+            field = field.get(step, {}) if isinstance(field, dict) else {}
+        if (field or "") != value:
             return False
     return True
 

@@ -145,19 +145,19 @@ def stuck_proxy(why: PodFailure, message: str = "because") -> ProxyPod:
 
 def answer(*names: str, **more: Any) -> ProxyReport:
     """The answer of a proxy whose master is up, with ROS nodes in one pod."""
-    there = {"10.244.1.5": names} if names else {}
-    return ProxyReport(**{"answered": True, "master_up": True, "nodes": there, **more})
+    nodes = {"10.244.1.5": names} if names else {}
+    return ProxyReport(**{"answered": True, "master_up": True, "nodes": nodes, **more})
 
 
 def state(node: str = "node1", **more: Any) -> RosProxyOnNode:
     """A node with a pod, a proxy and its answer, unless told otherwise."""
-    found = {
+    fields = {
         "proxy": proxy(node),
         "pods": (pod(),),
         "answer": answer("/talker", topics=frozenset({"/chatter"})),
         **more,
     }
-    return RosProxyOnNode(node, "192.0.2.11", found.pop("range", RANGE), **found)
+    return RosProxyOnNode(node, "192.0.2.11", fields.pop("range", RANGE), **fields)
 
 
 def status(
@@ -167,21 +167,21 @@ def status(
     **given: Any,
 ) -> Json:
     """The status that follows from some nodes; ``more`` problems besides those that they have."""
-    one = of or rosproxy()
-    problems = (*findings(one, states, given.get("failures", {})), *more)
+    resource = of or rosproxy()
+    problems = (*findings(resource, states, given.get("failures", {})), *more)
     stamp = given.get("stamp", STAMP)
-    return status_of(one, states, problems, given.get("cluster_ip", CLUSTER_IP), ROBOT, stamp)
+    return status_of(resource, states, problems, given.get("cluster_ip", CLUSTER_IP), ROBOT, stamp)
 
 
-def condition(found: Json, type: str) -> Any:
-    (one,) = [one for one in found["conditions"] if one["type"] == type]
-    return one
+def condition(rosproxy_status: Json, type: str) -> Any:
+    (matching,) = [c for c in rosproxy_status["conditions"] if c["type"] == type]
+    return matching
 
 
-def judged(found: Json, type: str) -> tuple[str, str]:
-    one = condition(found, type)
-    return one["status"], one["reason"]
+def judged(rosproxy_status: Json, type: str) -> tuple[str, str]:
+    matching = condition(rosproxy_status, type)
+    return matching["status"], matching["reason"]
 
 
-def message(found: Json, type: str = "Ready") -> str:
-    return str(condition(found, type)["message"])
+def message(rosproxy_status: Json, type: str = "Ready") -> str:
+    return str(condition(rosproxy_status, type)["message"])

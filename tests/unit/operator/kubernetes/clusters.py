@@ -110,11 +110,11 @@ class Clusters(World):
         if not self.nodes:
             return
         node = pick(self.nodes, n)
-        there = [meta(pod)["uid"] for pod in self.users() if node_of(pod) == node]
-        known = {self.cluster.addresses[uid] for uid in there if uid in self.cluster.addresses}
+        uids = [meta(pod)["uid"] for pod in self.users() if node_of(pod) == node]
+        addresses = {self.cluster.addresses[uid] for uid in uids if uid in self.cluster.addresses}
         for pod, proxy in self.proxies():
             if proxy.node == node and proxy.pod.uid in self.cluster.ros:
-                self.cluster.ros[meta(pod)["uid"]] |= known
+                self.cluster.ros[meta(pod)["uid"]] |= addresses
 
     # nodes
 
@@ -132,7 +132,9 @@ class Clusters(World):
         if len(self.nodes) > 1:
             node = pick(self.nodes, n)
             del self.cluster.state.nodes[node]
-            self.held = {place: r for place, r in self.held.items() if place.node != node}
+            self.served_ranges = {
+                place: r for place, r in self.served_ranges.items() if place.node != node
+            }
 
     def join_node(self, n: int, _: int) -> None:
         name = pick(list(self.names), n)
@@ -148,8 +150,8 @@ class Clusters(World):
     # RosProxies
 
     def change(self, n: int, m: int) -> None:
-        if every := sorted(self.cluster.state.rosproxies.items()):
-            _, rosproxy = pick(every, n)
+        if rosproxies := sorted(self.cluster.state.rosproxies.items()):
+            _, rosproxy = pick(rosproxies, n)
             rosproxy["spec"] = mended(rosproxy["spec"] | pick(CHANGES, m))
             rosproxy["metadata"]["generation"] += 1
 
@@ -159,10 +161,12 @@ class Clusters(World):
             self.cluster.add_rosproxy(name, spec(m))
 
     def delete(self, n: int, _: int) -> None:
-        if every := sorted(self.cluster.state.rosproxies):
-            of = pick(every, n)
+        if rosproxies := sorted(self.cluster.state.rosproxies):
+            of = pick(rosproxies, n)
             del self.cluster.state.rosproxies[of]
-            self.held = {place: r for place, r in self.held.items() if place.of != of}
+            self.served_ranges = {
+                place: r for place, r in self.served_ranges.items() if place.of != of
+            }
 
     def replace(self, n: int, m: int) -> None:
         """Deleted and created again at once, as `kubectl replace --force` does."""
@@ -183,20 +187,20 @@ class Clusters(World):
 
     def delete_service(self, n: int, m: int) -> None:
         """A Service is deleted, and maybe its address is given to another one."""
-        if every := list(self.cluster.state.services):
-            gone = self.cluster.state.services.pop(pick(every, n))
+        if services := list(self.cluster.state.services):
+            gone = self.cluster.state.services.pop(pick(services, n))
             if m % 3 == 0 and is_own(gone):
-                other = {
+                other_service = {
                     "metadata": {"name": f"s-{self.cluster.uid('s')}", "namespace": self.namespace}
                 }
-                where = {"clusterIP": gone["spec"]["clusterIP"]}
+                service_spec = {"clusterIP": gone["spec"]["clusterIP"]}
                 with contextlib.suppress(Refused):
-                    self.cluster.create_service({**other, "spec": where})
+                    self.cluster.create_service({**other_service, "spec": service_spec})
 
     def meddle_with_policy(self, n: int, m: int) -> None:
         """A NetworkPolicy is deleted, or changed."""
-        if every := sorted(self.cluster.state.policies):
-            policy = self.cluster.state.policies[pick(every, n)]
+        if policies := sorted(self.cluster.state.policies):
+            policy = self.cluster.state.policies[pick(policies, n)]
             if m % 2:
                 del self.cluster.state.policies[name_of(policy)]
             else:
@@ -226,17 +230,19 @@ class Clusters(World):
         self.controller.remember()
 
     def look(self, n: int, _: int) -> None:
-        found = self.seen()
-        self.carry_out(found)
+        plan = self.seen()
+        self.carry_out(plan)
         if n % 2:
             self.cluster.step()
 
     def look_and_be_killed(self, n: int, _: int) -> None:
-        found = self.seen()
-        self.carry_out(found, n % (len(found.actions) + 1))
+        plan = self.seen()
+        self.carry_out(plan, n % (len(plan.actions) + 1))
         self.controller.lose_memory()
-        self.held = {place: r for place, r in self.held.items() if self.in_status(place) == r}
+        self.served_ranges = {
+            place: r for place, r in self.served_ranges.items() if self.in_status(place) == r
+        }
 
     def look_and_stall(self, n: int, _: int) -> None:
-        found = self.seen()
-        self.carry_out(found, n % (len(found.actions) + 1))
+        plan = self.seen()
+        self.carry_out(plan, n % (len(plan.actions) + 1))

@@ -39,28 +39,28 @@ ROBOT = Name("ros", "robot")
 
 def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
     """A RosProxy in namespace ros with four ports per node. ``changes`` are of it or its spec."""
-    words: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "master": MasterSpec("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
     }  # fmt: skip
     own = {key: changes.pop(key) for key in ("former_ranges", "cluster_ip", "status", "deleting")
            if key in changes}  # fmt: skip
     return RosProxy(
-        Name("ros", name), uid or f"uid-{name}", 1, RosProxySpec(**words | changes), **own
+        Name("ros", name), uid or f"uid-{name}", 1, RosProxySpec(**defaults | changes), **own
     )
 
 
 def node(name: str = "one", **changes: Any) -> ClusterNode:
-    words: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "addresses": {"InternalIP": "192.0.2.1", "Hostname": name},
         "pod_networks": ("10.244.1.0/24",),
     }
-    return ClusterNode(name, **words | changes)
+    return ClusterNode(name, **defaults | changes)
 
 
 def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **changes: Any) -> Pod:
     """A pod that runs and asks for a proxy; or, with ``ports``, a stranger that takes those."""
     taken = frozenset(ports)
-    words: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "labels": {} if taken else {names.INJECT: "true"},
         "node": on,
         "phase": "Running",
@@ -68,7 +68,7 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
         "host_ports": taken,
         "wired_master_uri": "" if taken else "http://10.96.1.1:11311",
     }
-    return Pod(Name("ros", name), f"uid-{name}", **words | changes)
+    return Pod(Name("ros", name), f"uid-{name}", **defaults | changes)
 
 
 def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> ProxySite:
@@ -93,32 +93,32 @@ def proxy(
     )
     body["metadata"]["uid"] = f"uid-proxy-{of.id.name}-{on.name}"
     running = phase == "Running" and stuck is None
-    found = objects.proxy_pod({**body, "status": {"phase": "Pending" if stuck else phase}})
-    assert found is not None
-    where = {"node": "" if stuck else on.name, "ip": "10.244.1.200" if running else ""}
-    own = replace(found.pod, **where | changes)
-    return replace(found, pod=own, ready=running, stuck=stuck, message="so it is" if stuck else "")
+    parsed = objects.proxy_pod({**body, "status": {"phase": "Pending" if stuck else phase}})
+    assert parsed is not None
+    placement = {"node": "" if stuck else on.name, "ip": "10.244.1.200" if running else ""}
+    own = replace(parsed.pod, **placement | changes)
+    return replace(parsed, pod=own, ready=running, stuck=stuck, message="so it is" if stuck else "")
 
 
 def service(of: RosProxy | None = None, ip: str = "10.96.1.1", **changes: Any) -> ProxyService:
     of = of or rosproxy()
     print_ = manifests.fingerprint_of(manifests.service(of))
-    found = ProxyService(of.id, of.uid, f"uid-service-{of.id.name}", ip, print_)
-    return replace(found, **changes)
+    proxy_service = ProxyService(of.id, of.uid, f"uid-service-{of.id.name}", ip, print_)
+    return replace(proxy_service, **changes)
 
 
 def observed(
-    *things: RosProxy | ClusterNode | Pod | ProxyPod | ProxyService, **more: Any
+    *resources: RosProxy | ClusterNode | Pod | ProxyPod | ProxyService, **more: Any
 ) -> ClusterSnapshot:
     """A cluster with these. Node one is there unless other nodes are given."""
-    nodes = [one for one in things if isinstance(one, ClusterNode)] or [node()]
-    services = [one for one in things if isinstance(one, ProxyService)]
+    nodes = [r for r in resources if isinstance(r, ClusterNode)] or [node()]
+    services = [r for r in resources if isinstance(r, ProxyService)]
     return ClusterSnapshot(
-        rosproxies=tuple(one for one in things if isinstance(one, RosProxy)),
-        nodes={one.name: one for one in nodes},
-        pods=tuple(one for one in things if isinstance(one, Pod)),
-        proxies=tuple(one for one in things if isinstance(one, ProxyPod)),
-        services={one.of: one for one in services},
+        rosproxies=tuple(r for r in resources if isinstance(r, RosProxy)),
+        nodes={n.name: n for n in nodes},
+        pods=tuple(r for r in resources if isinstance(r, Pod)),
+        proxies=tuple(r for r in resources if isinstance(r, ProxyPod)),
+        services={s.of: s for s in services},
         **more,
     )
 
@@ -143,38 +143,42 @@ def look(
     return plan(seen, settings, memory or ClusterState(), now, STAMP)
 
 
-def written(seen: ClusterSnapshot, found: ClusterPlan | None = None) -> ClusterSnapshot:
+def written(seen: ClusterSnapshot, plan: ClusterPlan | None = None) -> ClusterSnapshot:
     """The cluster with the status that a plan, or the first one, writes."""
-    found = found or look(seen)
-    new = {one.of: one.status for one in found.actions if isinstance(one, PatchStatus)}
-    rosproxies = (replace(one, status=new.get(one.id, one.status)) for one in seen.rosproxies)
+    plan = plan or look(seen)
+    new = {action.of: action.status for action in plan.actions if isinstance(action, PatchStatus)}
+    rosproxies = (replace(of, status=new.get(of.id, of.status)) for of in seen.rosproxies)
     return replace(seen, rosproxies=tuple(rosproxies))
 
 
-def done(found: ClusterPlan) -> list[Action]:
+def done(plan: ClusterPlan) -> list[Action]:
     """What a plan does to pods and Services."""
-    return [action for action in found.actions if not isinstance(action, Emit | PatchStatus)]
+    return [action for action in plan.actions if not isinstance(action, Emit | PatchStatus)]
 
 
-def kinds(found: ClusterPlan) -> list[type]:
-    return [type(one) for one in done(found)]
+def kinds(plan: ClusterPlan) -> list[type]:
+    return [type(action) for action in done(plan)]
 
 
-def creation(found: ClusterPlan) -> CreateProxy:
-    (action,) = done(found)
+def creation(plan: ClusterPlan) -> CreateProxy:
+    (action,) = done(plan)
     assert isinstance(action, CreateProxy), action
     return action
 
 
-def status(found: ClusterPlan, of: Name = ROBOT) -> Mapping[str, Any]:
+def status(plan: ClusterPlan, of: Name = ROBOT) -> Mapping[str, Any]:
     """The status that a plan writes."""
-    written = [action for action in found.actions if isinstance(action, PatchStatus)]
+    written = [action for action in plan.actions if isinstance(action, PatchStatus)]
     return next(action.status for action in written if action.of == of)
 
 
-def told(found: ClusterPlan, reason: str) -> list[str]:
+def told(plan: ClusterPlan, reason: str) -> list[str]:
     """The texts of findings with a reason."""
-    return [f"{one.subject}: {one.text}" for one in found.problems if one.reason == reason]
+    return [
+        f"{finding.subject}: {finding.text}"
+        for finding in plan.problems
+        if finding.reason == reason
+    ]
 
 
 def node_of(action: Any) -> str:

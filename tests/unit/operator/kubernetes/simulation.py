@@ -68,9 +68,9 @@ def node_of(pod: Object) -> str:
 
 
 def host_ports(pod: Object) -> set[tuple[str, int]]:
-    found = parse.pod(pod)
-    return {("TCP", port) for port in found.host_ports} | {
-        ("UDP", port) for port in found.udp_ports
+    parsed = parse.pod(pod)
+    return {("TCP", port) for port in parsed.host_ports} | {
+        ("UDP", port) for port in parsed.udp_ports
     }
 
 
@@ -190,10 +190,10 @@ class Cluster:
     def create_service(self, body: Object) -> None:
         if name_of(body) in self.state.services:
             raise Refused("AlreadyExists")
-        held = {one["spec"]["clusterIP"] for one in self.state.services.values()}
+        allocated = {existing["spec"]["clusterIP"] for existing in self.state.services.values()}
         service = copy.deepcopy(body)
         wanted = service["spec"].setdefault("clusterIP", f"10.96.1.{next(self.numbers) % 250}")
-        if wanted in held:
+        if wanted in allocated:
             raise Refused("provided IP is already allocated")
         service["metadata"]["uid"] = self.uid("service")
         self.state.services[name_of(service)] = service
@@ -217,7 +217,7 @@ class Cluster:
 
     def collect(self) -> None:
         """The garbage collectors: owners and nodes that are gone."""
-        uids = {meta(one)["uid"] for one in self.state.rosproxies.values()}
+        uids = {meta(owner)["uid"] for owner in self.state.rosproxies.values()}
         for pod in list(self.state.pods.values()):
             owners = meta(pod).get("ownerReferences", ())
             orphaned = any(ref["uid"] not in uids for ref in owners)
@@ -226,8 +226,10 @@ class Cluster:
             ):
                 self.delete_pod(pod)
         for kind in (self.state.services, self.state.policies):
-            for name, one in list(kind.items()):
-                if any(ref["uid"] not in uids for ref in meta(one).get("ownerReferences", ())):
+            for name, dependent in list(kind.items()):
+                if any(
+                    ref["uid"] not in uids for ref in meta(dependent).get("ownerReferences", ())
+                ):
                     del kind[name]
 
     def schedule(self) -> None:
@@ -240,15 +242,15 @@ class Cluster:
     def _bind(self, pod: Object, node: str) -> str:
         if node not in self.state.nodes or not self.is_ready(node):
             return "node(s) didn't match Pod's node affinity/selector"
-        if host_ports(pod) & self.held(node):
+        if host_ports(pod) & self.taken_host_ports(node):
             return PORTS_TAKEN
         pod["spec"]["nodeName"] = node
         return ""
 
-    def held(self, node: str) -> set[tuple[str, int]]:
+    def taken_host_ports(self, node: str) -> set[tuple[str, int]]:
         """The hostPorts that the scheduler counts on a node."""
-        there = [pod for pod in self.state.pods.values() if node_of(pod) == node]
-        return {port for pod in there if not ended(pod) for port in host_ports(pod)}
+        pods = [pod for pod in self.state.pods.values() if node_of(pod) == node]
+        return {port for pod in pods if not ended(pod) for port in host_ports(pod)}
 
     def running(self) -> set[str]:
         pods = self.state.pods.values()
@@ -290,27 +292,29 @@ class Cluster:
     def observe(self, old: State | None, failures: dict[Name, dict[Name, str]]) -> ClusterSnapshot:
         """What is there; pods, nodes and Services as they were before, if ``old`` is given."""
         seen = old or self.state
-        pods = [parse.pod(one) for one in seen.pods.values()]
-        own = [found for one in seen.pods.values() if (found := parse.proxy_pod(one))]
+        pods = [parse.pod(pod) for pod in seen.pods.values()]
+        own = [proxy for pod in seen.pods.values() if (proxy := parse.proxy_pod(pod))]
         ears = filter(None, map(parse.ear_pod, seen.pods.values()))
         services = filter(None, map(parse.service, seen.services.values()))
         policies = seen.policies.values()
-        of = tuple(parse_rosproxy.rosproxy(one) for one in self.state.rosproxies.values())
-        masters = {one.spec.master.service for one in of if one.spec.master.service}
-        there = (self.master_ip, "") if self.master_ip else ("", "does not exist")
+        of = tuple(parse_rosproxy.rosproxy(rosproxy) for rosproxy in self.state.rosproxies.values())
+        masters = {rosproxy.spec.master.service for rosproxy in of if rosproxy.spec.master.service}
+        resolved = (self.master_ip, "") if self.master_ip else ("", "does not exist")
         return ClusterSnapshot(
             rosproxies=of,
-            nodes={name: parse.node(one) for name, one in seen.nodes.items()},
+            nodes={name: parse.node(node) for name, node in seen.nodes.items()},
             pods=tuple(pods),
             proxies=tuple(own),
             ears=tuple(ears),
-            services={one.of: one for one in services},
-            policies={one.id: one for one in filter(None, map(parse.policy, policies))},
+            services={service.of: service for service in services},
+            policies={policy.id: policy for policy in filter(None, map(parse.policy, policies))},
             key=self.key,
-            masters=dict.fromkeys(masters, there),
+            masters=dict.fromkeys(masters, resolved),
             reports={
-                uid: ProxyReport(True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(known)})
-                for uid, known in self.ros.items()
+                uid: ProxyReport(
+                    True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(addresses)}
+                )
+                for uid, addresses in self.ros.items()
                 if uid in self.running()
             },
             failures=failures,
@@ -358,12 +362,12 @@ class Cluster:
 
     def _own(self, objects: dict[Name, Object], id: Name, uid: str) -> Object | None:
         """An object to do something to, if it is still the one that is meant."""
-        found = objects.get(id)
-        if found is None or meta(found)["uid"] != uid:
+        target = objects.get(id)
+        if target is None or meta(target)["uid"] != uid:
             return None
-        assert is_own(found), f"{id} is not the operator's"
+        assert is_own(target), f"{id} is not the operator's"
         self.made += 1
-        return found
+        return target
 
 
 class Controller:
@@ -377,21 +381,21 @@ class Controller:
         self.old: State | None = None
 
     def remember(self) -> None:
-        """What is there now is what the next looks see, until `forget`."""
+        """What is there now is what the next looks see, while ``old`` stays."""
         self.old = self.old or copy.deepcopy(self.cluster.state)
 
     def look(self) -> ClusterPlan:
         observed = self.cluster.observe(self.old, self.failures)
         stamp = f"2026-01-01T{int(self.now) // 3600 % 24:02}:00:00Z"
-        found = plan(observed, self.settings, self.state, self.now, stamp)
-        self.state = found.state
-        for uid, addresses in found.departed_addresses.items():
+        cluster_plan = plan(observed, self.settings, self.state, self.now, stamp)
+        self.state = cluster_plan.state
+        for uid, addresses in cluster_plan.departed_addresses.items():
             self.cluster.ros[uid] -= set(addresses)
-        return found
+        return cluster_plan
 
-    def carry_out(self, found: ClusterPlan, most: int | None = None) -> None:
+    def carry_out(self, cluster_plan: ClusterPlan, most: int | None = None) -> None:
         """Carry out a plan's actions, or the first few."""
-        actions = found.actions[:most]
+        actions = cluster_plan.actions[:most]
         failed: dict[Name, dict[Name, str]] = {action.of: {} for action in actions}
         for action in actions:
             failed[action.of] |= self._try(action)
@@ -406,10 +410,10 @@ class Controller:
             kinds = {
                 CreateProxy: state.pods, CreateEar: state.pods, CreateService: state.services,
             }  # fmt: skip
-            there = kinds.get(type(action), state.policies).get(name)
-            if str(error) == "AlreadyExists" and there is not None:
+            existing = kinds.get(type(action), state.policies).get(name)
+            if str(error) == "AlreadyExists" and existing is not None:
                 text = "there is already a Pod of this name that is not the operator's"
-                return {} if is_own(there) else {name: text}
+                return {} if is_own(existing) else {name: text}
             return {name: str(error)}
         return {}
 

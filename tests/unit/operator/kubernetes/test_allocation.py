@@ -33,7 +33,7 @@ from tests.unit.operator.kubernetes.objects import (
     told,
 )
 
-HERE = ProxyPlace(ROBOT, "one")
+ROBOT_ON_ONE = ProxyPlace(ROBOT, "one")
 NEXT = PortRange(11404, 11407)
 FORMER = {"one": PortRange(11450, 11453)}
 ARM = {names.INJECT: "arm"}
@@ -49,8 +49,8 @@ def two(*more: Any, arm: Any = None, robot: Any = None) -> ClusterSnapshot:
     return observed(arm, robot, service(arm), service(robot), *more)
 
 
-def created(found: ClusterPlan) -> str:
-    return ports_of(creation(found))
+def created(plan: ClusterPlan) -> str:
+    return ports_of(creation(plan))
 
 
 def publishing(port: int, name: str = "robot") -> Any:
@@ -58,14 +58,14 @@ def publishing(port: int, name: str = "robot") -> Any:
 
 
 def host_ports(action: CreateProxy) -> list[int]:
-    return [one["hostPort"] for one in action.body["spec"]["containers"][0]["ports"]]
+    return [port["hostPort"] for port in action.body["spec"]["containers"][0]["ports"]]
 
 
 # a new range
 
 
 @pytest.mark.parametrize(
-    ("of", "others", "ports"),
+    ("of", "other_pods", "ports"),
     [
         (rosproxy(), [pod("ended", ports=[11401], phase="Succeeded")], "11400-11403"),
         (rosproxy(), [pod("elsewhere", "two", ports=[11401])], "11400-11403"),
@@ -79,8 +79,8 @@ def host_ports(action: CreateProxy) -> list[int]:
         (rosproxy(former_ranges=FORMER), [pod("web", ports=[11451])], "11400-11403"),
     ],
 )  # fmt: skip
-def test_a_new_range(of: Any, others: list, ports: str) -> None:
-    assert created(look(scene(*others, of=of))) == ports
+def test_a_new_range(of: Any, other_pods: list, ports: str) -> None:
+    assert created(look(scene(*other_pods, of=of))) == ports
 
 
 def test_never_ports_of_the_api_server_or_of_the_kernel() -> None:
@@ -92,8 +92,8 @@ def test_never_ports_of_the_api_server_or_of_the_kernel() -> None:
 
 
 def test_two_rosproxies_get_different_ports_on_a_node_and_the_same_on_two() -> None:
-    found = look(two(node("one"), node("two"), A, B, pod("c", "two", labels=OURS)))
-    given = {(one.of.name, node_of(one)): ports_of(one) for one in done(found)}
+    plan = look(two(node("one"), node("two"), A, B, pod("c", "two", labels=OURS)))
+    given = {(action.of.name, node_of(action)): ports_of(action) for action in done(plan)}
     assert given == {
         ("arm", "one"): "11400-11403",
         ("robot", "one"): "11404-11407",
@@ -111,20 +111,20 @@ def test_former_ports_of_another_rosproxy_are_left_alone_if_there_are_others(
 
 def test_when_there_are_none_it_is_told_who_holds_them_and_what_to_do() -> None:
     of = rosproxy(window=PortRange(11400, 11406))
-    found = look(scene(pod("web", ports=[11403]), of=of))
-    assert done(found) == []
-    (text,) = told(found, "PortsExhausted")
+    plan = look(scene(pod("web", ports=[11403]), of=of))
+    assert done(plan) == []
+    (text,) = told(plan, "PortsExhausted")
     assert text == (
         "node one: no 4 free ports in a row between 11400 and 11406: 6 of 7 are free, "
         "3 at most in a row; others are held by ros/web: enlarge spec.portWindow (11400-11406), "
         "lower spec.ports (4), or delete one of those pods"
     )
-    assert "ports" not in status(found)["perNode"][0]
+    assert "ports" not in status(plan)["perNode"][0]
 
 
 def test_ports_that_no_pod_may_have_are_named() -> None:
-    found = look(scene(of=rosproxy(window=PortRange(30000, 40000))))
-    (text,) = told(found, "PortsExhausted")
+    plan = look(scene(of=rosproxy(window=PortRange(30000, 40000))))
+    (text,) = told(plan, "PortsExhausted")
     assert "NodePorts are 30000-32767, the nodes' ephemeral ports are 32768-60999" in text
 
 
@@ -134,8 +134,8 @@ def test_ports_that_no_pod_may_have_are_named() -> None:
 def changed(**changes: Any) -> tuple[str, ClusterPlan]:
     """The range that a running proxy gets when its RosProxy changes."""
     of = rosproxy(**changes)
-    found = look(scene(proxy(), of=of))
-    return str(found.state.given[HERE]), found
+    plan = look(scene(proxy(), of=of))
+    return str(plan.state.given[ROBOT_ON_ONE]), plan
 
 
 @pytest.mark.parametrize(
@@ -149,23 +149,23 @@ def changed(**changes: Any) -> tuple[str, ClusterPlan]:
     ],
 )
 def test_a_change_moves_no_more_than_need_be(changes: dict, ports: str) -> None:
-    given, found = changed(**changes)
+    given, plan = changed(**changes)
     assert given == ports
-    assert kinds(found) == [DeleteProxy] * (ports != str(RANGE))
+    assert kinds(plan) == [DeleteProxy] * (ports != str(RANGE))
 
 
 def test_ports_are_not_left_because_there_could_be_more_elsewhere() -> None:
     of = rosproxy(ports=8)
-    found = look(scene(proxy(), pod("web", ports=[11405]), of=of))
-    assert found.state.given[HERE] == RANGE
-    (text,) = told(found, "PortsExhausted")
+    plan = look(scene(proxy(), pod("web", ports=[11405]), of=of))
+    assert plan.state.given[ROBOT_ON_ONE] == RANGE
+    (text,) = told(plan, "PortsExhausted")
     assert "spec.ports is 8, but the proxy on node one keeps its 4 at 11400-11403" in text
     assert "11404-11407 are not free" in text
 
 
 def test_who_has_left_his_ports_is_told() -> None:
-    _, found = changed(window=PortRange(11410, 11420))
-    (text,) = told(found, "PortConflict")
+    _, plan = changed(window=PortRange(11410, 11420))
+    (text,) = told(plan, "PortConflict")
     assert "has left ports 11400-11403 for 11410-11413" in text
     assert "restart them" in text
 
@@ -196,7 +196,7 @@ def test_ports_that_never_served_are_left_at_once_if_they_can_not_be_had() -> No
 def test_the_next_range_begins_after_the_port_that_a_pod_is_seen_to_hold() -> None:
     first = look(scene())
     stuck = scene(proxy(stuck=PodFailure.PORTS), pod("web", ports=[11400]))
-    assert str(look(stuck, first.state, 101.0).state.given[HERE]) == "11401-11404"
+    assert str(look(stuck, first.state, 101.0).state.given[ROBOT_ON_ONE]) == "11401-11404"
 
 
 def test_ports_that_have_served_are_tried_for_a_while() -> None:
@@ -208,7 +208,7 @@ def test_ports_that_have_served_are_tried_for_a_while() -> None:
     assert done(second) == []
     third = look(STUCK, second.state, 121.0)
     assert kinds(third) == [DeleteProxy]
-    assert third.state.given[HERE] == NEXT
+    assert third.state.given[ROBOT_ON_ONE] == NEXT
     assert any("restart them" in text for text in told(third, "PortConflict"))
 
 
@@ -219,7 +219,7 @@ def test_a_rejected_pod_is_made_anew_on_the_same_ports_for_a_while() -> None:
     second = look(scene(), first.state, 102.0)
     assert created(second) == "11400-11403"
     third = look(failed, second.state, 122.0)
-    assert third.state.given[HERE] == NEXT
+    assert third.state.given[ROBOT_ON_ONE] == NEXT
 
 
 def test_who_gets_his_ports_back_in_time_stays() -> None:
@@ -231,10 +231,10 @@ def test_who_gets_his_ports_back_in_time_stays() -> None:
 
 def test_another_proxy_that_is_about_to_end_is_waited_for() -> None:
     waits = scene(proxy(stuck=PodFailure.PORTS), proxy(rosproxy("arm"), deleting=True))
-    found = look(waits)
+    plan = look(waits)
     for now in (200.0, 300.0):
-        assert not [one for one in done(found) if one.of == ROBOT]
-        found = look(waits, found.state, now)
+        assert not [action for action in done(plan) if action.of == ROBOT]
+        plan = look(waits, plan.state, now)
 
 
 def test_what_the_status_names_counts_as_served_after_a_restart_of_the_controller() -> None:
@@ -256,9 +256,9 @@ def test_ports_of_a_pod_that_is_about_to_end_are_waited_for_by_who_has_served_th
 
 
 def test_ports_that_another_pod_has_taken_are_left_at_once() -> None:
-    found = look(scene(pod("web", ports=[11401])), served(), 101.0)
-    assert created(found) == "11402-11405"
-    assert told(found, "PortConflict")
+    plan = look(scene(pod("web", ports=[11401])), served(), 101.0)
+    assert created(plan) == "11402-11405"
+    assert told(plan, "PortConflict")
 
 
 def test_a_proxy_that_has_its_ports_stays_whatever_else_is_seen() -> None:
@@ -270,13 +270,13 @@ WAITS = proxy(rosproxy("arm"), phase="Pending", node="")
 
 
 def test_of_two_that_wait_with_the_same_ports_one_stays() -> None:
-    found = look(two(A, B, WAITS, proxy(phase="Pending", node="")))
-    assert [(type(one), one.of.name) for one in done(found)] == [(DeleteProxy, "robot")]
-    assert found.state.given[HERE] == NEXT
+    plan = look(two(A, B, WAITS, proxy(phase="Pending", node="")))
+    assert [(type(action), action.of.name) for action in done(plan)] == [(DeleteProxy, "robot")]
+    assert plan.state.given[ROBOT_ON_ONE] == NEXT
 
 
 def test_who_serves_comes_before_who_waits() -> None:
-    assert [one.of.name for one in done(look(two(A, B, WAITS, proxy())))] == ["arm"]
+    assert [action.of.name for action in done(look(two(A, B, WAITS, proxy())))] == ["arm"]
 
 
 # the port of a master in the cluster
@@ -290,17 +290,17 @@ def test_the_masters_port_is_published_besides_the_range_that_avoids_it() -> Non
 
 def test_a_masters_port_that_is_taken_is_told_and_the_rest_works() -> None:
     of = publishing(11500)
-    found = look(scene(pod("web", ports=[11500]), of=of))
-    assert host_ports(creation(found)) == list(RANGE.ports())
-    (text,) = told(found, "PortConflict")
+    plan = look(scene(pod("web", ports=[11500]), of=of))
+    assert host_ports(creation(plan)) == list(RANGE.ports())
+    (text,) = told(plan, "PortConflict")
     assert "not published on port 11500 of node one, which is held by ros/web" in text
     assert "spec.master.publish" in text
 
 
 def test_only_one_of_two_gets_the_masters_port() -> None:
-    found = look(two(A, B, arm=publishing(11500, "arm"), robot=publishing(11500)))
-    made = [one for one in done(found) if isinstance(one, CreateProxy)]
-    assert [11500 in host_ports(one) for one in made] == [True, False]
+    plan = look(two(A, B, arm=publishing(11500, "arm"), robot=publishing(11500)))
+    made = [action for action in done(plan) if isinstance(action, CreateProxy)]
+    assert [11500 in host_ports(action) for action in made] == [True, False]
 
 
 def test_who_has_the_masters_port_keeps_it() -> None:
@@ -313,6 +313,6 @@ def test_who_has_the_masters_port_keeps_it() -> None:
 def test_a_masters_port_that_is_in_the_way_does_not_move_the_range() -> None:
     of = publishing(11500)
     stuck = proxy(of, stuck=PodFailure.PORTS, publish=11500)
-    found = look(scene(stuck, pod("web", ports=[11500]), of=of), look(scene(of=of)).state, 101.0)
-    assert kinds(found) == [DeleteProxy]
-    assert found.state.given[HERE] == RANGE
+    plan = look(scene(stuck, pod("web", ports=[11500]), of=of), look(scene(of=of)).state, 101.0)
+    assert kinds(plan) == [DeleteProxy]
+    assert plan.state.given[ROBOT_ON_ONE] == RANGE

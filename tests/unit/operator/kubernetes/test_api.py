@@ -32,8 +32,8 @@ def pod(name: str, **labels: str) -> dict[str, object]:
     return {"metadata": {"name": name, "labels": labels}, "spec": {"nodeName": "node1"}}
 
 
-def names(found: list[dict[str, dict[str, str]]]) -> set[str]:
-    return {each["metadata"]["name"] for each in found}
+def names(listed: list[dict[str, dict[str, str]]]) -> set[str]:
+    return {o["metadata"]["name"] for o in listed}
 
 
 async def test_lists_with_selectors(server: ApiServer, api: Api) -> None:
@@ -88,8 +88,8 @@ async def test_only_the_given_namespaces_are_listed(server: ApiServer) -> None:
     api = Api(["one", "two"])
     server.put("rosproxies", {"metadata": {"name": "arm"}}, "two")
     server.put("rosproxies", {"metadata": {"name": "leg"}}, "three")
-    found = await in_thread(api.rosproxies)
-    assert [each["metadata"]["name"] for each in found] == ["arm"]
+    rosproxies = await in_thread(api.rosproxies)
+    assert [rosproxy["metadata"]["name"] for rosproxy in rosproxies] == ["arm"]
     api.close()
 
 

@@ -37,7 +37,7 @@ from tests.unit.operator.kubernetes.builders_api import (
     proxy_obj,
     rosproxy_obj,
 )
-from tests.unit.operator.kubernetes.known import known
+from tests.unit.operator.kubernetes.snapshots import snapshot_of
 
 OF = Name(NAMESPACE, "arm")
 KEY = b"k" * 32
@@ -110,8 +110,8 @@ async def test_a_policy_is_made_mended_and_deleted(server: ApiServer, carry: Car
     await carry.out(CreatePolicy(OF, made))
     await carry.out(CreatePolicy(OF, made))  # it is there by now
     assert carry.applier.failures == {OF: {}}
-    (there,) = server.all("networkpolicies")
-    uid = there["metadata"]["uid"]
+    (policy,) = server.all("networkpolicies")
+    uid = policy["metadata"]["uid"]
     await carry.out(SetPolicy(OF, id, uid, {"policyTypes": ["Ingress"]}))
     assert server.get("networkpolicies", id.name, NAMESPACE)["spec"] == {"policyTypes": ["Ingress"]}
     await carry.out(SetPolicy(OF, id, "another", {}), DeletePolicy(OF, id, "another", "old"))
@@ -143,7 +143,7 @@ async def test_a_lost_service_gets_its_address_or_another(
 ) -> None:
     """That of one just deleted is given back only after its deletion was told."""
     monkeypatch.setattr("time.sleep", lambda _: None)
-    server.held.update({"10.96.0.5": 2, "10.96.9.9": 1000})
+    server.address_refusals.update({"10.96.0.5": 2, "10.96.9.9": 1000})
     service = body("Service", "rosproxy-arm", clusterIP="10.96.0.5")
     taken = body("Service", "rosproxy-leg", clusterIP="10.96.9.9")
     await carry.out(CreateService(OF, service), CreateService(OF, taken))
@@ -158,14 +158,14 @@ async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Ca
     for pod in (old, new):
         server.put("pods", pod, NAMESPACE)
     server.put("services", body("Service", "new"), NAMESPACE)
-    names = [Name(NAMESPACE, one["metadata"]["name"]) for one in (old, new)]
+    names = [Name(NAMESPACE, pod["metadata"]["name"]) for pod in (old, new)]
     actions = (
         DeleteProxy(OF, names[0], old["metadata"]["uid"], "why"),
         DeleteProxy(OF, names[1], "another", "why"),
         DeleteProxy(OF, Name(NAMESPACE, "never was"), "x", "why"),
         DeleteService(OF, Name(NAMESPACE, "new"), "another", "why"),
     )
-    await carry.applier.carry_out(actions, known(server))
+    await carry.applier.carry_out(actions, snapshot_of(server))
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == [names[1].name]
     assert server.all("services")
     assert carry.applier.failures == {OF: {}}
@@ -180,7 +180,7 @@ async def test_what_stays_another_than_it_is_known_is_doubted(
     action = DeleteProxy(
         OF, Name(NAMESPACE, old["metadata"]["name"]), old["metadata"]["uid"], "why"
     )
-    seen = known(server)
+    seen = snapshot_of(server)
     server.drop("rosproxies", "arm", NAMESPACE)
     for times in (0, 1, 1, 2):
         await carry.applier.carry_out([action], seen)
@@ -202,9 +202,9 @@ async def test_a_status_is_replaced_whole(server: ApiServer, carry: Carried) -> 
     old = {"message": "old", "perNode": [{"name": "a"}, {"name": "b"}]}
     server.put("rosproxies", rosproxy_obj(status=old), NAMESPACE)
     await carry.out(PatchStatus(OF, seen().uid, {"perNode": []}), rosproxies=(seen(old),))
-    held = server.get("rosproxies", "arm", NAMESPACE)
-    assert held["status"] == {"perNode": []}
-    assert held["spec"] == rosproxy_obj()["spec"]
+    stored = server.get("rosproxies", "arm", NAMESPACE)
+    assert stored["status"] == {"perNode": []}
+    assert stored["spec"] == rosproxy_obj()["spec"]
     assert server.requests[-1][1].endswith("/rosproxies/arm/status")
 
 
@@ -338,7 +338,7 @@ async def _retire(server: ApiServer, carry: Carried, ip: str) -> None:
 
     obj = proxy_obj(status={"phase": "Running", "podIP": ip})
     server.put("pods", obj, NAMESPACE)
-    proxy, seen = proxy_pod(obj), known(server, KEY)
+    proxy, seen = proxy_pod(obj), snapshot_of(server, KEY)
     assert proxy is not None
     action = DeleteProxy(OF, proxy.pod.id, proxy.pod.uid, "RosProxy deleted", retire=True)
     await carry.applier.carry_out([action, action], seen)

@@ -48,9 +48,9 @@ def asks(settings: ClusterSettings = OWN, **changes: Any) -> str:
     return bounds_violation(rosproxy(**changes), {}, settings)
 
 
-def condition(found: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, str]:
-    (one,) = [one for one in found["conditions"] if one["type"] == kind]
-    return one["status"], one["reason"], one["message"]
+def condition(rosproxy_status: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, str]:
+    (matching,) = [c for c in rosproxy_status["conditions"] if c["type"] == kind]
+    return matching["status"], matching["reason"], matching["message"]
 
 
 @pytest.mark.parametrize(
@@ -154,36 +154,36 @@ def test_another_namespaces_master_needs_its_consent(
 def test_whether_another_namespaces_service_exists_is_not_told() -> None:
     seen = scene(of=rosproxy(master=THEIRS))
     missing = replace(seen, masters={ROSCORE: ("", "there is no Service")})
-    there = replace(seen, masters={ROSCORE: ("10.96.0.9", "")})
-    assert status(look(missing)) == status(look(there))
+    existing = replace(seen, masters={ROSCORE: ("10.96.0.9", "")})
+    assert status(look(missing)) == status(look(existing))
 
 
 def test_who_asks_for_too_much_gets_nothing_and_is_told() -> None:
     of = rosproxy(data_plane="kernel")
-    found = look(observed(of, pod(wired_master_uri="")), settings=OWN)
-    assert done(found) == []
+    plan = look(observed(of, pod(wired_master_uri="")), settings=OWN)
+    assert done(plan) == []
     text = "spec.dataPlane: 'Kernel' is not what the operator allows"
     for kind, holds in (("Ready", "False"), ("Degraded", "True")):
-        status_, reason, message = condition(status(found), kind)
+        status_, reason, message = condition(status(plan), kind)
         assert (status_, reason) == (holds, "NotAllowed")
         assert message.startswith(text)
-    assert [one.about.kind for one in found.problems if one.about] == ["RosProxy"]
-    assert told(found, "NotAllowed")
+    assert [problem.about.kind for problem in plan.problems if problem.about] == ["RosProxy"]
+    assert told(plan, "NotAllowed")
 
 
 def test_what_it_had_stays_as_it_is() -> None:
     """An upgrade that forbids what was allowed takes no port from anybody."""
     of = rosproxy(image="mine:1", status={"perNode": [{"name": "one", "ports": "11400-11403"}]})
-    found = look(observed(of, service(of), pod(), proxy(of)), settings=OWN)
-    assert done(found) == []
-    assert status(found)["perNode"] == of.status["perNode"]
-    assert found.callers == {"uid-proxy-robot-one": (pod().ip,)}
+    plan = look(observed(of, service(of), pod(), proxy(of)), settings=OWN)
+    assert done(plan) == []
+    assert status(plan)["perNode"] == of.status["perNode"]
+    assert plan.callers == {"uid-proxy-robot-one": (pod().ip,)}
 
 
 def test_ports_of_one_that_asks_for_too_much_are_still_his() -> None:
     bad, good = rosproxy("arm", image="mine:1"), rosproxy(ports=2)
-    found = look(observed(bad, good, service(good), proxy(bad), pod()), settings=OWN)
-    action = creation(found)
+    plan = look(observed(bad, good, service(good), proxy(bad), pod()), settings=OWN)
+    action = creation(plan)
     assert action.of == ROBOT
     assert action.body["metadata"]["annotations"]["rosproxy.io/port-range"] == "11404-11405"
 

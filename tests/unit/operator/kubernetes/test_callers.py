@@ -19,8 +19,8 @@ def who(*things: Any) -> tuple[str, ...] | None:
 
 
 def test_selected_pods_on_its_node() -> None:
-    here, there = pod("a", ip="10.244.1.5"), pod("b", on="two", ip="10.244.2.5")
-    assert who(rosproxy(), here, there) == ("10.244.1.5",)
+    local, remote = pod("a", ip="10.244.1.5"), pod("b", on="two", ip="10.244.2.5")
+    assert who(rosproxy(), local, remote) == ("10.244.1.5",)
     assert who() == ()
 
 
@@ -55,10 +55,10 @@ def test_a_pod_that_others_select_too_may_have_been_wired_before() -> None:
 def test_all_addresses_of_a_pod_count() -> None:
     obj = pod_obj(labels={names.INJECT: "true"})
     obj["status"]["podIPs"] = [{"ip": "10.244.1.5"}, {"ip": "fd00::5"}]
-    found = objects.pod(obj)
-    assert found.ips == ("10.244.1.5", "fd00::5")
-    here = replace(found, id=Name("ros", "talker"), node="one")
-    assert who(rosproxy(), here) == ("10.244.1.5", "fd00::5")
+    parsed = objects.pod(obj)
+    assert parsed.ips == ("10.244.1.5", "fd00::5")
+    local = replace(parsed, id=Name("ros", "talker"), node="one")
+    assert who(rosproxy(), local) == ("10.244.1.5", "fd00::5")
 
 
 @pytest.mark.parametrize("of", [(), (rosproxy(uid="other"),), (rosproxy(deleting=True),)])

@@ -56,9 +56,9 @@ def put(server: ApiServer, data: dict[str, str] | None = None) -> None:
 
 def bundle(server: ApiServer) -> bytes:
     hooks = server.get("mutatingwebhookconfigurations", "wh", "")["webhooks"]
-    found = {hook["clientConfig"].get("caBundle", "") for hook in hooks}
-    assert len(found) == 1
-    return base64.b64decode(found.pop())
+    bundles = {hook["clientConfig"].get("caBundle", "") for hook in hooks}
+    assert len(bundles) == 1
+    return base64.b64decode(bundles.pop())
 
 
 def source(api: Api, clock: Clock) -> SelfSigned:
@@ -177,23 +177,23 @@ async def test_one_that_cannot_be_written_is_kept(server: ApiServer, api: Api) -
     """With another one each time, what is served would not always be trusted."""
     put(server)
     clock = Clock()
-    one = source(api, clock)
-    old = await in_thread(one.refresh)
+    self_signed = source(api, clock)
+    old = await in_thread(self_signed.refresh)
     server.refuse("PATCH", "secrets", 500, "failed calling webhook")
     clock.forward(days=61)
     served = []
     for _ in range(4):
-        served.append(await in_thread(one.refresh))
+        served.append(await in_thread(self_signed.refresh))
         authorities = {c.subject for c in x509.load_pem_x509_certificates(bundle(server))}
         assert x509.load_pem_x509_certificate(served[-1].certificate).issuer in authorities
         assert len(authorities) == 2
-        assert "kept in memory" in one.problems[0].text
+        assert "kept in memory" in self_signed.problems[0].text
         clock.forward(seconds=20)
     assert served[0] == old
     assert served[1] != old
     assert len(set(served[1:])) == 1
     server.refusals.clear()
-    assert await in_thread(one.refresh) == served[-1]
+    assert await in_thread(self_signed.refresh) == served[-1]
     assert certificates.read(server.get("secrets", "wh")["data"]) == served[-1]
 
 
@@ -201,63 +201,63 @@ async def test_only_the_operator_that_leads_makes_it(server: ApiServer, api: Api
     """One that waits for it is ready: an upgrade may wait for that before it ends the other."""
     put(server)
     leading = False
-    one = SelfSigned(api, NAMES, SECRET, "wh", Clock(), leads=lambda: leading)
-    kept = CertificateRotation(one, ClusterMetrics())
-    webhook = WebhookServer(HostPort("127.0.0.1", 0), kept)
+    self_signed = SelfSigned(api, NAMES, SECRET, "wh", Clock(), leads=lambda: leading)
+    certificate_rotation = CertificateRotation(self_signed, ClusterMetrics())
+    webhook = WebhookServer(HostPort("127.0.0.1", 0), certificate_rotation)
     assert webhook.unready()
 
-    await kept.refresh()
-    assert (kept.pair, webhook.unready()) == (None, None)
+    await certificate_rotation.refresh()
+    assert (certificate_rotation.pair, webhook.unready()) == (None, None)
     assert server.asked("PATCH", "secrets") == []
 
     leading = True
-    await kept.refresh()
-    assert kept.pair == certificates.read(server.get("secrets", "wh")["data"])
+    await certificate_rotation.refresh()
+    assert certificate_rotation.pair == certificates.read(server.get("secrets", "wh")["data"])
     assert webhook.unready()
 
 
 async def test_renewed_and_trusted_before_it_is_served(server: ApiServer, api: Api) -> None:
     put(server)
     clock = Clock()
-    one = source(api, clock)
-    first = await in_thread(one.refresh)
+    self_signed = source(api, clock)
+    first = await in_thread(self_signed.refresh)
     clock.forward(days=61)
-    assert await in_thread(one.refresh) == first
+    assert await in_thread(self_signed.refresh) == first
     second = certificates.read(server.get("secrets", "wh")["data"])
     assert second != first
     assert bundle(server) == second.ca
     assert second.ca.endswith(first.ca)
     clock.forward(seconds=5)
-    assert await in_thread(one.refresh) == first
+    assert await in_thread(self_signed.refresh) == first
     clock.forward(seconds=6)
-    assert await in_thread(one.refresh) == second
+    assert await in_thread(self_signed.refresh) == second
 
 
 async def test_not_served_while_it_cannot_be_trusted(server: ApiServer, api: Api) -> None:
     put(server)
     clock = Clock()
-    one = source(api, clock)
-    first = await in_thread(one.refresh)
+    self_signed = source(api, clock)
+    first = await in_thread(self_signed.refresh)
     clock.forward(days=61)
     server.refuse("PATCH", "mutatingwebhookconfigurations", 422, "no")
     for _ in range(3):
         clock.forward(minutes=1)
-        assert await in_thread(one.refresh) == first
-    (problem,) = one.problems
+        assert await in_thread(self_signed.refresh) == first
+    (problem,) = self_signed.problems
     assert problem.text == "MutatingWebhookConfiguration wh: no"
     server.refusals.clear()
-    await in_thread(one.refresh)
+    await in_thread(self_signed.refresh)
     clock.forward(seconds=11)
-    assert await in_thread(one.refresh) != first
+    assert await in_thread(self_signed.refresh) != first
 
 
 async def test_a_ca_that_somebody_overwrites_is_written_again(server: ApiServer, api: Api) -> None:
     put(server)
-    one = source(api, Clock())
-    pair = await in_thread(one.refresh)
+    self_signed = source(api, Clock())
+    pair = await in_thread(self_signed.refresh)
     hooks = server.get("mutatingwebhookconfigurations", "wh", "")["webhooks"]
     del hooks[0]["clientConfig"]["caBundle"]
-    assert await in_thread(one.refresh) == pair
+    assert await in_thread(self_signed.refresh) == pair
     assert bundle(server) == pair.ca
 
 
@@ -267,23 +267,23 @@ async def test_without_the_secret_it_is_kept_in_memory(
 ) -> None:
     put(server)
     server.refuse("GET", "secrets", status, "no")
-    one = source(api, Clock())
-    pair = await in_thread(one.refresh)
-    assert await in_thread(one.refresh) == pair
+    self_signed = source(api, Clock())
+    pair = await in_thread(self_signed.refresh)
+    assert await in_thread(self_signed.refresh) == pair
     assert bundle(server) == pair.ca
-    assert "the certificate is kept in memory meanwhile" in one.problems[0].text
+    assert "the certificate is kept in memory meanwhile" in self_signed.problems[0].text
 
 
 async def test_without_the_api_server_nothing_is_made(server: ApiServer, api: Api) -> None:
     put(server)
     server.refuse("GET", "secrets", 503, "starting")
-    one = source(api, Clock())
+    self_signed = source(api, Clock())
     with pytest.raises(ApiError):
-        await in_thread(one.refresh)
+        await in_thread(self_signed.refresh)
     server.refusals.clear()
-    pair = await in_thread(one.refresh)
+    pair = await in_thread(self_signed.refresh)
     server.refuse("GET", "secrets", 503, "starting")
-    assert await in_thread(one.refresh) == pair
+    assert await in_thread(self_signed.refresh) == pair
 
 
 @pytest.mark.parametrize("data", [{"tls.key": "?"}, {"tls.crt": "", "tls.key": "eA=="}])
@@ -292,9 +292,9 @@ async def test_nonsense_in_the_secret_is_replaced(
 ) -> None:
     put(server, {**data, "other": "a2VwdA=="})
     pair = await in_thread(source(api, Clock()).refresh)
-    held = server.get("secrets", "wh")["data"]
-    assert certificates.read(held) == pair
-    assert held["other"] == "a2VwdA=="
+    stored = server.get("secrets", "wh")["data"]
+    assert certificates.read(stored) == pair
+    assert stored["other"] == "a2VwdA=="
 
 
 async def test_one_for_other_names_is_replaced(server: ApiServer, api: Api) -> None:
@@ -306,12 +306,12 @@ async def test_one_for_other_names_is_replaced(server: ApiServer, api: Api) -> N
 async def test_who_writes_the_secret_first_has_the_right_one(server: ApiServer, api: Api) -> None:
     put(server)
     server.refuse("PATCH", "secrets", 409, "the object has been modified")
-    one = source(api, Clock())
+    self_signed = source(api, Clock())
     with pytest.raises(ApiError, match="somebody else writes Secret ns/wh"):
-        await in_thread(one.refresh)
+        await in_thread(self_signed.refresh)
     theirs = certificates.make(NAMES, NOW)
     put(server, theirs.secret())
-    assert await in_thread(one.refresh) == theirs
+    assert await in_thread(self_signed.refresh) == theirs
 
 
 def write(directory: Path, pair: KeyPair) -> None:
@@ -320,24 +320,26 @@ def write(directory: Path, pair: KeyPair) -> None:
 
 
 async def test_a_directory_is_read_again(tmp_path: Path) -> None:
-    one = CertificateDirectory(str(tmp_path))
+    directory = CertificateDirectory(str(tmp_path))
     with pytest.raises(InvalidCertificate, match=r"--webhook-cert-dir: .*tls.crt: No such file"):
-        one.refresh()
+        directory.refresh()
     pair, other = certificates.make(NAMES, NOW), certificates.make(NAMES, NOW)
     write(tmp_path, pair)
-    assert one.refresh().certificate == pair.certificate
+    assert directory.refresh().certificate == pair.certificate
     write(tmp_path, other)
-    assert one.refresh().certificate == other.certificate
+    assert directory.refresh().certificate == other.certificate
 
 
 async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> None:
     write(tmp_path, certificates.make(NAMES, NOW))
-    one = CertificateRotation(CertificateDirectory(str(tmp_path)), ClusterMetrics())
-    await one.refresh()
-    first = one.pair
+    certificate_rotation = CertificateRotation(
+        CertificateDirectory(str(tmp_path)), ClusterMetrics()
+    )
+    await certificate_rotation.refresh()
+    first = certificate_rotation.pair
     (tmp_path / "tls.crt").write_bytes(certificates.make(NAMES, NOW).certificate)
-    await one.refresh()
-    assert one.pair is first is not None
+    await certificate_rotation.refresh()
+    assert certificate_rotation.pair is first is not None
 
 
 async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
@@ -347,9 +349,9 @@ async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) ->
         def refresh(self) -> KeyPair:
             raise RuntimeError("oops")
 
-    one = CertificateRotation(cast(Any, Broken()), ClusterMetrics())
-    await one.refresh()
-    assert one.pair is None
+    certificate_rotation = CertificateRotation(cast(Any, Broken()), ClusterMetrics())
+    await certificate_rotation.refresh()
+    assert certificate_rotation.pair is None
     assert "the operator failed: RuntimeError('oops')" in caplog.text
 
 
@@ -358,21 +360,21 @@ async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPa
     old = certificates.make(NAMES, NOW)
     new = certificates.make(NAMES, NOW, before=old.ca)
     port = free_ports(1)
-    held = CertificateRotation(rotation.CertificateDirectory(""), ClusterMetrics())
+    certificate_rotation = CertificateRotation(rotation.CertificateDirectory(""), ClusterMetrics())
 
     async def answer(review: Any, **_: Any) -> Any:
         return {}
 
-    server = WebhookServer(HostPort("127.0.0.1", port), held)
+    server = WebhookServer(HostPort("127.0.0.1", port), certificate_rotation)
     serving = server(answer)  # type: ignore[arg-type]
     started = asyncio.ensure_future(anext(serving))
     await asyncio.sleep(0.05)
     assert not started.done()  # there is no certificate yet
-    held.pair = old
+    certificate_rotation.pair = old
     await started
     keeping = asyncio.ensure_future(anext(serving))
     assert b"HTTP" in await in_thread(call, port, old.ca)
-    held.pair = new
+    certificate_rotation.pair = new
 
     def exchanged() -> bool:
         try:

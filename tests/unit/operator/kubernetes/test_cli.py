@@ -16,9 +16,9 @@ HOOK = ["--webhook-bind=0.0.0.0:9443"]
 @pytest.fixture
 def given(monkeypatch: pytest.MonkeyPatch) -> list[KubernetesSettings]:
     """The settings with which the operator would have been run."""
-    found: list[KubernetesSettings] = []
-    monkeypatch.setattr(cli, "_run_kubernetes", lambda settings, *_: found.append(settings))
-    return found
+    recorded: list[KubernetesSettings] = []
+    monkeypatch.setattr(cli, "_run_kubernetes", lambda settings, *_: recorded.append(settings))
+    return recorded
 
 
 def run(*words: str, **variables: str) -> Result:
@@ -148,8 +148,8 @@ def test_a_wrong_word_is_one_line() -> None:
 
 
 def test_no_cluster_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
-    where = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
-    monkeypatch.setattr(where, f"{tmp_path}/none")
+    default_location = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
+    monkeypatch.setattr(default_location, f"{tmp_path}/none")
     monkeypatch.setattr("rosproxy.telemetry.logs.set_up", lambda *_: None)
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
     result = run()

@@ -37,12 +37,12 @@ REFUSED = Name("robots", "rosproxy-arm-node1-1")
     ],
 )
 def test_a_proxy_that_is_yet_to_come_is_no_problem(given, said):
-    found = status(given, state("node2"))
+    rosproxy_status = status(given, state("node2"))
 
-    assert judged(found, "Ready") == ("False", "ProxiesStarting")
-    assert message(found) == said
-    assert judged(found, "Degraded") == ("False", "AsExpected")
-    assert found["proxies"] == "1/2"
+    assert judged(rosproxy_status, "Ready") == ("False", "ProxiesStarting")
+    assert message(rosproxy_status) == said
+    assert judged(rosproxy_status, "Degraded") == ("False", "AsExpected")
+    assert rosproxy_status["proxies"] == "1/2"
 
 
 @pytest.mark.parametrize(
@@ -60,46 +60,46 @@ def test_a_proxy_that_is_yet_to_come_is_no_problem(given, said):
     ],
 )
 def test_a_proxy_that_does_not_run(why, reason, said):
-    found = status(state(proxy=stuck_proxy(why), answer=None))
+    rosproxy_status = status(state(proxy=stuck_proxy(why), answer=None))
 
-    assert judged(found, "Ready") == ("False", reason)
-    assert message(found).startswith(f"proxy {NAME}")
-    assert said in message(found)
-    assert judged(found, "Degraded") == ("True", reason)
-    assert said[:20] in found["perNode"][0]["message"]
+    assert judged(rosproxy_status, "Ready") == ("False", reason)
+    assert message(rosproxy_status).startswith(f"proxy {NAME}")
+    assert said in message(rosproxy_status)
+    assert judged(rosproxy_status, "Degraded") == ("True", reason)
+    assert said[:20] in rosproxy_status["perNode"][0]["message"]
     ports = ("False", "PortConflict") if why is PodFailure.PORTS else ("True", "Allocated")
-    assert judged(found, "PortsAllocated") == ports
+    assert judged(rosproxy_status, "PortsAllocated") == ports
 
 
 def test_a_node_without_ports():
     text = "no 32 free ports in a row between 11400 and 11410: widen spec.portWindow"
-    found = status(
+    rosproxy_status = status(
         state(range=None, proxy=None, answer=None, obstacle=Obstacle("PortsExhausted", text))
     )
 
     for type in ("Ready", "PortsAllocated"):
-        assert judged(found, type) == ("False", "PortsExhausted")
-        assert message(found, type) == f"node node1: {text}"
-    assert found["perNode"][0]["message"] == f"node node1: {text}"
-    assert "ports" not in found["perNode"][0]
+        assert judged(rosproxy_status, type) == ("False", "PortsExhausted")
+        assert message(rosproxy_status, type) == f"node node1: {text}"
+    assert rosproxy_status["perNode"][0]["message"] == f"node node1: {text}"
+    assert "ports" not in rosproxy_status["perNode"][0]
 
 
 def test_another_reason_for_a_node_without_proxy():
     obstacle = Obstacle("NodeNotReady", "is not ready")
-    found = status(state(proxy=None, answer=None, obstacle=obstacle))
+    rosproxy_status = status(state(proxy=None, answer=None, obstacle=obstacle))
 
-    assert judged(found, "Ready") == ("False", "NodeNotReady")
+    assert judged(rosproxy_status, "Ready") == ("False", "NodeNotReady")
 
 
 def test_the_master_is_not_reached():
     down = ProxyReport(True, False, "refused", problems=("master: refused", "/a: hangs"))
-    found = status(state("node2"), state(proxy=proxy(ready=False), answer=down))
+    rosproxy_status = status(state("node2"), state(proxy=proxy(ready=False), answer=down))
 
-    assert judged(found, "MasterReachable") == ("False", "MasterUnreachable")
-    assert judged(found, "Ready") == ("False", "MasterUnreachable")
-    assert "(refused): start roscore there" in message(found)
-    assert message(found, "Degraded").count("refused") == 1
-    assert "/a: hangs" in message(found, "Degraded")
+    assert judged(rosproxy_status, "MasterReachable") == ("False", "MasterUnreachable")
+    assert judged(rosproxy_status, "Ready") == ("False", "MasterUnreachable")
+    assert "(refused): start roscore there" in message(rosproxy_status)
+    assert message(rosproxy_status, "Degraded").count("refused") == 1
+    assert "/a: hangs" in message(rosproxy_status, "Degraded")
 
 
 def test_a_master_in_the_cluster_is_told_by_its_service():
@@ -110,48 +110,48 @@ def test_a_master_in_the_cluster_is_told_by_its_service():
 
 
 def test_a_proxy_that_does_not_answer_the_controller():
-    found = status(state(answer=no_answer("timed out")))
+    rosproxy_status = status(state(answer=no_answer("timed out")))
 
-    assert judged(found, "Ready") == ("False", "ProxyUnreachable")
-    assert "(timed out): let the operator's pod connect to port 11312" in message(found)
-    assert judged(found, "MasterReachable") == ("Unknown", "NotAsked")
+    assert judged(rosproxy_status, "Ready") == ("False", "ProxyUnreachable")
+    assert "(timed out): let the operator's pod connect to port 11312" in message(rosproxy_status)
+    assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NotAsked")
 
 
 def test_a_proxy_that_does_not_take_its_policy():
     refusal = "knows no policies: its image is that of a former release"
-    found = status(state(answer=ProxyReport(True, True, refusal=refusal)))
+    rosproxy_status = status(state(answer=ProxyReport(True, True, refusal=refusal)))
 
-    assert judged(found, "Ready") == ("True", "Serving")
-    assert judged(found, "Degraded") == ("True", "PolicyRefused")
-    assert "it knows no policies" in message(found, "Degraded")
+    assert judged(rosproxy_status, "Ready") == ("True", "Serving")
+    assert judged(rosproxy_status, "Degraded") == ("True", "PolicyRefused")
+    assert "it knows no policies" in message(rosproxy_status, "Degraded")
 
 
 def test_what_proxies_warn_of_keeps_nobody_from_being_served():
-    found = status(state(answer=answer("/a", problems=("/a: does not answer",))))
+    rosproxy_status = status(state(answer=answer("/a", problems=("/a: does not answer",))))
 
-    assert judged(found, "Ready") == ("True", "Serving")
-    assert judged(found, "Degraded") == ("True", "ProxyWarns")
-    assert message(found, "Degraded").endswith("/a: does not answer")
+    assert judged(rosproxy_status, "Ready") == ("True", "Serving")
+    assert judged(rosproxy_status, "Degraded") == ("True", "ProxyWarns")
+    assert message(rosproxy_status, "Degraded").endswith("/a: does not answer")
 
 
 def test_a_pod_that_is_left_out_keeps_the_others_ready():
     about = Reference("Pod", Name("robots", "x"), "u")
-    one = ClusterFinding(
+    finding = ClusterFinding(
         "pod robots/x", "is ambiguous", reason="Ambiguous", of=rosproxy().id, about=about
     )
 
-    assert judged(status(state(), more=(one,)), "Ready") == ("True", "Serving")
-    assert judged(status(state(), more=(one,)), "Degraded") == ("True", "Ambiguous")
-    starting = status(state(proxy=None, answer=None), more=(one,))
+    assert judged(status(state(), more=(finding,)), "Ready") == ("True", "Serving")
+    assert judged(status(state(), more=(finding,)), "Degraded") == ("True", "Ambiguous")
+    starting = status(state(proxy=None, answer=None), more=(finding,))
     assert judged(starting, "Ready") == ("False", "ProxiesStarting")
 
 
 def test_a_problem_without_a_reason():
-    one = ClusterFinding("service x", "is not there", reason="", of=rosproxy().id)
-    found = status(state(proxy=None, answer=None), more=(one,))
+    finding = ClusterFinding("service x", "is not there", reason="", of=rosproxy().id)
+    rosproxy_status = status(state(proxy=None, answer=None), more=(finding,))
 
-    assert judged(found, "Ready") == ("False", "Problem")
-    assert message(found) == "service x: is not there"
+    assert judged(rosproxy_status, "Ready") == ("False", "Problem")
+    assert message(rosproxy_status) == "service x: is not there"
 
 
 @pytest.mark.parametrize(
@@ -172,11 +172,13 @@ def test_a_problem_without_a_reason():
     ],
 )
 def test_what_the_api_server_refuses(text, fix):
-    found = status(state(proxy=None, answer=None), failures={REFUSED: text})
+    rosproxy_status = status(state(proxy=None, answer=None), failures={REFUSED: text})
 
-    assert judged(found, "Ready") == ("False", "ProxyNotAdmitted")
-    assert message(found).startswith("robots/rosproxy-arm-node1-1: the API server refused it")
-    assert fix in message(found)
+    assert judged(rosproxy_status, "Ready") == ("False", "ProxyNotAdmitted")
+    assert message(rosproxy_status).startswith(
+        "robots/rosproxy-arm-node1-1: the API server refused it"
+    )
+    assert fix in message(rosproxy_status)
 
 
 @pytest.mark.parametrize(
@@ -203,14 +205,14 @@ def test_what_the_api_server_refuses(text, fix):
 def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
     of = replace(rosproxy(), spec=replace(rosproxy().spec, data_plane="kernel"))
 
-    (found,) = findings(of, (), {REFUSED: text})
+    (finding,) = findings(of, (), {REFUSED: text})
 
-    assert found.text.endswith(fix)
-    assert len(found.text) <= 600
+    assert finding.text.endswith(fix)
+    assert len(finding.text) <= 600
 
 
 def test_findings_are_told_at_the_rosproxy():
-    (found,) = findings(rosproxy(), [state(proxy=stuck_proxy(PodFailure.PORTS), answer=None)], {})
+    (finding,) = findings(rosproxy(), [state(proxy=stuck_proxy(PodFailure.PORTS), answer=None)], {})
 
-    assert (found.reason, found.of) == ("PortConflict", rosproxy().id)
-    assert found.about == Reference("RosProxy", rosproxy().id, "uid-arm")
+    assert (finding.reason, finding.of) == ("PortConflict", rosproxy().id)
+    assert finding.about == Reference("RosProxy", rosproxy().id, "uid-arm")

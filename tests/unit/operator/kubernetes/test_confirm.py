@@ -20,7 +20,7 @@ from tests.unit.operator.kubernetes.builders_api import (
     rosproxy_obj,
     service_obj,
 )
-from tests.unit.operator.kubernetes.known import known
+from tests.unit.operator.kubernetes.snapshots import snapshot_of
 
 OF = Name(NAMESPACE, "arm")
 PROXY = proxy_obj()["metadata"]["name"]
@@ -82,9 +82,9 @@ def remove(server: ApiServer) -> None:
 
 async def test_what_is_so_is_confirmed_in_its_version(server: ApiServer, api: Api) -> None:
     put_all(server)
-    version = await in_thread(confirm, api, DELETE, known(server))
+    version = await in_thread(confirm, api, DELETE, snapshot_of(server))
     assert version == server.get("pods", PROXY, NAMESPACE)["metadata"]["resourceVersion"]
-    assert await in_thread(confirm, api, SERVICE, known(server)) == ""
+    assert await in_thread(confirm, api, SERVICE, snapshot_of(server)) == ""
     server.put("pods", {**server.get("pods", PROXY, NAMESPACE)}, NAMESPACE)
     with pytest.raises(ApiConflict):
         await in_thread(api.delete, "pods", DELETE.id, DELETE.uid, version)
@@ -92,7 +92,7 @@ async def test_what_is_so_is_confirmed_in_its_version(server: ApiServer, api: Ap
 
 async def test_what_does_not_matter_changes_nothing(server: ApiServer, api: Api) -> None:
     put_all(server)
-    seen = known(server)
+    seen = snapshot_of(server)
     server.put("pods", pod_obj("far", INJECT, nodeName="node2"), NAMESPACE)
     elsewhere = pod_obj("elsewhere", INJECT)
     elsewhere["metadata"]["namespace"] = "other"
@@ -107,7 +107,7 @@ async def test_what_is_not_so_any_more(
     server: ApiServer, api: Api, happen: Callable[[ApiServer], None]
 ) -> None:
     put_all(server)
-    seen = known(server)
+    seen = snapshot_of(server)
     happen(server)
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, DELETE, seen)
@@ -121,7 +121,7 @@ async def test_a_service_is_its_rosproxys(
     server: ApiServer, api: Api, happen: Callable[[ApiServer], None]
 ) -> None:
     put_all(server)
-    seen = known(server)
+    seen = snapshot_of(server)
     happen(server)
     with pytest.raises(StateChanged, match="RosProxy robots/arm"):
         await in_thread(confirm, api, SERVICE, seen)
@@ -134,7 +134,7 @@ async def test_of_a_rosproxy_that_is_gone_nothing_else_matters(
     """The garbage collector is at its pods; who waits for them to rest unregisters nobody."""
     put_all(server)
     remove(server)
-    seen = known(server)
+    seen = snapshot_of(server)
     happen(server)
     change(server, "pods", PROXY, NAMESPACE, deletionTimestamp="2026-01-01T00:00:00Z")
     assert await in_thread(confirm, api, DELETE, seen) == ""
@@ -142,7 +142,7 @@ async def test_of_a_rosproxy_that_is_gone_nothing_else_matters(
 
 async def test_one_that_nobody_has_seen_is_stale(server: ApiServer, api: Api) -> None:
     put_all(server)
-    seen = known(server)
+    seen = snapshot_of(server)
     other = DeleteProxy(OF, DELETE.id, "another", "nobody wants it")
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, other, seen)
@@ -152,7 +152,7 @@ async def test_an_api_server_that_does_not_answer_confirms_nothing(
     server: ApiServer, api: Api
 ) -> None:
     put_all(server)
-    seen = known(server)
+    seen = snapshot_of(server)
     server.refuse("GET", "pods", 503, "starting")
     with pytest.raises(ApiUnavailable):
         await in_thread(confirm, api, DELETE, seen)

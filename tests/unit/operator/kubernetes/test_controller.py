@@ -62,10 +62,10 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     monkeypatch.setattr(proxy_sync, "EVERY", 0.05)
     monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.02)
     monkeypatch.setattr(proxy_sync, "EVERY_FORMER", 0.05)
-    one = Running(api)
-    yield one
-    one.task.cancel()
-    await asyncio.gather(one.task, return_exceptions=True)
+    started = Running(api)
+    yield started
+    started.task.cancel()
+    await asyncio.gather(started.task, return_exceptions=True)
 
 
 def put_all(server: ApiServer) -> None:
@@ -117,11 +117,11 @@ async def test_what_happens_during_a_look_is_seen_by_the_next_one(
     store, real = running.controller._store, SandboxFailures.read
 
     async def read(self: SandboxFailures, observed: ClusterSnapshot) -> set[str]:
-        found = await real(self, observed)
+        namespaces = await real(self, observed)
         if not observed.pods:
             server.put("pods", pod_obj("talker", INJECT), NAMESPACE)
             await until(lambda: bool(store.snapshot().pods))
-        return found
+        return namespaces
 
     monkeypatch.setattr(SandboxFailures, "read", read)
     running.controller.wake()
@@ -254,7 +254,7 @@ async def test_a_proxy_is_asked_and_told(
     async def containers(request: web.Request) -> web.Response:
         body = await request.json()
         told.append((request.headers["Authorization"], body))
-        first = "gone" in body and not any("gone" in one for _, one in told[:-1])
+        first = "gone" in body and not any("gone" in earlier for _, earlier in told[:-1])
         return web.json_response({}, status=503 if first else 200)
 
     application = web.Application()
@@ -267,8 +267,8 @@ async def test_a_proxy_is_asked_and_told(
     gone: dict[str, tuple[str, ...]] = {}
 
     def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
-        found = real(observed, *rest)
-        return structs.replace(found, departed_addresses={**gone})
+        cluster_plan = real(observed, *rest)
+        return structs.replace(cluster_plan, departed_addresses={**gone})
 
     monkeypatch.setattr(module, "plan", planned)
     put_all(server)
@@ -286,9 +286,11 @@ async def test_a_proxy_is_asked_and_told(
     await until(lambda: len([1 for _, body in told if "gone" in body]) >= 2)
     gone.clear()
     env = proxy["spec"]["containers"][0]["env"]
-    hashed = next(one["value"] for one in env if one["name"] == "ROSPROXY_ADMIN_TOKEN_HASH")
-    (who,) = {who for who, _ in told}
-    assert hash_token(who.removeprefix("Bearer ")) == hashed
+    hashed = next(
+        variable["value"] for variable in env if variable["name"] == "ROSPROXY_ADMIN_TOKEN_HASH"
+    )
+    (authorization,) = {authorization for authorization, _ in told}
+    assert hash_token(authorization.removeprefix("Bearer ")) == hashed
     assert [body for _, body in told if "gone" in body][:2] == [{"gone": ["10.244.1.9"]}] * 2
     assert told[0][1] == {"selected": ["10.244.1.5"]}
     await runner.cleanup()

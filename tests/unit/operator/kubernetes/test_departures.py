@@ -84,8 +84,8 @@ def test_a_pod_that_got_the_address_of_another_one_is_not_gone() -> None:
 
 
 def test_an_address_on_another_node_counts_as_nobodys_here() -> None:
-    there = [node("one"), node("two")]
-    assert told(seen(*there, pod("far", "two", ip=TALKER))) == (TALKER,)
+    nodes = [node("one"), node("two")]
+    assert told(seen(*nodes, pod("far", "two", ip=TALKER))) == (TALKER,)
 
 
 def test_a_pod_may_run_before_its_address_is_known() -> None:
@@ -145,8 +145,8 @@ def test_pods_in_the_nodes_own_network_are_no_reason_to_call_its_address_gone() 
 
 def test_a_proxy_that_does_not_answer_is_told_nothing_and_nothing_is_forgotten() -> None:
     silent = seen(reports={PROXY: ProxyReport(False, error="refused")})
-    found = find_departures(silent, KNOWN, 1.0)
-    assert found.addresses == {}
-    assert TALKER in found.state.addresses["one"]
-    unasked = find_departures(replace(silent, reports={}), found.state, 2.0)
+    departures = find_departures(silent, KNOWN, 1.0)
+    assert departures.addresses == {}
+    assert TALKER in departures.state.addresses["one"]
+    unasked = find_departures(replace(silent, reports={}), departures.state, 2.0)
     assert find_departures(seen(), unasked.state, 3.0).addresses == {PROXY: (TALKER,)}

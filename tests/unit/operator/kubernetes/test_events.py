@@ -28,9 +28,9 @@ def finding(text: str = "no ports", about: Reference | None = OF_ARM) -> Cluster
 
 
 def test_a_problem_that_is_new_is_told():
-    found = warnings([finding()], {}, 10.0)
+    new_events = warnings([finding()], {}, 10.0)
 
-    (emit,) = found.emits
+    (emit,) = new_events.emits
     assert (emit.of, emit.type, emit.reason) == (ARM, "Warning", "PortsExhausted")
     assert emit.message == "node node1: no ports"
     assert event_body(emit, 0.0)["involvedObject"] == {
@@ -40,14 +40,16 @@ def test_a_problem_that_is_new_is_told():
         "name": "arm",
         "uid": "uid-arm",
     }
-    assert found.reported == {finding(): 10.0}
+    assert new_events.reported == {finding(): 10.0}
 
 
 def test_a_pods_problem_is_told_at_the_pod():
     pod = Reference("Pod", Name("robots", "talker"), "uid-talker")
-    one = ClusterFinding("pod robots/talker", "is not wired", reason="NotWired", of=ARM, about=pod)
+    problem = ClusterFinding(
+        "pod robots/talker", "is not wired", reason="NotWired", of=ARM, about=pod
+    )
 
-    (emit,) = warnings([one], {}, 0.0).emits
+    (emit,) = warnings([problem], {}, 0.0).emits
 
     about = event_body(emit, 0.0)["involvedObject"]
     assert (about["apiVersion"], about["kind"]) == ("v1", "Pod")
@@ -115,15 +117,15 @@ def test_what_is_done_is_told():
         PatchStatus(ARM, "uid-arm", {}),
     ]
 
-    found = [*results(rosproxy(), actions)]
+    emits = [*results(rosproxy(), actions)]
 
     name = body["metadata"]["name"]
-    assert [(one.type, one.reason, one.message) for one in found] == [
+    assert [(emit.type, emit.reason, emit.message) for emit in emits] == [
         ("Normal", "ProxyCreated", f"created pod {name} on node node1 with ports 11400-11431"),
         ("Normal", "ImageSet", f"gave pod {pod.name} the image rosproxy:2"),
         ("Normal", "ProxyDeleted", f"deleted pod {pod.name}: no selected pod is left on node1"),
     ]
-    assert {one.about for one in found} == {OF_ARM}
+    assert {emit.about for emit in emits} == {OF_ARM}
 
 
 def test_what_is_done_to_many_is_summed_up():
@@ -132,9 +134,9 @@ def test_what_is_done_to_many_is_summed_up():
         DeleteProxy(ARM, Name("robots", f"pod-{number}"), "u", "gone") for number in range(of_all)
     ]
 
-    *each, last = results(rosproxy(), actions)
+    *single_results, last = results(rosproxy(), actions)
 
-    assert len(each) == MOST_RESULTS
+    assert len(single_results) == MOST_RESULTS
     assert (
         last.message == f"and {of_all - MOST_RESULTS} more at once, which the operator's log names"
     )

@@ -53,10 +53,10 @@ def env_of(wiring: Wiring, kind: str = "containers", place: int = 0) -> Any:
 
 
 def test_a_pod_is_wired():
-    found = wire(admitted(container()), TO)
+    wiring = wire(admitted(container()), TO)
 
-    assert env_of(found) == [MASTER, IP]
-    assert (found.annotations, found.warnings) == ({ANNOTATION: URI}, ())
+    assert env_of(wiring) == [MASTER, IP]
+    assert (wiring.annotations, wiring.warnings) == ({ANNOTATION: URI}, ())
 
 
 def test_every_container_is_wired_and_nothing_else_changes():
@@ -68,13 +68,13 @@ def test_every_container_is_wired_and_nothing_else_changes():
     )
     before = copy.deepcopy(obj)
 
-    found = wire(obj, TO)
+    wiring = wire(obj, TO)
 
     assert obj == before
-    assert found.spec is not None
+    assert wiring.spec is not None
     for kind in ("containers", "initContainers"):
-        assert [one.pop("env") for one in found.spec[kind]] == [[MASTER, IP]] * 2
-    assert found.spec == before["spec"]
+        assert [c.pop("env") for c in wiring.spec[kind]] == [[MASTER, IP]] * 2
+    assert wiring.spec == before["spec"]
 
 
 def test_variables_of_the_template_can_use_those_that_are_set():
@@ -106,10 +106,10 @@ def test_a_pod_that_sets_all_itself_stays_as_it_is():
 def test_a_pod_of_which_one_container_sets_it_is_still_wired():
     own = {"name": "ROS_MASTER_URI", "value": "http://robot:11311"}
 
-    found = wire(admitted(container(own), container(name="b")), TO)
+    wiring = wire(admitted(container(own), container(name="b")), TO)
 
-    assert env_of(found, place=1) == [MASTER, IP]
-    assert found.annotations == {ANNOTATION: URI}
+    assert env_of(wiring, place=1) == [MASTER, IP]
+    assert wiring.annotations == {ANNOTATION: URI}
     assert wire(admitted(container(own, MASTER, IP)), TO).annotations == {ANNOTATION: URI}
 
 
@@ -117,14 +117,14 @@ def test_host_aliases_are_added_to_those_of_the_pod():
     own = {"ip": "192.0.2.7", "hostnames": ["mine", "robot"]}
     other = {"ip": "192.0.2.9", "hostnames": ["other"]}
 
-    found = wire(
+    wiring = wire(
         admitted(container(), hostAliases=[own]),
         TO,
         [{"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]}, other],
     )
 
-    assert found.spec is not None
-    assert found.spec["hostAliases"] == [
+    assert wiring.spec is not None
+    assert wiring.spec["hostAliases"] == [
         {"ip": "192.0.2.7", "hostnames": ["mine", "robot", "robot.example"]},
         other,
     ]
@@ -142,20 +142,20 @@ def test_a_copy_of_a_wired_pod_is_wired_anew():
     obj = admitted(container())
     copied = applied(obj, wire(obj, Target("http://10.96.0.1:11311")))
 
-    found = wire(copied, TO)
+    wiring = wire(copied, TO)
 
-    assert env_of(found) == [MASTER, IP]
-    assert found.annotations == {ANNOTATION: URI}
+    assert env_of(wiring) == [MASTER, IP]
+    assert wiring.annotations == {ANNOTATION: URI}
 
 
 def test_a_static_pods_picture_is_not_changed():
     obj = admitted(container())
     obj["metadata"]["annotations"] = {MIRROR: "hash"}
 
-    found = wire(obj, TO)
+    wiring = wire(obj, TO)
 
-    assert (found.spec, found.annotations) == (None, {})
-    assert "static pod" in found.warnings[0]
+    assert (wiring.spec, wiring.annotations) == (None, {})
+    assert "static pod" in wiring.warnings[0]
 
 
 _variable = st.builds(
@@ -195,25 +195,27 @@ def test_wiring_twice_changes_nothing_more(obj, aliases):
 
 @given(_pods)
 def test_what_a_template_sets_comes_through_unharmed_and_last(obj):
-    found = wire(obj, TO)
-    spec = found.spec or obj["spec"]
+    wiring = wire(obj, TO)
+    spec = wiring.spec or obj["spec"]
 
     for kind in ("containers", "initContainers"):
         for before, after in zip(obj["spec"][kind], spec[kind], strict=True):
             own = before.get("env", [])
             added = after["env"][: len(after["env"]) - len(own)]
             assert after["env"] == [*added, *own]
-            assert not {one["name"] for one in added} & {one["name"] for one in own}
+            assert not {variable["name"] for variable in added} & {
+                variable["name"] for variable in own
+            }
 
 
 @given(_pods)
 def test_every_container_has_a_master_and_an_address_in_the_end(obj):
     spec = wire(obj, TO).spec or obj["spec"]
 
-    for one in (*spec["containers"], *spec["initContainers"]):
-        there = {variable["name"] for variable in one["env"]}
-        assert "ROS_MASTER_URI" in there
-        assert there & {"ROS_IP", "ROS_HOSTNAME"}
+    for ros_container in (*spec["containers"], *spec["initContainers"]):
+        variables = {variable["name"] for variable in ros_container["env"]}
+        assert "ROS_MASTER_URI" in variables
+        assert variables & {"ROS_IP", "ROS_HOSTNAME"}
 
 
 def test_a_wired_pod_is_wired():
@@ -255,27 +257,27 @@ def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
     ],
 )
 def test_a_pod_that_goes_around_its_proxy_is_told(master):
-    found = wiring_finding(
+    finding = wiring_finding(
         pod(own_masters=(URI, master), wired_master_uri=URI), rosproxy(), CLUSTER_IP
     )
 
-    assert found is not None
-    assert (found.reason, found.fatal) == ("NotWired", False)
-    assert f"ROS_MASTER_URI={master}" in found.text
-    assert found.about is not None
-    assert found.about.id == pod().id
+    assert finding is not None
+    assert (finding.reason, finding.fatal) == ("NotWired", False)
+    assert f"ROS_MASTER_URI={master}" in finding.text
+    assert finding.about is not None
+    assert finding.about.id == pod().id
 
 
 @pytest.mark.parametrize(
-    ("there", "said"),
+    ("unwired", "said"),
     [
         (pod(), "create the pod anew"),
         (pod(labels={"app": "x"}), "rosproxy.io/inject=arm"),
         (pod(wired_master_uri="http://10.96.0.1:11311"), f"its proxy is at {URI} now"),
     ],
 )
-def test_a_pod_that_is_not_wired_is_told_what_to_do(there, said):
-    found = wiring_finding(there, rosproxy(), CLUSTER_IP)
+def test_a_pod_that_is_not_wired_is_told_what_to_do(unwired, said):
+    finding = wiring_finding(unwired, rosproxy(), CLUSTER_IP)
 
-    assert found is not None
-    assert said in found.text
+    assert finding is not None
+    assert said in finding.text

@@ -42,30 +42,30 @@ class Candidates:
         self.changes = 0
 
     def join(self) -> LeaderElection:
-        one = LeaderElection(self.api, LEASE, ClusterMetrics())
-        self.tasks[one] = asyncio.create_task(one.run(self.changed))
-        return one
+        election = LeaderElection(self.api, LEASE, ClusterMetrics())
+        self.tasks[election] = asyncio.create_task(election.run(self.changed))
+        return election
 
     def changed(self) -> None:
         self.changes += 1
 
-    async def kill(self, one: LeaderElection) -> None:
-        task = self.tasks.pop(one)
-        async with one._lock:  # no request is under way
+    async def kill(self, election: LeaderElection) -> None:
+        task = self.tasks.pop(election)
+        async with election._lock:  # no request is under way
             task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
     def leaders(self) -> list[LeaderElection]:
-        return [one for one in self.tasks if one.leads()]
+        return [election for election in self.tasks if election.leads()]
 
 
 @pytest.fixture
 async def candidates(api: Api, server: ApiServer) -> AsyncIterator[Candidates]:
     server.put("leases", {"metadata": {"name": "operator"}}, "ros")
-    found = Candidates(api)
-    yield found
-    for one in [*found.tasks]:
-        await found.kill(one)
+    participants = Candidates(api)
+    yield participants
+    for election in [*participants.tasks]:
+        await participants.kill(election)
 
 
 async def test_one_of_two_leads(candidates: Candidates, server: ApiServer) -> None:
@@ -116,41 +116,41 @@ async def test_one_that_can_not_renew_ceases(
 ) -> None:
     """And leads again, for another term, when it can."""
     caplog.set_level(logging.INFO)
-    one = candidates.join()
-    await until(one.leads)
+    election = candidates.join()
+    await until(election.leads)
     server.refuse("PATCH", "leases", 403, "patch is not for you")
     now[0] += leadership.DEADLINE
-    assert one.term() == 0
+    assert election.term() == 0
     await until(lambda: "stands by: nobody leads" in caplog.text)
     assert caplog.text.count("patch is not for you") == 1
     server.refusals.clear()
-    await until(one.leads)
-    assert one.term() == 2
+    await until(election.leads)
+    assert election.term() == 2
 
 
 async def test_a_lease_that_was_taken_away_is_made_anew(
     candidates: Candidates, server: ApiServer, now: list[float]
 ) -> None:
-    one = candidates.join()
-    await until(one.leads)
+    election = candidates.join()
+    await until(election.leads)
     server.forget(*KEY)
-    await until(lambda: not one.leads())
-    await until(lambda: one._candidate.record is not None)
+    await until(lambda: not election.leads())
+    await until(lambda: election._candidate.record is not None)
     now[0] += leadership.DURATION
-    await until(one.leads)
+    await until(election.leads)
 
 
 async def test_one_that_is_stopped_acts_no_more_and_then_gives_the_lead_away(
     candidates: Candidates, server: ApiServer, api: Api
 ) -> None:
-    one = candidates.join()
-    await until(one.leads)
-    api.gate.open = one.leads
-    controller = KubernetesController(KubernetesSettings(), api, ClusterMetrics(), one.term)
+    election = candidates.join()
+    await until(election.leads)
+    api.gate.open = election.leads
+    controller = KubernetesController(KubernetesSettings(), api, ClusterMetrics(), election.term)
     with api.gate.passing() as may:
         assert may
-        handing = asyncio.create_task(hand_over(api, controller, one))
-        await until(lambda: not one.leads())
+        handing = asyncio.create_task(hand_over(api, controller, election))
+        await until(lambda: not election.leads())
         assert server.get(*KEY)["spec"]["holderIdentity"]
     await handing
     assert server.get(*KEY)["spec"]["holderIdentity"] == ""
@@ -159,9 +159,9 @@ async def test_one_that_is_stopped_acts_no_more_and_then_gives_the_lead_away(
 
 
 async def test_alone_it_always_leads(api: Api) -> None:
-    one = LeaderElection(api, None, ClusterMetrics())
-    one.resign()
-    assert one.term() == 1
+    election = LeaderElection(api, None, ClusterMetrics())
+    election.resign()
+    assert election.term() == 1
 
 
 async def test_nothing_is_written_by_one_that_does_not_lead(api: Api, server: ApiServer) -> None:

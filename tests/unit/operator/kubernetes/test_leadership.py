@@ -27,18 +27,21 @@ MINE = LeaseRecord("", "a")
 
 def test_one_that_is_missing_is_made_and_has_to_run_out() -> None:
     """Whoever held it before it was taken away may still act."""
-    one = observe(Candidate("a"), None, 5.0)
-    made = next_record(one, 5.0)
+    candidate = observe(Candidate("a"), None, 5.0)
+    made = next_record(candidate, 5.0)
     assert made == LeaseRecord("", NOBODY)
-    assert not after_write(one, made, 5.0, 5.0).leads(5.0)
-    one = observe(one, LeaseRecord("1", NOBODY), 6.0)
-    assert next_record(one, 6.0 + DURATION - 0.1) is None
-    assert next_record(one, 6.0 + DURATION) == LeaseRecord("1", "a", transitions=1)
+    assert not after_write(candidate, made, 5.0, 5.0).leads(5.0)
+    candidate = observe(candidate, LeaseRecord("1", NOBODY), 6.0)
+    assert next_record(candidate, 6.0 + DURATION - 0.1) is None
+    assert next_record(candidate, 6.0 + DURATION) == LeaseRecord("1", "a", transitions=1)
 
 
 def test_one_acts_for_a_time_that_begins_before_its_write() -> None:
-    one = after_write(Candidate("a"), MINE, 15.0, 16.0)
-    assert (one.leads(15.0 + DEADLINE - 0.1), one.leads(15.0 + DEADLINE)) == (True, False)
+    candidate = after_write(Candidate("a"), MINE, 15.0, 16.0)
+    assert (candidate.leads(15.0 + DEADLINE - 0.1), candidate.leads(15.0 + DEADLINE)) == (
+        True,
+        False,
+    )
 
 
 def test_one_that_nobody_holds_is_taken_at_once() -> None:
@@ -46,23 +49,23 @@ def test_one_that_nobody_holds_is_taken_at_once() -> None:
 
 
 def test_one_that_is_held_is_taken_once_it_has_been_the_same_for_long() -> None:
-    one = observe(Candidate("a"), OTHER, 100.0)
-    one = observe(one, OTHER, 105.0)
-    assert next_record(one, 100.0 + DURATION - 0.1) is None
-    assert next_record(one, 100.0 + DURATION) == LeaseRecord("7", "a", transitions=4)
+    candidate = observe(Candidate("a"), OTHER, 100.0)
+    candidate = observe(candidate, OTHER, 105.0)
+    assert next_record(candidate, 100.0 + DURATION - 0.1) is None
+    assert next_record(candidate, 100.0 + DURATION) == LeaseRecord("7", "a", transitions=4)
 
 
 def test_a_renewal_begins_the_time_anew() -> None:
-    one = observe(Candidate("a"), OTHER, 100.0)
-    one = observe(one, LeaseRecord("8", "b"), 109.0)
-    assert next_record(one, 109.0 + DURATION - 0.1) is None
+    candidate = observe(Candidate("a"), OTHER, 100.0)
+    candidate = observe(candidate, LeaseRecord("8", "b"), 109.0)
+    assert next_record(candidate, 109.0 + DURATION - 0.1) is None
 
 
 def test_a_holder_that_promises_longer_is_waited_for() -> None:
     """Another release may have other times."""
-    one = observe(Candidate("a"), LeaseRecord("7", "b", duration=30.0), 100.0)
-    assert next_record(one, 129.0) is None
-    assert next_record(one, 130.0) is not None
+    candidate = observe(Candidate("a"), LeaseRecord("7", "b", duration=30.0), 100.0)
+    assert next_record(candidate, 129.0) is None
+    assert next_record(candidate, 130.0) is not None
 
 
 def test_one_that_was_released_is_taken_at_once() -> None:
@@ -78,18 +81,18 @@ def test_only_the_holder_releases() -> None:
 
 
 def test_who_sees_another_holder_leads_no_more() -> None:
-    one = after_write(observe(Candidate("a"), LeaseRecord("6"), 99.0), MINE, 100.0, 100.0)
-    assert observe(one, LeaseRecord("8", "a"), 101.0).leads(101.0)
-    assert not observe(one, OTHER, 101.0).leads(101.0)
-    assert not observe(one, None, 101.0).leads(101.0)
+    candidate = after_write(observe(Candidate("a"), LeaseRecord("6"), 99.0), MINE, 100.0, 100.0)
+    assert observe(candidate, LeaseRecord("8", "a"), 101.0).leads(101.0)
+    assert not observe(candidate, OTHER, 101.0).leads(101.0)
+    assert not observe(candidate, None, 101.0).leads(101.0)
 
 
 def test_terms_are_counted() -> None:
-    one = after_write(Candidate("a"), MINE, 100.0, 100.0)
-    one = after_write(one, MINE, 102.0, 102.0)
-    assert one.terms == 1
-    assert after_write(one, MINE, 120.0, 120.0).terms == 2
-    assert after_resignation(one).terms == 1
+    candidate = after_write(Candidate("a"), MINE, 100.0, 100.0)
+    candidate = after_write(candidate, MINE, 102.0, 102.0)
+    assert candidate.terms == 1
+    assert after_write(candidate, MINE, 120.0, 120.0).terms == 2
+    assert after_resignation(candidate).terms == 1
 
 
 @dataclass
@@ -113,7 +116,7 @@ class Store:
 class Operator:
     """One candidate with a clock of its own, and a request that may be under way."""
 
-    one: Candidate
+    candidate: Candidate
     ahead: float
     read: LeaseRecord | None = None
     writing: tuple[LeaseRecord, float] | None = None
@@ -127,8 +130,8 @@ class Operator:
         if self.step == 1:
             self.read = store.record
         elif self.step == 2:
-            self.one = observe(self.one, self.read, own)
-            record = next_record(self.one, own)
+            self.candidate = observe(self.candidate, self.read, own)
+            record = next_record(self.candidate, own)
             self.writing = (record, own) if record is not None else None
         elif self.step == 3:
             self.answered = None
@@ -136,7 +139,7 @@ class Operator:
                 done = store.write(self.writing[0])
                 self.answered = done and not lost  # it was written, and the answer is lost
         elif self.writing is not None and self.answered:
-            self.one = after_write(self.one, *self.writing, own)
+            self.candidate = after_write(self.candidate, *self.writing, own)
 
     def round(self, store: Store, now: float) -> None:
         """End what is under way, then do a whole round at once."""
@@ -145,10 +148,10 @@ class Operator:
 
     def stop(self, store: Store) -> None:
         """Act no more, then release what it holds."""
-        self.one = after_resignation(self.one)
-        if record := released_record(store.record, self.one.name):
+        self.candidate = after_resignation(self.candidate)
+        if record := released_record(store.record, self.candidate.name):
             store.write(record)
-        self.one, self.step = Candidate(f"{self.one.name}'"), 0  # it is started again
+        self.candidate, self.step = Candidate(f"{self.candidate.name}'"), 0  # it is started again
 
 
 STEPS = st.lists(
@@ -173,25 +176,29 @@ def test_never_two_at_once(
     """
     store, now = Store(LeaseRecord("0") if made else None), 0.0
     operators = [Operator(Candidate(name), own) for name, own in zip("abc", ahead, strict=True)]
-    for who, passed, what in steps:
+    for index, passed, action in steps:
         now += passed
         leading(operators, now)
-        if what == "stop":
-            operators[who].stop(store)
-        elif what == "delete":
+        if action == "stop":
+            operators[index].stop(store)
+        elif action == "delete":
             store.record = None
-        elif what == "round":
-            operators[who].round(store, now)
+        elif action == "round":
+            operators[index].round(store, now)
         else:
-            operators[who].go(store, now, lost=what == "lost")
+            operators[index].go(store, now, lost=action == "lost")
         leading(operators, now)
 
 
 def leading(operators: list[Operator], now: float) -> list[str]:
     """Who leads; never more than one does."""
-    found = [each.one.name for each in operators if each.one.leads(now + each.ahead)]
-    assert len(found) <= 1, found
-    return found
+    leaders = [
+        operator.candidate.name
+        for operator in operators
+        if operator.candidate.leads(now + operator.ahead)
+    ]
+    assert len(leaders) <= 1, leaders
+    return leaders
 
 
 @pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "killed"])
@@ -199,8 +206,8 @@ def test_another_one_takes_over(stopped: bool) -> None:
     """Of those that look each second, one leads a second after a stop, 12 after a kill."""
     store, now = Store(LeaseRecord("0")), 0.0
     first, second = Operator(Candidate("a"), 0.0), Operator(Candidate("b"), 50.0)
-    for each in (first, second):
-        each.round(store, now)
+    for operator in (first, second):
+        operator.round(store, now)
     assert leading([first, second], now) == ["a"]
     if stopped:
         first.stop(store)

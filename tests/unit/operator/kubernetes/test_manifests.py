@@ -35,7 +35,9 @@ def env(place: ProxySite | None = None, **changes: Any) -> dict[str, str]:
 
 
 def env_of(made: Json) -> dict[str, str]:
-    return {one["name"]: one["value"] for one in made["spec"]["containers"][0]["env"]}
+    return {
+        variable["name"]: variable["value"] for variable in made["spec"]["containers"][0]["env"]
+    }
 
 
 def test_the_proxy_understands_all_of_its_variables() -> None:
@@ -43,16 +45,16 @@ def test_the_proxy_understands_all_of_its_variables() -> None:
     on = node(pod_networks=("10.244.1.0/24", "fd00::/64"))
     master = MasterSpec("http://roscore.ros.svc:1", "10.96.0.9", publish=999)
     place = ProxySite(of, on, "192.0.2.1", RANGE, master)
-    found = settings_of(env(place))
-    assert found.master_uri == "http://roscore.ros.svc:1"
-    assert found.master_address == "10.96.0.9"
-    assert found.advertise_host == "192.0.2.1"
-    assert found.ports.listen == found.ports.advertise == RANGE
-    assert (found.master_port, found.publish_master) == (11311, 999)
-    assert str(found.admin) == "0.0.0.0:11312"
-    assert list(map(str, found.inside_networks)) == ["10.244.1.0/24", "fd00::/64"]
-    assert (found.cleanup_after, found.slave_control) == (0.5, "master")
-    assert found.admin_token is None
+    settings = settings_of(env(place))
+    assert settings.master_uri == "http://roscore.ros.svc:1"
+    assert settings.master_address == "10.96.0.9"
+    assert settings.advertise_host == "192.0.2.1"
+    assert settings.ports.listen == settings.ports.advertise == RANGE
+    assert (settings.master_port, settings.publish_master) == (11311, 999)
+    assert str(settings.admin) == "0.0.0.0:11312"
+    assert list(map(str, settings.inside_networks)) == ["10.244.1.0/24", "fd00::/64"]
+    assert (settings.cleanup_after, settings.slave_control) == (0.5, "master")
+    assert settings.admin_token is None
 
 
 def test_its_policy_is_there_from_the_start_and_makes_no_pod_anew() -> None:
@@ -94,7 +96,7 @@ def test_each_port_is_the_same_on_the_node() -> None:
 
 def test_ports_for_datagrams_are_those_of_the_range() -> None:
     made = container(site(rosproxy(direction="both", udp=True), node(), publish=11500))
-    ports = {kind: {one["hostPort"] for one in made["ports"] if one["protocol"] == kind}
+    ports = {kind: {port["hostPort"] for port in made["ports"] if port["protocol"] == kind}
              for kind in ("TCP", "UDP")}  # fmt: skip
     assert ports["TCP"] == ports["UDP"] | {11500}
     assert {"name": "ROSPROXY_UDP", "value": "1"} in made["env"]
@@ -138,8 +140,11 @@ def test_it_is_bound_to_its_node_but_placed_by_the_scheduler() -> None:
 
 def test_it_stays_where_pods_of_daemon_sets_stay() -> None:
     own = {"key": "robot", "operator": "Exists", "effect": "NoSchedule"}
-    found = {(one["key"], one["effect"]) for one in spec(tolerations=(own,))["tolerations"]}
-    assert found == {
+    tolerations = {
+        (toleration["key"], toleration["effect"])
+        for toleration in spec(tolerations=(own,))["tolerations"]
+    }
+    assert tolerations == {
         ("node.kubernetes.io/not-ready", "NoExecute"),
         ("node.kubernetes.io/unreachable", "NoExecute"),
         ("node.kubernetes.io/disk-pressure", "NoSchedule"),
@@ -190,12 +195,12 @@ def test_the_master_in_the_cluster_counts_too() -> None:
 
 def test_a_pod_is_read_back_as_it_was_made() -> None:
     made = body(replace(site(rosproxy(), node()), token_hash="5e884898da28"))
-    found = objects.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
-    assert found is not None
-    assert (found.of, found.owner, found.node) == (rosproxy().id, "uid-robot", "one")
-    assert (found.range, found.image, found.token) == (RANGE, "rosproxy:1", "")
-    assert found.fingerprint == manifests.fingerprint_of(made)
-    assert found.pod.host_ports == set(RANGE.ports())
+    proxy = objects.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
+    assert proxy is not None
+    assert (proxy.of, proxy.owner, proxy.node) == (rosproxy().id, "uid-robot", "one")
+    assert (proxy.range, proxy.image, proxy.token) == (RANGE, "rosproxy:1", "")
+    assert proxy.fingerprint == manifests.fingerprint_of(made)
+    assert proxy.pod.host_ports == set(RANGE.ports())
 
 
 def test_it_is_told_the_hash_of_its_token_alone() -> None:
@@ -207,7 +212,7 @@ def test_it_is_told_the_hash_of_its_token_alone() -> None:
 
 def test_each_proxy_has_a_token_of_its_own() -> None:
     proxies = [(Name("ros", "a"), "one"), (Name("ros", "a"), "two"), (Name("arm", "a"), "one")]
-    tokens = {names.token_of(key, *one) for one in proxies for key in (b"k" * 32, b"l" * 32)}
+    tokens = {names.token_of(key, *proxy) for proxy in proxies for key in (b"k" * 32, b"l" * 32)}
     assert len(tokens) == 6
     assert names.token_of(b"", *proxies[0]) == ""
 
@@ -241,7 +246,7 @@ def test_it_goes_on_for_a_moment_after_its_deletion() -> None:
 
 def test_the_fingerprint_does_not_depend_on_the_image() -> None:
     bodies = [body(), body(image="rosproxy:2")]
-    assert len({manifests.fingerprint_of(one) for one in bodies}) == 1
+    assert len({manifests.fingerprint_of(manifest) for manifest in bodies}) == 1
 
 
 @pytest.mark.parametrize(
@@ -266,19 +271,25 @@ def test_the_fingerprint_depends_on_all_else(other: ProxySite) -> None:
 
 
 def test_a_service_leads_to_the_proxy_on_the_callers_own_node() -> None:
-    found = manifests.service(rosproxy())
-    assert found["spec"]["internalTrafficPolicy"] == "Local"
-    assert found["spec"]["publishNotReadyAddresses"] is True
-    assert found["spec"]["selector"] == body()["metadata"]["labels"]
-    assert [(one["port"], one["targetPort"]) for one in found["spec"]["ports"]] == [(11311, 11311)]
+    service = manifests.service(rosproxy())
+    assert service["spec"]["internalTrafficPolicy"] == "Local"
+    assert service["spec"]["publishNotReadyAddresses"] is True
+    assert service["spec"]["selector"] == body()["metadata"]["labels"]
+    assert [(port["port"], port["targetPort"]) for port in service["spec"]["ports"]] == [
+        (11311, 11311)
+    ]
 
 
 def test_a_service_is_read_back_as_it_was_made() -> None:
     made = manifests.service(rosproxy(), "10.96.1.1")
-    found = objects.service({**made, "metadata": {**made["metadata"], "uid": "u"}})
-    assert found is not None
-    assert (found.of, found.owner, found.cluster_ip) == (rosproxy().id, "uid-robot", "10.96.1.1")
-    assert found.fingerprint == manifests.fingerprint_of(manifests.service(rosproxy()))
+    service = objects.service({**made, "metadata": {**made["metadata"], "uid": "u"}})
+    assert service is not None
+    assert (service.of, service.owner, service.cluster_ip) == (
+        rosproxy().id,
+        "uid-robot",
+        "10.96.1.1",
+    )
+    assert service.fingerprint == manifests.fingerprint_of(manifests.service(rosproxy()))
 
 
 def test_a_service_can_do_without_its_former_address() -> None:

@@ -38,11 +38,11 @@ def look(seen: ClusterSnapshot, memory: ClusterState | None = None) -> ClusterPl
     return look_at(seen, memory, settings=ON)
 
 
-def there(spec: Json | None = None, **changes: Any) -> dict[Name, ProxyPolicy]:
+def existing_policies(spec: Json | None = None, **changes: Any) -> dict[Name, ProxyPolicy]:
     own = policy(rosproxy(), ON)["spec"] if spec is None else spec
     name = names.policy_id(ROBOT)
-    found = ProxyPolicy(name, ROBOT, "uid-robot", "uid-policy", own)
-    return {name: replace(found, **changes)}
+    existing = ProxyPolicy(name, ROBOT, "uid-robot", "uid-policy", own)
+    return {name: replace(existing, **changes)}
 
 
 def rules(**changes: Any) -> list[Json]:
@@ -81,7 +81,7 @@ def test_ros_nodes_ports_are_for_everybody() -> None:
 )
 def test_the_proxys_own_ports_are_not_among_them(window: PortRange, ports: list[Any]) -> None:
     first, *_ = rules(window=window, ports=1)
-    assert [(one["port"], one.get("endPort")) for one in first["ports"]] == ports
+    assert [(port["port"], port.get("endPort")) for port in first["ports"]] == ports
 
 
 def test_the_masters_port_is_for_selected_pods() -> None:
@@ -118,59 +118,63 @@ def test_the_admin_port_is_for_the_operator() -> None:
 
 def test_it_is_read_back_as_it_was_made() -> None:
     made = policy(rosproxy(), ON)
-    found = objects.policy({**made, "metadata": {**made["metadata"], "uid": "uid-policy"}})
-    assert found == there()[names.policy_id(ROBOT)]
+    parsed = objects.policy({**made, "metadata": {**made["metadata"], "uid": "uid-policy"}})
+    assert parsed == existing_policies()[names.policy_id(ROBOT)]
     other = {**made["metadata"], "name": "other"}
     assert objects.policy({**made, "metadata": other}) is None
 
 
 def test_it_is_made_before_the_proxies() -> None:
-    found = look(observed(rosproxy(), service()))
-    (created,) = done(found)
+    plan = look(observed(rosproxy(), service()))
+    (created,) = done(plan)
     assert isinstance(created, CreatePolicy)
-    assert done(look(complete(policies=there()))) == []
+    assert done(look(complete(policies=existing_policies()))) == []
 
 
 @pytest.mark.parametrize("spec", [{}, {"podSelector": {}, "policyTypes": ["Ingress"]}])
 def test_it_is_mended(spec: Json) -> None:
-    (mended,) = done(look(complete(policies=there(spec))))
+    (mended,) = done(look(complete(policies=existing_policies(spec))))
     assert isinstance(mended, SetPolicy)
     assert (mended.uid, mended.spec) == ("uid-policy", policy(rosproxy(), ON)["spec"])
 
 
 def test_mending_that_does_not_help_is_not_repeated_at_once() -> None:
-    seen = complete(policies=there({}))
+    seen = complete(policies=existing_policies({}))
     first = look(seen)
     assert done(look(seen, first.state)) == []
 
 
 @pytest.mark.parametrize(
     ("policies", "rosproxies"),
-    [(there(owner="uid-old"), (rosproxy(),)), (there(), ()), (there(owner="uid-old"), ())],
+    [
+        (existing_policies(owner="uid-old"), (rosproxy(),)),
+        (existing_policies(), ()),
+        (existing_policies(owner="uid-old"), ()),
+    ],
 )
 def test_that_of_a_rosproxy_that_is_gone_is_deleted(
     policies: dict[Name, ProxyPolicy], rosproxies: Any
 ) -> None:
-    found = look(replace(observed(), policies=policies, rosproxies=rosproxies))
-    (deleted,) = [one for one in done(found) if isinstance(one, DeletePolicy)]
+    plan = look(replace(observed(), policies=policies, rosproxies=rosproxies))
+    (deleted,) = [action for action in done(plan) if isinstance(action, DeletePolicy)]
     assert deleted.uid == "uid-policy"
 
 
 def test_one_that_goes_already_is_left_alone() -> None:
-    assert done(look(observed(policies=there(deleting=True)))) == []
+    assert done(look(observed(policies=existing_policies(deleting=True)))) == []
 
 
 def test_switched_off_it_is_deleted() -> None:
-    (deleted,) = done(look_at(complete(policies=there())))
+    (deleted,) = done(look_at(complete(policies=existing_policies())))
     assert isinstance(deleted, DeletePolicy)
     assert done(look_at(complete())) == []
 
 
 def test_a_role_that_lacks_the_right_is_told() -> None:
     seen = complete(policies_error="the operator's role lacks a rule")
-    found = look(seen)
-    assert done(found) == []
-    assert "the operator's role lacks a rule" in told(found, "NoNetworkPolicy")[0]
+    plan = look(seen)
+    assert done(plan) == []
+    assert "the operator's role lacks a rule" in told(plan, "NoNetworkPolicy")[0]
     assert told(look_at(seen), "NoNetworkPolicy") == []
 
 
@@ -181,9 +185,11 @@ def test_the_ports_that_stand_in_for_outside_are_for_selected_pods() -> None:
     """For UDP, too: there the proxy takes what UDPROS sends out."""
     everybody, pods, _ = rules(direction="both")
     first, last = PORTS[0], PORTS[-1]
-    stand_ins = [{"protocol": one, "port": first, "endPort": last} for one in ("TCP", "UDP")]
+    stand_ins = [
+        {"protocol": protocol, "port": first, "endPort": last} for protocol in ("TCP", "UDP")
+    ]
     assert pods["ports"] == [{"protocol": "TCP", "port": 11311}, *stand_ins]
-    assert not [one for one in stand_ins if one in everybody["ports"]]
+    assert not [port for port in stand_ins if port in everybody["ports"]]
 
 
 def test_the_window_is_open_for_datagrams_where_they_are_asked_for() -> None:
@@ -191,14 +197,14 @@ def test_the_window_is_open_for_datagrams_where_they_are_asked_for() -> None:
     assert rules(direction="both", udp=True)[0]["ports"] == [tcp, {**tcp, "protocol": "UDP"}]
 
 
-def held(**changes: Any) -> RosProxy:
+def rosproxy_restricting_egress(**changes: Any) -> RosProxy:
     """A RosProxy whose pods are kept to their proxies."""
     return rosproxy(direction="both", pod_egress="proxy", **changes)
 
 
 def test_pods_are_kept_to_their_proxies_on_demand() -> None:
-    both = wanted_policies(held(), ON)
-    assert both[names.policy_id(ROBOT)] == policy(held(), ON)
+    both = wanted_policies(rosproxy_restricting_egress(), ON)
+    assert both[names.policy_id(ROBOT)] == policy(rosproxy_restricting_egress(), ON)
     pods = both[names.pods_policy_id(ROBOT)]["spec"]
     assert pods["policyTypes"] == ["Egress"]
     assert pods["podSelector"] == rules()[1]["from"][0]["podSelector"]
@@ -207,24 +213,31 @@ def test_pods_are_kept_to_their_proxies_on_demand() -> None:
     selected = to_proxies["to"][0]["podSelector"]["matchLabels"]
     assert selected.items() <= proxy["metadata"]["labels"].items()
     assert to_pods == {"to": [{"podSelector": pods["podSelector"]}]}
-    assert {(one["protocol"], one["port"]) for one in to_dns["ports"]} == {("UDP", 53), ("TCP", 53)}
+    assert {(port["protocol"], port["port"]) for port in to_dns["ports"]} == {
+        ("UDP", 53),
+        ("TCP", 53),
+    }
     assert list(wanted_policies(rosproxy(direction="both"), ON)) == [names.policy_id(ROBOT)]
-    assert wanted_policies(held(), SETTINGS) == {}
+    assert wanted_policies(rosproxy_restricting_egress(), SETTINGS) == {}
 
 
 def seen_policies(of: RosProxy) -> dict[Name, ProxyPolicy]:
     """What is there once all policies of a RosProxy have been made."""
-    found = (
+    parsed = (
         objects.policy({**body, "metadata": {**body["metadata"], "uid": f"uid-{name}"}})
         for name, body in wanted_policies(of, ON).items()
     )
-    return {one.id: one for one in found if one}
+    return {p.id: p for p in parsed if p}
 
 
 def test_the_pods_policy_is_made_and_goes_when_it_is_not_asked_for_any_more() -> None:
-    seen = replace(complete(policies=there()), rosproxies=(held(),))
-    made = [one for one in done(look(seen)) if isinstance(one, CreatePolicy)]
-    assert [one.body["metadata"]["name"] for one in made] == ["rosproxy-robot.pods"]
-    all_there = replace(complete(policies=seen_policies(held())), rosproxies=(rosproxy(),))
-    (deleted,) = [one for one in done(look(all_there)) if isinstance(one, DeletePolicy)]
+    seen = replace(
+        complete(policies=existing_policies()), rosproxies=(rosproxy_restricting_egress(),)
+    )
+    made = [action for action in done(look(seen)) if isinstance(action, CreatePolicy)]
+    assert [action.body["metadata"]["name"] for action in made] == ["rosproxy-robot.pods"]
+    both_made = replace(
+        complete(policies=seen_policies(rosproxy_restricting_egress())), rosproxies=(rosproxy(),)
+    )
+    (deleted,) = [action for action in done(look(both_made)) if isinstance(action, DeletePolicy)]
     assert deleted.id == names.pods_policy_id(ROBOT)

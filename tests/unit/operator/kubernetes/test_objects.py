@@ -42,13 +42,13 @@ NODE = {
 
 
 def test_a_node():
-    found = node(NODE)
+    parsed_node = node(NODE)
 
-    assert found.name == "node1"
-    assert found.addresses == {"InternalIP": "10.88.0.11", "Hostname": "node1"}
-    assert found.advertise_host == "arm.example"
-    assert found.pod_networks == ("10.244.1.0/24", "fd00:1::/64")
-    assert (found.ready, found.deleting) == (True, False)
+    assert parsed_node.name == "node1"
+    assert parsed_node.addresses == {"InternalIP": "10.88.0.11", "Hostname": "node1"}
+    assert parsed_node.advertise_host == "arm.example"
+    assert parsed_node.pod_networks == ("10.244.1.0/24", "fd00:1::/64")
+    assert (parsed_node.ready, parsed_node.deleting) == (True, False)
 
 
 def test_a_cordoned_node_is_as_any_other():
@@ -66,34 +66,43 @@ def test_a_node_whose_kubelet_is_gone_is_not_ready(status):
 
 
 def test_a_node_that_was_just_made_is_not_ready_and_has_nothing():
-    found = node({"metadata": {"name": "node3"}, "spec": {"unschedulable": True}})
+    parsed_node = node({"metadata": {"name": "node3"}, "spec": {"unschedulable": True}})
 
-    assert (found.ready, found.pod_networks) == (False, ())
+    assert (parsed_node.ready, parsed_node.pod_networks) == (False, ())
 
 
 def test_a_pod():
-    found = pod(pod_obj(labels={"app": "talker"}))
+    parsed_pod = pod(pod_obj(labels={"app": "talker"}))
 
-    assert found.id == Name(NAMESPACE, "talker")
-    assert (found.node, found.phase, found.ip) == ("node1", "Running", "10.244.1.5")
-    assert found.labels == {"app": "talker"}
-    assert (found.own_masters, found.wired_master_uri, found.host_network) == ((), "", False)
+    assert parsed_pod.id == Name(NAMESPACE, "talker")
+    assert (parsed_pod.node, parsed_pod.phase, parsed_pod.ip) == ("node1", "Running", "10.244.1.5")
+    assert parsed_pod.labels == {"app": "talker"}
+    assert (parsed_pod.own_masters, parsed_pod.wired_master_uri, parsed_pod.host_network) == (
+        (),
+        "",
+        False,
+    )
 
 
 def test_a_pod_at_admission_has_neither_name_nor_node():
     meta = {"generateName": "talker-", "namespace": "robots"}
 
-    found = pod({"metadata": meta, "spec": {"containers": [{"name": "ros"}]}})
+    parsed_pod = pod({"metadata": meta, "spec": {"containers": [{"name": "ros"}]}})
 
-    assert found.id == Name("robots", "")
-    assert (found.uid, found.node, found.ip, found.phase) == ("", "", "", "Pending")
+    assert parsed_pod.id == Name("robots", "")
+    assert (parsed_pod.uid, parsed_pod.node, parsed_pod.ip, parsed_pod.phase) == (
+        "",
+        "",
+        "",
+        "Pending",
+    )
 
 
 def test_host_ports_are_those_that_the_scheduler_counts():
     def container(name: str, port: int, **more: Any) -> dict[str, Any]:
         return {"name": name, "ports": [{"containerPort": 80, "hostPort": port, **more}]}
 
-    found = pod(
+    parsed_pod = pod(
         pod_obj(
             containers=[container("a", 8080), container("b", 8081, protocol="UDP"), {"name": "c"}],
             initContainers=[
@@ -103,7 +112,7 @@ def test_host_ports_are_those_that_the_scheduler_counts():
         )
     )
 
-    assert found.host_ports == {8080, 8082}
+    assert parsed_pod.host_ports == {8080, 8082}
 
 
 def test_what_does_not_fit_is_as_if_it_were_not_there_and_the_rest_is_read():
@@ -115,17 +124,17 @@ def test_what_does_not_fit_is_as_if_it_were_not_there_and_the_rest_is_read():
         containers=[{"name": "a", "ports": ports}, None],
     )
 
-    found = pod(obj)
+    parsed_pod = pod(obj)
 
-    assert (found.labels, found.host_network) == ({"app": "ros"}, False)
-    assert (found.host_ports, found.ip) == (frozenset({8080}), "10.244.1.5")
+    assert (parsed_pod.labels, parsed_pod.host_network) == ({"app": "ros"}, False)
+    assert (parsed_pod.host_ports, parsed_pod.ip) == (frozenset({8080}), "10.244.1.5")
 
 
 def test_masters_that_a_template_sets_itself():
     def container(**variable: Any) -> dict[str, Any]:
         return {"name": "x", "env": [{"name": "ROS_MASTER_URI", **variable}]}
 
-    found = pod(
+    parsed_pod = pod(
         pod_obj(
             containers=[
                 container(value="http://robot:11311"),
@@ -137,7 +146,7 @@ def test_masters_that_a_template_sets_itself():
         )
     )
 
-    assert found.own_masters == ("", "http://robot:11311", VALUE_AT_RUNTIME, VALUE_AT_RUNTIME)
+    assert parsed_pod.own_masters == ("", "http://robot:11311", VALUE_AT_RUNTIME, VALUE_AT_RUNTIME)
 
 
 def test_what_the_webhook_has_set_is_not_the_templates_own():
@@ -146,9 +155,9 @@ def test_what_the_webhook_has_set_is_not_the_templates_own():
     )
     obj["metadata"]["annotations"] = {"rosproxy.io/master-uri": "http://a:11311"}
 
-    found = pod(obj)
+    parsed_pod = pod(obj)
 
-    assert (found.own_masters, found.wired_master_uri) == ((), "http://a:11311")
+    assert (parsed_pod.own_masters, parsed_pod.wired_master_uri) == ((), "http://a:11311")
 
 
 @pytest.mark.parametrize(
@@ -162,7 +171,7 @@ def test_pods_that_have_ended(phase, ended):
 
 
 def test_a_proxy_is_read_back_from_its_pod():
-    found = proxy_pod(
+    parsed_proxy = proxy_pod(
         proxy_obj(
             status={
                 "phase": "Running",
@@ -175,15 +184,24 @@ def test_a_proxy_is_read_back_from_its_pod():
         )
     )
 
-    assert found is not None
-    assert (found.of, found.owner, found.node) == (Name(NAMESPACE, "arm"), "uid-arm", "node1")
-    assert (found.range, found.fingerprint, found.image) == (
+    assert parsed_proxy is not None
+    assert (parsed_proxy.of, parsed_proxy.owner, parsed_proxy.node) == (
+        Name(NAMESPACE, "arm"),
+        "uid-arm",
+        "node1",
+    )
+    assert (parsed_proxy.range, parsed_proxy.fingerprint, parsed_proxy.image) == (
         RANGE,
         "0123456789abcdef",
         "rosproxy:1",
     )
-    assert (found.token, found.ready, found.stuck, found.restarts) == ("", True, None, 2)
-    assert found.pod.host_ports == set(RANGE.ports())
+    assert (parsed_proxy.token, parsed_proxy.ready, parsed_proxy.stuck, parsed_proxy.restarts) == (
+        "",
+        True,
+        None,
+        2,
+    )
+    assert parsed_proxy.pod.host_ports == set(RANGE.ports())
 
 
 @pytest.mark.parametrize(
@@ -219,11 +237,15 @@ def test_somebody_elses_pod_with_the_same_labels_is_no_proxy(owner):
 
 
 def test_a_service():
-    found = service(service_obj())
+    parsed_service = service(service_obj())
 
-    assert found is not None
-    assert (found.of, found.owner) == (Name(NAMESPACE, "arm"), "uid-arm")
-    assert (found.cluster_ip, found.fingerprint, found.deleting) == (CLUSTER_IP, "f", False)
+    assert parsed_service is not None
+    assert (parsed_service.of, parsed_service.owner) == (Name(NAMESPACE, "arm"), "uid-arm")
+    assert (parsed_service.cluster_ip, parsed_service.fingerprint, parsed_service.deleting) == (
+        CLUSTER_IP,
+        "f",
+        False,
+    )
 
 
 def test_a_service_without_an_address():
@@ -258,12 +280,12 @@ STATUS = {
 
 
 def test_what_a_proxy_answers():
-    found = report(read_status(STATUS))
+    proxy_report = report(read_status(STATUS))
 
-    assert (found.answered, found.master_up, found.error) == (True, True, "")
-    assert found.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
-    assert found.topics == {"/chatter", "/rosout"}
-    assert found.problems == ("/talker: does not answer",)
+    assert (proxy_report.answered, proxy_report.master_up, proxy_report.error) == (True, True, "")
+    assert proxy_report.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
+    assert proxy_report.topics == {"/chatter", "/rosout"}
+    assert proxy_report.problems == ("/talker: does not answer",)
 
 
 def test_a_proxy_without_its_master():
@@ -272,9 +294,13 @@ def test_a_proxy_without_its_master():
 
 
 def test_a_proxy_that_does_not_answer():
-    found = no_answer("timed\x1bout")
+    proxy_report = no_answer("timed\x1bout")
 
-    assert (found.answered, found.master_up, found.error) == (False, False, "timed\\x1bout")
+    assert (proxy_report.answered, proxy_report.master_up, proxy_report.error) == (
+        False,
+        False,
+        "timed\\x1bout",
+    )
 
 
 _json = st.recursive(

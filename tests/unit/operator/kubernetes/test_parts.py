@@ -45,7 +45,7 @@ class Together:
         self.state, self.now = ClusterState(), 1000.0
 
     def observe(self) -> ClusterSnapshot:
-        first, second = (each.observe() for each in self.worlds)
+        first, second = (world.observe() for world in self.worlds)
         return replace(
             first,
             rosproxies=first.rosproxies + second.rosproxies,
@@ -61,29 +61,29 @@ class Together:
             failures={**first.failures, **second.failures},
         )
 
-    def carry_out(self, found: ClusterPlan) -> None:
+    def carry_out(self, whole: ClusterPlan) -> None:
         for world in self.worlds:
-            mine = [one for one in found.actions if one.of.namespace == world.namespace]
-            world.controller.carry_out(replace(found, actions=tuple(mine)))
-            for uid, addresses in found.departed_addresses.items():
+            mine = [action for action in whole.actions if action.of.namespace == world.namespace]
+            world.controller.carry_out(replace(whole, actions=tuple(mine)))
+            for uid, addresses in whole.departed_addresses.items():
                 if uid in world.cluster.ros:
                     world.cluster.ros[uid] -= set(addresses)
 
 
 def by_rosproxy(actions: tuple[Action, ...]) -> dict[Any, list[Action]]:
     """The actions of each RosProxy, in their order."""
-    found: dict[Any, list[Action]] = {}
-    for one in actions:
-        found.setdefault(one.of, []).append(one)
-    return found
+    grouped: dict[Any, list[Action]] = {}
+    for action in actions:
+        grouped.setdefault(action.of, []).append(action)
+    return grouped
 
 
 def all_of(observed: ClusterSnapshot) -> Partition:
     """All parts as one. What is remembered of others is forgotten with the next look at all."""
-    every = [*partitions(observed)]
+    all_partitions = [*partitions(observed)]
     return Partition(
-        frozenset(one for part in every for one in part.namespaces),
-        frozenset(one for part in every for one in part.nodes),
+        frozenset(namespace for partition in all_partitions for namespace in partition.namespaces),
+        frozenset(node for partition in all_partitions for node in partition.nodes),
     )
 
 
@@ -94,16 +94,22 @@ def check(
     union: Partition,
 ) -> None:
     merged: dict[Any, list[Action]] = {}
-    for _, one in pieces:
-        for of, actions in by_rosproxy(one.actions).items():
+    for _, part_plan in pieces:
+        for of, actions in by_rosproxy(part_plan.actions).items():
             assert of not in merged, "two parts have it"
             merged[of] = actions
     assert merged == by_rosproxy(whole.actions)
     for name in ("departed_addresses", "callers", "policies", "peers", "former_ports"):
-        both = {uid: told for _, one in pieces for uid, told in getattr(one, name).items()}
+        both = {
+            uid: told for _, part_plan in pieces for uid, told in getattr(part_plan, name).items()
+        }
         assert both == dict(getattr(whole, name)), name
-    assert {one for _, each in pieces for one in each.problems} == {*whole.problems}
-    waits = [one.next_look_in for _, one in pieces if one.next_look_in is not None]
+    assert {problem for _, part_plan in pieces for problem in part_plan.problems} == {
+        *whole.problems
+    }
+    waits = [
+        part_plan.next_look_in for _, part_plan in pieces if part_plan.next_look_in is not None
+    ]
     assert min(waits, default=None) == whole.next_look_in
     remembered = partition_state(whole.state, union)
     for name in state.__struct_fields__:
@@ -122,11 +128,13 @@ def test_planning_by_parts_is_planning_it_all(shared: bool, events: list) -> Non
         both.state = partition_state(both.state, union)
         whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
         pieces, state = [], ClusterState(begun=both.state.begun)
-        for part in partitions(observed):
-            before = partition_state(both.state, part)
-            one = plan(partition_snapshot(observed, part), SETTINGS, before, both.now, STAMP)
-            state = merge_state(state, part, one.state)
-            pieces.append((part, one))
+        for partition in partitions(observed):
+            before = partition_state(both.state, partition)
+            part_plan = plan(
+                partition_snapshot(observed, partition), SETTINGS, before, both.now, STAMP
+            )
+            state = merge_state(state, partition, part_plan.state)
+            pieces.append((partition, part_plan))
         check(whole, pieces, replace(state, begun=True), union)
         both.state = whole.state
         both.carry_out(whole)
@@ -141,19 +149,25 @@ def test_what_is_not_touched_stays_as_it_is(shared: bool, events: list) -> None:
         happen(both.worlds[which], n, m)
     observed = both.observe()
     whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
-    for part in partitions(observed):
+    for partition in partitions(observed):
         before = copy.copy(whole.state)
-        one = plan(
-            partition_snapshot(observed, part),
+        part_plan = plan(
+            partition_snapshot(observed, partition),
             SETTINGS,
-            partition_state(before, part),
+            partition_state(before, partition),
             both.now,
             STAMP,
         )
-        after = merge_state(before, part, one.state)
-        others = [other for other in partitions(observed) if other != part]
-        for other in others:
-            assert partition_state(after, other) == partition_state(whole.state, other)
+        after = merge_state(before, partition, part_plan.state)
+        other_partitions = [
+            other_partition
+            for other_partition in partitions(observed)
+            if other_partition != partition
+        ]
+        for other_partition in other_partitions:
+            assert partition_state(after, other_partition) == partition_state(
+                whole.state, other_partition
+            )
 
 
 def test_who_shares_a_node_is_one_part() -> None:
@@ -161,10 +175,10 @@ def test_who_shares_a_node_is_one_part() -> None:
     for world in both.worlds:
         world.run(0, 0)
     observed = both.observe()
-    (part,) = [one for one in partitions(observed) if one.nodes]
-    assert part.namespaces == {"ros", "arms"}
-    assert partition_of(observed, ["arms"]) == part
-    assert partition_of(observed, [], part.nodes) == part
+    (partition,) = [p for p in partitions(observed) if p.nodes]
+    assert partition.namespaces == {"ros", "arms"}
+    assert partition_of(observed, ["arms"]) == partition
+    assert partition_of(observed, [], partition.nodes) == partition
 
 
 def test_who_shares_no_node_is_apart() -> None:
@@ -172,6 +186,6 @@ def test_who_shares_no_node_is_apart() -> None:
     for world in both.worlds:
         world.run(0, 0)
     observed = both.observe()
-    assert [one.namespaces for one in partitions(observed)] == [{"arms"}, {"ros"}]
+    assert [partition.namespaces for partition in partitions(observed)] == [{"arms"}, {"ros"}]
     assert partition_of(observed, ["ros"]).namespaces == {"ros"}
     assert partition_of(observed, [], ["nowhere"]) == Partition()

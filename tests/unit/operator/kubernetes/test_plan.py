@@ -52,23 +52,23 @@ INSIDE = MasterSpec(service=MASTER)
 
 def env(action: Any) -> dict[str, str]:
     variables = action.body["spec"]["containers"][0]["env"]
-    return {one["name"]: one["value"] for one in variables}
+    return {variable["name"]: variable["value"] for variable in variables}
 
 
-def reasons(found: ClusterPlan) -> list[str]:
-    return [action.reason for action in found.actions if isinstance(action, Emit)]
+def reasons(plan: ClusterPlan) -> list[str]:
+    return [action.reason for action in plan.actions if isinstance(action, Emit)]
 
 
 def test_a_rosproxy_gets_a_service_and_a_proxy_on_each_node_with_selected_pods() -> None:
     nodes = [node("one"), node("two"), node("three")]
     pods = [pod("a", "one"), pod("b", "two"), pod("c", "two")]
-    found = look(observed(rosproxy(), *nodes, *pods))
-    assert [(type(one), node_of(one)) for one in done(found)] == [
+    plan = look(observed(rosproxy(), *nodes, *pods))
+    assert [(type(action), node_of(action)) for action in done(plan)] == [
         (CreateService, ""),
         (CreateProxy, "one"),
         (CreateProxy, "two"),
     ]
-    assert reasons(found) == ["ProxyCreated", "ProxyCreated"]
+    assert reasons(plan) == ["ProxyCreated", "ProxyCreated"]
 
 
 def test_a_service_is_there_before_any_pod_is() -> None:
@@ -84,7 +84,7 @@ def test_when_all_is_there_nothing_is_done() -> None:
 
 
 @pytest.mark.parametrize(
-    "other",
+    "other_pod",
     [
         pod("ended", phase="Succeeded"),
         pod("going", deleting=True),
@@ -95,17 +95,17 @@ def test_when_all_is_there_nothing_is_done() -> None:
         replace(pod("elsewhere"), id=Name("other", "elsewhere")),
         pod("a-proxy", labels=names.own_labels("robot") | {names.INJECT: "true"}),
     ],
-    ids=lambda one: one.id.name,
+    ids=lambda other_pod: other_pod.id.name,
 )
-def test_other_pods_get_no_proxy(other: Any) -> None:
-    assert done(look(observed(rosproxy(), service(), other))) == []
+def test_other_pods_get_no_proxy(other_pod: Any) -> None:
+    assert done(look(observed(rosproxy(), service(), other_pod))) == []
 
 
 def test_on_a_node_that_is_not_ready_nothing_is_created_nor_deleted() -> None:
     away = node(ready=False)
-    found = look(scene(away))
-    assert done(found) == []
-    (text,) = told(found, "NodeNotReady")
+    plan = look(scene(away))
+    assert done(plan) == []
+    (text,) = told(plan, "NodeNotReady")
     assert text.startswith("node one: is not ready")
     assert "kubectl describe node one" in text
     alone = observed(rosproxy(grace=0.0), service(), away, proxy())
@@ -148,9 +148,9 @@ def test_a_proxy_on_a_node_that_is_gone_is_deleted_after_a_while() -> None:
 
 
 def test_another_image_is_given_to_the_pod_that_is_there() -> None:
-    found = look(complete(rosproxies=(rosproxy(image="rosproxy:2"),)))
-    assert done(found) == [SetImage(ROBOT, PROXY, "uid-proxy-robot-one", "rosproxy:2")]
-    assert reasons(found) == ["ImageSet"]
+    plan = look(complete(rosproxies=(rosproxy(image="rosproxy:2"),)))
+    assert done(plan) == [SetImage(ROBOT, PROXY, "uid-proxy-robot-one", "rosproxy:2")]
+    assert reasons(plan) == ["ImageSet"]
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_another_image_is_given_to_the_pod_that_is_there() -> None:
         {"resources": {"limits": {"memory": "1Gi"}}},
         {"tolerations": ({"operator": "Exists"},)},
     ],
-    ids=lambda one: next(iter(one)),
+    ids=lambda changes: next(iter(changes)),
 )
 def test_any_other_change_makes_the_pod_anew_once_the_old_one_is_gone(changes: dict) -> None:
     of = rosproxy(**changes)
@@ -201,31 +201,31 @@ def test_who_is_not_found_again_at_the_master_is_unregistered(
 
 
 def test_what_a_deleted_rosproxy_has_made_goes() -> None:
-    found = look(complete(rosproxies=()))
+    plan = look(complete(rosproxies=()))
     why = "its RosProxy is gone"
-    assert done(found) == [
+    assert done(plan) == [
         DeleteProxy(ROBOT, PROXY, "uid-proxy-robot-one", why, retire=True),
         DeleteService(ROBOT, Name("ros", "rosproxy-robot"), "uid-service-robot", why),
     ]
 
 
 def test_a_proxy_that_the_garbage_collector_deletes_is_retired_nonetheless() -> None:
-    found = look(complete(rosproxies=(), proxies=(proxy(deleting=True),)))
-    assert [getattr(one, "retire", None) for one in done(found)] == [True, None]
+    plan = look(complete(rosproxies=(), proxies=(proxy(deleting=True),)))
+    assert [getattr(action, "retire", None) for action in done(plan)] == [True, None]
     never = proxy(deleting=True, phase="Pending")
     assert kinds(look(complete(rosproxies=(), proxies=(never,)))) == [DeleteService]
 
 
 def test_a_rosproxy_that_is_being_deleted_counts_as_gone() -> None:
-    found = look(complete(rosproxies=(rosproxy(deleting=True),)))
-    assert [type(one) for one in found.actions] == [DeleteProxy, DeleteService]
+    plan = look(complete(rosproxies=(rosproxy(deleting=True),)))
+    assert [type(action) for action in plan.actions] == [DeleteProxy, DeleteService]
 
 
 def test_one_of_the_same_name_takes_over_once_all_is_gone() -> None:
     """Its pods were wired to an address: the new Service is to have it again."""
     new = rosproxy(uid="uid-new")
     first = look(complete(rosproxies=(new,)))
-    assert [(type(one), getattr(one, "retire", None)) for one in done(first)] == [
+    assert [(type(action), getattr(action, "retire", None)) for action in done(first)] == [
         (DeleteProxy, False),
         (DeleteService, None),
     ]
@@ -237,20 +237,20 @@ def test_one_of_the_same_name_takes_over_once_all_is_gone() -> None:
 
 def test_what_an_unreadable_rosproxy_has_stays_as_it_is() -> None:
     bad = InvalidRosProxy(ROBOT, "uid-robot", 2, "spec.ports: is no number: write one")
-    found = look(complete(rosproxies=(), unusable={ROBOT: bad}))
-    assert done(found) == []
-    assert told(found, "Invalid") == ["rosproxy ros/robot: spec.ports: is no number: write one"]
-    (event,) = (one for one in found.actions if isinstance(one, Emit))
+    plan = look(complete(rosproxies=(), unusable={ROBOT: bad}))
+    assert done(plan) == []
+    assert told(plan, "Invalid") == ["rosproxy ros/robot: spec.ports: is no number: write one"]
+    (event,) = (action for action in plan.actions if isinstance(action, Emit))
     assert (event.type, event.reason, event.message) == ("Warning", "Invalid", bad.text)
     assert event.about == Reference("RosProxy", ROBOT, "uid-robot")
-    assert status(found)["conditions"][0]["reason"] == "Invalid"
+    assert status(plan)["conditions"][0]["reason"] == "Invalid"
 
 
 def test_ports_of_an_unreadable_rosproxy_are_not_given_to_others() -> None:
     bad = InvalidRosProxy(ROBOT, "uid-robot", 2, "bad")
     arm = rosproxy("arm")
-    found = look(observed(arm, proxy(), pod(), service(arm), unusable={ROBOT: bad}))
-    (created,) = done(found)
+    plan = look(observed(arm, proxy(), pod(), service(arm), unusable={ROBOT: bad}))
+    (created,) = done(plan)
     assert isinstance(created, CreateProxy)
     assert env(created)["ROSPROXY_PORT_RANGE"] == "11404-11407"
 
@@ -260,9 +260,9 @@ def test_ports_of_an_unreadable_rosproxy_are_not_given_to_others() -> None:
 
 def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
     namesake = pod(PROXY.name, labels={})
-    found = look(scene(namesake))
-    assert done(found) == []
-    (text,) = told(found, "NameTaken")
+    plan = look(scene(namesake))
+    assert done(plan) == []
+    (text,) = told(plan, "NameTaken")
     assert f"a pod called {PROXY} is there already, and is not the operator's" in text
     assert "delete or rename it" in text
 
@@ -270,7 +270,7 @@ def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
 def test_a_proxy_under_a_name_of_former_times_goes_first() -> None:
     old = replace(proxy(), pod=replace(proxy().pod, id=Name("ros", "rosproxy-old")))
     first = look(scene(old))
-    assert [getattr(one, "id", None) for one in done(first)] == [Name("ros", "rosproxy-old")]
+    assert [getattr(action, "id", None) for action in done(first)] == [Name("ros", "rosproxy-old")]
     second = look(scene(), first.state, 101.0)
     assert kinds(second) == [CreateProxy]
 
@@ -302,10 +302,10 @@ def test_a_node_that_outside_does_not_reach_gets_no_proxy_and_it_is_told_why(
     annotated: str, why: list[str]
 ) -> None:
     of = rosproxy(advertise=Advertise.EXTERNAL_IP)
-    found = look(scene(node(advertise_host=annotated), of=of))
-    assert done(found) == []
-    (text,) = told(found, "NoAdvertiseHost")
-    assert all(part in text for part in why)
+    plan = look(scene(node(advertise_host=annotated), of=of))
+    assert done(plan) == []
+    (text,) = told(plan, "NoAdvertiseHost")
+    assert all(fragment in text for fragment in why)
 
 
 def test_a_master_in_the_cluster_is_given_by_name_and_address() -> None:
@@ -318,22 +318,22 @@ def test_a_master_in_the_cluster_is_given_by_name_and_address() -> None:
 @pytest.mark.parametrize("masters", [{}, {MASTER: ("", "does not exist: create it")}])
 def test_while_the_masters_service_is_missing_everything_stays(masters: dict) -> None:
     of = rosproxy(master=INSIDE)
-    found = look(replace(scene(proxy(), of=of), masters=masters))
-    assert done(found) == []
-    assert "spec.master.service: Service ros/roscore" in told(found, "MasterUnknown")[0]
+    plan = look(replace(scene(proxy(), of=of), masters=masters))
+    assert done(plan) == []
+    assert "spec.master.service: Service ros/roscore" in told(plan, "MasterUnknown")[0]
 
 
 def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
-    found = look(scene(pod("a"), of=rosproxy(node_selector={"zone": "a"})))
-    assert done(found) == []
-    (text,) = told(found, "NodeLeftOut")
+    plan = look(scene(pod("a"), of=rosproxy(node_selector={"zone": "a"})))
+    assert done(plan) == []
+    (text,) = told(plan, "NodeLeftOut")
     assert "node one, which spec.nodeSelector leaves out" in text
     assert "ros/a, ros/talker" in text
 
 
 def test_a_pod_that_is_not_wired_is_told() -> None:
-    found = look(complete(pods=(pod(wired_master_uri=""),)))
-    assert "create the pod anew" in told(found, "NotWired")[0]
+    plan = look(complete(pods=(pod(wired_master_uri=""),)))
+    assert "create the pod anew" in told(plan, "NotWired")[0]
 
 
 @pytest.mark.parametrize(
@@ -356,15 +356,15 @@ def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(
 
 
 def test_a_service_that_is_lost_is_made_with_the_address_that_it_had() -> None:
-    found = look(observed(rosproxy(cluster_ip="10.96.3.3"), proxy(), pod()))
-    (created,) = done(found)
+    plan = look(observed(rosproxy(cluster_ip="10.96.3.3"), proxy(), pod()))
+    (created,) = done(plan)
     assert isinstance(created, CreateService)
     assert created.body["spec"]["clusterIP"] == "10.96.3.3"
 
 
 def test_a_service_of_former_times_is_made_anew() -> None:
-    found = look(complete(services={ROBOT: service(fingerprint="other")}))
-    (deleted,) = done(found)
+    plan = look(complete(services={ROBOT: service(fingerprint="other")}))
+    (deleted,) = done(plan)
     assert isinstance(deleted, DeleteService)
     assert deleted.why.startswith("made anew: ")
 
@@ -374,22 +374,22 @@ def test_a_service_of_former_times_is_made_anew() -> None:
 
 def test_the_status_keeps_the_ranges_of_nodes_that_have_no_proxy_now() -> None:
     former = {"one": proxy().range, "gone": proxy().range}
-    found = look(observed(rosproxy(former_ranges=former), service()))
-    assert [(one["name"], one["ports"]) for one in status(found)["perNode"]] == [
-        ("one", "11400-11403")
-    ]
+    plan = look(observed(rosproxy(former_ranges=former), service()))
+    assert [
+        (node_status["name"], node_status["ports"]) for node_status in status(plan)["perNode"]
+    ] == [("one", "11400-11403")]
 
 
 def test_one_bad_rosproxy_does_not_stop_another() -> None:
     bad = rosproxy("arm", advertise=Advertise.EXTERNAL_IP)
     pods = [pod("a", labels={names.INJECT: "arm"}), pod("b", labels={names.INJECT: "robot"})]
-    found = look(observed(bad, rosproxy(), service(), service(bad), *pods))
-    assert [(type(one), one.of.name) for one in done(found)] == [(CreateProxy, "robot")]
+    plan = look(observed(bad, rosproxy(), service(), service(bad), *pods))
+    assert [(type(action), action.of.name) for action in done(plan)] == [(CreateProxy, "robot")]
 
 
 def test_the_default_image_is_that_of_the_settings() -> None:
-    found = look(complete(), settings=replace(SETTINGS, image="rosproxy:9"))
-    (changed,) = done(found)
+    plan = look(complete(), settings=replace(SETTINGS, image="rosproxy:9"))
+    (changed,) = done(plan)
     assert isinstance(changed, SetImage)
     assert changed.image == "rosproxy:9"
 
@@ -408,26 +408,26 @@ def two(*proxies: ProxyPod, key: bytes = KEY) -> ClusterSnapshot:
 
 
 def test_another_key_makes_one_proxy_anew_at_a_time() -> None:
-    found = look(two(proxy(), proxy(on=node("two"))))
-    (action,) = done(found)
+    plan = look(two(proxy(), proxy(on=node("two"))))
+    (action,) = done(plan)
     assert isinstance(action, DeleteProxy)
     assert (action.id, action.retire) == (PROXY, False)
     assert action.why.startswith("made anew: its RosProxy, its node or the operator's options")
-    assert found.next_look_in == 1.0
+    assert plan.next_look_in == 1.0
 
 
 @pytest.mark.parametrize("first", [(), (proxy(stuck=None, phase="Pending"),)])
 def test_the_next_waits_until_the_one_before_runs(first: tuple[ProxyPod, ...]) -> None:
-    found = look(two(*first, proxy(on=node("two"))))
-    assert DeleteProxy not in kinds(found) or first
-    assert not [one for one in done(found) if getattr(one, "id", PROXY) != PROXY]
-    assert found.next_look_in == 1.0
+    plan = look(two(*first, proxy(on=node("two"))))
+    assert DeleteProxy not in kinds(plan) or first
+    assert not [action for action in done(plan) if getattr(action, "id", PROXY) != PROXY]
+    assert plan.next_look_in == 1.0
 
 
 def test_one_that_can_never_come_holds_up_nobody() -> None:
     bad = proxy(stuck=PodFailure.IMAGE)
-    found = look(two(replace(bad, fingerprint="x"), proxy(on=node("two"))))
-    assert {one.id for one in done(found) if isinstance(one, DeleteProxy)} == {PROXY}
+    plan = look(two(replace(bad, fingerprint="x"), proxy(on=node("two"))))
+    assert {action.id for action in done(plan) if isinstance(action, DeleteProxy)} == {PROXY}
     settled = replace(bad, fingerprint=fingerprint(two()))
     (action,) = done(look(two(settled, proxy(on=node("two")))))
     assert isinstance(action, DeleteProxy)
@@ -436,8 +436,8 @@ def test_one_that_can_never_come_holds_up_nobody() -> None:
 
 def fingerprint(seen: ClusterSnapshot) -> str:
     """That of the proxy of node one, as it is made now."""
-    (body,) = [one.body for one in done(look(seen)) if isinstance(one, CreateProxy)
-               and one.body["metadata"]["name"] == PROXY.name]  # fmt: skip
+    (body,) = [action.body for action in done(look(seen)) if isinstance(action, CreateProxy)
+               and action.body["metadata"]["name"] == PROXY.name]  # fmt: skip
     return str(body["metadata"]["annotations"][names.FINGERPRINT])
 
 

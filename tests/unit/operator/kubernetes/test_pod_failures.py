@@ -47,9 +47,9 @@ def waiting(why: str, said: str = "", **last: Any) -> dict[str, Any]:
     ],
 )
 def test_the_scheduler_finds_no_place(reason, message, why):
-    found, text = stuck(scheduled(reason, message))
+    failure, text = stuck(scheduled(reason, message))
 
-    assert found is why
+    assert failure is why
     assert text.startswith(f"{reason}: {message[:40]}")
     assert len(text) <= 300
 
@@ -82,9 +82,9 @@ def test_an_error_that_the_scheduler_gets_over_by_itself_is_no_trouble():
     ],
 )
 def test_the_kubelet_does_not_admit_it(reason, message, why):
-    found, text = stuck({"status": {"phase": "Failed", "reason": reason, "message": message}})
+    failure, text = stuck({"status": {"phase": "Failed", "reason": reason, "message": message}})
 
-    assert found is why
+    assert failure is why
     assert text == (f"{reason}: {message}" if reason else "")
 
 

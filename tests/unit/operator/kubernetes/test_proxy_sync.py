@@ -43,43 +43,43 @@ class Told(ProxyClient):
         self.policies: list[Any] = []
         self.refuses: ProxyError | None = None
 
-    async def status(self, where: HostPort) -> ProxyStatus:
+    async def status(self, admin: HostPort) -> ProxyStatus:
         self.asked += 1
         self.failing -= 1
         if self.says is None or self.failing >= 0:
-            raise ProxyError(f"{where} refuses connections")
+            raise ProxyError(f"{admin} refuses connections")
         return read_status(self.says)
 
     async def changes(
-        self, where: HostPort, token: str, since: str, within: float
+        self, admin: HostPort, token: str, since: str, within: float
     ) -> tuple[str, ProxyStatus]:
         self.waited.append((since, within))
         if self.former:
             raise ProxyError("no such path", status=404)
         if not within or since != self.version:
-            return self.version, await self.status(where)
+            return self.version, await self.status(admin)
         self.listening += 1
         try:
             await asyncio.wait_for(self.changed.wait(), within)
         finally:
             self.listening -= 1
         self.changed.clear()
-        return self.version, await self.status(where)
+        return self.version, await self.status(admin)
 
-    async def containers(self, where: HostPort, token: str, body: Any) -> dict[str, Any]:
+    async def containers(self, admin: HostPort, token: str, body: Any) -> dict[str, Any]:
         self.told.append(body)
         if not self.hears:
             raise ProxyError("its master is away", status=503)
         return {}
 
-    async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+    async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         self.policies.append((token, *layers))
         if self.refuses:
             raise self.refuses
 
     async def selected(
         self,
-        where: HostPort,
+        admin: HostPort,
         token: str,
         addresses: Collection[str],
         peers: Collection[str] | None = None,
@@ -110,15 +110,15 @@ async def talk(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Talk]:
     monkeypatch.setattr(proxy_sync, "EVERY", 0.01)
     monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.01)
     monkeypatch.setattr(proxy_sync, "EVERY_FORMER", 0.01)
-    one = Talk()
-    yield one
-    await one.tasks.cancel()
+    conversation = Talk()
+    yield conversation
+    await conversation.tasks.cancel()
 
 
 def proxy(ip: str = "10.244.1.7") -> ProxyPod:
-    found = proxy_pod(proxy_obj(status={"phase": "Running", "podIP": ip}))
-    assert found is not None
-    return found
+    parsed = proxy_pod(proxy_obj(status={"phase": "Running", "podIP": ip}))
+    assert parsed is not None
+    return parsed
 
 
 UID = proxy().pod.uid
@@ -204,8 +204,8 @@ async def test_another_address_is_another_poller(talk: Talk) -> None:
 
 
 async def test_no_address_no_poller(talk: Talk) -> None:
-    one = proxy()
-    ended = replace(one, pod=replace(one.pod, phase="Failed"))
+    running = proxy()
+    ended = replace(running, pod=replace(running.pod, phase="Failed"))
     talk.all.follow([proxy(""), ended])
     await asyncio.sleep(0.05)
     assert talk.proxies.asked == 0
@@ -318,9 +318,9 @@ async def test_another_key_is_another_token(talk: Talk) -> None:
 def test_a_former_operators_token_is_in_the_pod() -> None:
     obj = proxy_obj()
     obj["spec"]["containers"][0]["env"] = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}]
-    found = proxy_pod(obj)
-    assert found is not None
-    assert token_for(found, KEY) == "secret"
+    parsed = proxy_pod(obj)
+    assert parsed is not None
+    assert token_for(parsed, KEY) == "secret"
 
 
 async def listening(talk: Talk) -> None:
@@ -373,12 +373,12 @@ async def test_what_stays_there_is_not_told_over_and_over(
     assert talk.changes == 1
 
 
-@pytest.mark.parametrize("what", ["policy", "callers"])
-async def test_what_is_not_confirmed_is_told_again(talk: Talk, what: str) -> None:
+@pytest.mark.parametrize("subject", ["policy", "callers"])
+async def test_what_is_not_confirmed_is_told_again(talk: Talk, subject: str) -> None:
     talk.proxies.former, talk.proxies.says = False, UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
-    if what == "policy":
+    if subject == "policy":
         talk.proxies.refuses = PolicyRefused("knows no policies")
         talk.all.report_policies({UID: (LAYER,)})
         await until(lambda: talk.all.reports[UID].refusal == "knows no policies")
@@ -439,7 +439,7 @@ async def test_proxies_whose_masters_hang_keep_nobody_waiting(
     ]
     talk.all.follow([well, *sick], KEY)
     await until(lambda: talk.proxies.listening == len(sick) + 1)
-    talk.all.report_gone({one.pod.uid: ["10.0.0.1"] for one in sick})
+    talk.all.report_gone({p.pod.uid: ["10.0.0.1"] for p in sick})
     await until(lambda: hung == len(sick))
     talk.all.report_callers({well.pod.uid: ("10.244.1.5",)}, {}, {})
     await until(lambda: bool(talk.proxies.callers))

@@ -47,7 +47,7 @@ class Seen:
             kinds, api.namespaces_of(PLURAL), self.wake, self.come_back, self.correct
         )
         soon = asyncio.get_running_loop().call_soon_threadsafe
-        self.all = [Reflector(api, what, self.store, soon, self.lose) for what in kinds]
+        self.all = [Reflector(api, collection, self.store, soon, self.lose) for collection in kinds]
 
     def wake(self) -> None:
         self.woken += 1
@@ -73,17 +73,17 @@ class Seen:
 async def seen(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Seen]:
     monkeypatch.setattr(reflector, "PAUSES", (0.02,))
     monkeypatch.setattr(api_module, "PAGE", 2)
-    one = Seen(api)
-    yield one
-    for each in one.all:
-        each.stop()
-    await asyncio.gather(*(asyncio.to_thread(each.join) for each in one.all))
-    assert not [each for each in one.all if each._thread.is_alive()]
+    reflected_store = Seen(api)
+    yield reflected_store
+    for collection_reflector in reflected_store.all:
+        collection_reflector.stop()
+    await asyncio.gather(*(asyncio.to_thread(r.join) for r in reflected_store.all))
+    assert not [r for r in reflected_store.all if r._thread.is_alive()]
 
 
 def start(seen: Seen) -> None:
-    for each in seen.all:
-        each.start()
+    for collection_reflector in seen.all:
+        collection_reflector.start()
 
 
 async def begun(server: ApiServer, seen: Seen) -> ClusterSnapshot:
@@ -127,13 +127,13 @@ def put_all(server: ApiServer) -> None:
 
 async def test_what_matters_is_seen(server: ApiServer, seen: Seen) -> None:
     put_all(server)
-    found = await begun(server, seen)
-    assert [each.id.name for each in found.rosproxies] == ["arm"]
-    assert set(found.nodes) == {"node1", "node2", "node3"}
-    names = {pod.id.name for pod in found.pods if not pod.id.name.startswith("rosproxy-")}
+    snapshot = await begun(server, seen)
+    assert [rosproxy.id.name for rosproxy in snapshot.rosproxies] == ["arm"]
+    assert set(snapshot.nodes) == {"node1", "node2", "node3"}
+    names = {pod.id.name for pod in snapshot.pods if not pod.id.name.startswith("rosproxy-")}
     assert names == {"talker", "stranger", "holder"}
-    assert [proxy.node for proxy in found.proxies] == ["node2"]
-    assert found.selected == {"uid-talker"}
+    assert [proxy.node for proxy in snapshot.proxies] == ["node2"]
+    assert snapshot.selected == {"uid-talker"}
     pages = [query for query in server.asked("GET", "pods") if "limit" in query]
     assert len(pages) == 3  # of two pods each
 
@@ -219,8 +219,8 @@ async def test_what_is_doubted_is_listed_anew(
     await begun(server, seen)
     server.forget("pods", "talker", NAMESPACE)
     monkeypatch.setattr(reflector, "DOUBTED", 0.0)
-    for each in seen.all:
-        each.relist()
+    for collection_reflector in seen.all:
+        collection_reflector.relist()
     await until(lambda: "talker" not in seen.pods())
 
 
@@ -277,15 +277,15 @@ async def test_whom_it_concerns(server: ApiServer, seen: Seen) -> None:
     await begun(server, seen)
 
     async def touches(namespaces: set[str], nodes: set[str]) -> None:
-        found = StoreChanges()
+        changes = StoreChanges()
 
-        def all_there() -> bool:
+        def all_taken() -> bool:
             new = seen.store.take_changes()
-            found.namespaces.update(new.namespaces)
-            found.nodes.update(new.nodes)
-            return found == StoreChanges(namespaces, nodes)
+            changes.namespaces.update(new.namespaces)
+            changes.nodes.update(new.nodes)
+            return changes == StoreChanges(namespaces, nodes)
 
-        await until(all_there)
+        await until(all_taken)
 
     seen.store.take_changes()
     server.put("pods", {**pod_obj("talker", {})}, NAMESPACE)  # it has lost its label
@@ -322,9 +322,9 @@ async def test_one_bad_rosproxy_does_not_stop_the_others(server: ApiServer, seen
     put_all(server)
     server.put("rosproxies", rosproxy_obj({"master": {}}, "bad"), NAMESPACE)
     server.put("rosproxies", {"metadata": {"name": "worse"}, "spec": 3}, NAMESPACE)
-    found = await begun(server, seen)
-    assert [each.id.name for each in found.rosproxies] == ["arm"]
-    assert {id.name for id in found.unusable} == {"bad", "worse"}
+    snapshot = await begun(server, seen)
+    assert [rosproxy.id.name for rosproxy in snapshot.rosproxies] == ["arm"]
+    assert {id.name for id in snapshot.unusable} == {"bad", "worse"}
 
 
 async def test_a_missing_crd_is_told(server: ApiServer, seen: Seen) -> None:
@@ -353,12 +353,12 @@ async def test_what_only_an_event_tells(
             "lastTimestamp": stamp,
         }
         server.put("events", event, NAMESPACE)
-    found, failures = await begun(server, seen), SandboxFailures(api)
-    assert await failures.read(found) == {NAMESPACE}
-    (proxy,) = failures.with_messages(found).proxies
+    snapshot, failures = await begun(server, seen), SandboxFailures(api)
+    assert await failures.read(snapshot) == {NAMESPACE}
+    (proxy,) = failures.with_messages(snapshot).proxies
     assert proxy.stuck is PodFailure.PORTS
     assert proxy.message == SANDBOX.format("…")
-    assert await failures.read(found) == set()
+    assert await failures.read(snapshot) == set()
     assert len(server.asked("GET", "events")) == 1  # it is not asked for again at once
 
 
@@ -384,8 +384,8 @@ async def test_who_may_name_a_service(server: ApiServer, seen: Seen) -> None:
     server.put("rosproxies", rosproxy_obj({"master": SERVICE}), NAMESPACE)
     notes = {"rosproxy.io/allow-from": f"{NAMESPACE}, arms ,No Name,"}
     server.put("services", {"metadata": {"name": "roscore", "annotations": notes}}, "ros")
-    found = await begun(server, seen)
-    assert found.consents == {Name("ros", "roscore"): {NAMESPACE, "arms"}}
+    snapshot = await begun(server, seen)
+    assert snapshot.consents == {Name("ros", "roscore"): {NAMESPACE, "arms"}}
 
 
 async def test_a_role_without_the_right_to_policies_stops_nothing(
@@ -398,9 +398,9 @@ async def test_a_role_without_the_right_to_policies_stops_nothing(
     )
     server.refuse("GET", "networkpolicies", 403, refusal)
     start(seen)
-    found = await seen.read()
-    assert 'resources ["networkpolicies"], verbs ["list"]' in found.policies_error
-    assert [each.id.name for each in found.rosproxies] == ["arm"]
+    snapshot = await seen.read()
+    assert 'resources ["networkpolicies"], verbs ["list"]' in snapshot.policies_error
+    assert [rosproxy.id.name for rosproxy in snapshot.rosproxies] == ["arm"]
 
 
 @pytest.mark.parametrize(

@@ -38,16 +38,16 @@ def cluster(*pods: Pod, remakes: bool = True) -> ClusterSnapshot:
     return observed(of, service(), node(), proxy(), *pods)
 
 
-def evicted(found: ClusterPlan) -> list[str]:
-    return [one.id.name for one in found.actions if isinstance(one, EvictPod)]
+def evicted(plan: ClusterPlan) -> list[str]:
+    return [action.id.name for action in plan.actions if isinstance(action, EvictPod)]
 
 
 def test_one_that_was_not_wired_is_evicted() -> None:
-    found = look(cluster(of_set()))
-    (action,) = [one for one in found.actions if isinstance(one, EvictPod)]
+    plan = look(cluster(of_set()))
+    (action,) = [a for a in plan.actions if isinstance(a, EvictPod)]
     assert (action.of, action.uid) == (ROBOT, of_set().uid)
-    (event,) = [one for one in found.actions if isinstance(one, Emit)
-                and one.reason == "PodEvicted"]  # fmt: skip
+    (event,) = [a for a in plan.actions if isinstance(a, Emit)
+                and a.reason == "PodEvicted"]  # fmt: skip
     assert event.type == "Normal"
     assert event.message.startswith("evicted pod a: it is not wired to its proxy")
 
@@ -90,26 +90,26 @@ def test_nobody_is_evicted_while_there_is_no_service() -> None:
 
 def test_one_goes_at_a_time() -> None:
     a, b = of_set("a"), of_set("b")
-    found = look(cluster(b, a), now=100.0)
-    assert evicted(found) == ["a"]
-    going = look(cluster(replace(a, deleting=True), b), found.state, 110.0)
+    plan = look(cluster(b, a), now=100.0)
+    assert evicted(plan) == ["a"]
+    going = look(cluster(replace(a, deleting=True), b), plan.state, 110.0)
     assert evicted(going) == []
     coming = look(
         cluster(of_set("c", wired_master_uri=WIRED, phase="Pending"), b), going.state, 120.0
     )
     assert evicted(coming) == []
-    there = look(cluster(of_set("c", wired_master_uri=WIRED), b), coming.state, 130.0)
-    assert evicted(there) == ["b"]
+    arrived = look(cluster(of_set("c", wired_master_uri=WIRED), b), coming.state, 130.0)
+    assert evicted(arrived) == ["b"]
 
 
 def test_a_webhook_that_does_not_work_costs_a_pod_a_minute() -> None:
     """And also where nothing is left between one pod and the next."""
     state, gone = ClusterState(), list[float]()
     for second in range(3600):
-        there = cluster(of_set(f"pod-{second}")) if second % 2 else cluster()
-        found = look(there, state, 100.0 + second)
-        state = found.state
-        if evicted(found):
+        snapshot = cluster(of_set(f"pod-{second}")) if second % 2 else cluster()
+        plan = look(snapshot, state, 100.0 + second)
+        state = plan.state
+        if evicted(plan):
             gone.append(100.0 + second)
     assert len(gone) < 75
     pauses = [after - before for before, after in pairwise(gone)]

@@ -31,18 +31,18 @@ def refusing(name: Name = PROXY, text: str = "violates PodSecurity baseline") ->
 
 def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
     seen = replace(scene(), failures=refusing())
-    found, now, pauses = look(replace(seen, failures={})), 100.0, []
-    assert kinds(found) == [CreateProxy]
+    plan, now, pauses = look(replace(seen, failures={})), 100.0, []
+    assert kinds(plan) == [CreateProxy]
     for _ in range(8):
-        seen = written(seen, look(seen, found.state, now))
-        found = look(seen, found.state, now)
-        assert done(found) == []
-        assert "kubectl label namespace ros" in told(found, "ProxyNotAdmitted")[0]
-        assert found.next_look_in is not None
-        pauses.append(found.next_look_in)
-        now += found.next_look_in
-        found = look(seen, found.state, now)
-        assert kinds(found) == [CreateProxy]
+        seen = written(seen, look(seen, plan.state, now))
+        plan = look(seen, plan.state, now)
+        assert done(plan) == []
+        assert "kubectl label namespace ros" in told(plan, "ProxyNotAdmitted")[0]
+        assert plan.next_look_in is not None
+        pauses.append(plan.next_look_in)
+        now += plan.next_look_in
+        plan = look(seen, plan.state, now)
+        assert kinds(plan) == [CreateProxy]
     assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
 
 
@@ -50,9 +50,9 @@ def test_a_refusal_stays_told_until_the_object_is_there() -> None:
     seen = scene()
     memory = look(seen).state
     memory = look(replace(seen, failures=refusing()), memory, 100.5).state
-    found = look(seen, memory, 101.0)
-    assert told(found, "ProxyNotAdmitted")
-    assert not told(look(complete(), found.state, 102.0), "ProxyNotAdmitted")
+    plan = look(seen, memory, 101.0)
+    assert told(plan, "ProxyNotAdmitted")
+    assert not told(look(complete(), plan.state, 102.0), "ProxyNotAdmitted")
 
 
 def test_what_was_created_and_is_not_listed_yet_is_not_created_again_at_once() -> None:
@@ -76,31 +76,31 @@ def test_a_proxy_that_ends_is_made_anew_and_not_in_a_tight_loop() -> None:
     evicted = scene(proxy(phase="Failed"))
     memory, now, created = ClusterState(), 100.0, 0
     for _ in range(100):
-        found = look(without, memory, now)
-        if any(isinstance(one, CreateProxy) for one in done(found)):
+        plan = look(without, memory, now)
+        if any(isinstance(action, CreateProxy) for action in done(plan)):
             created += 1
-            found = look(evicted, found.state, now)
-        memory, now = found.state, now + 1.0
+            plan = look(evicted, plan.state, now)
+        memory, now = plan.state, now + 1.0
     assert 5 <= created <= 12
 
 
 def test_a_proxy_that_was_well_is_made_anew_at_once_when_it_is_gone() -> None:
     without, memory = scene(), ClusterState()
     for now in range(100, 200, 10):
-        found = look(without, memory, now)
-        assert kinds(found) == [CreateProxy]
-        memory = look(complete(), found.state, now + 1).state
+        plan = look(without, memory, now)
+        assert kinds(plan) == [CreateProxy]
+        memory = look(complete(), plan.state, now + 1).state
 
 
 def test_a_status_is_not_written_over_and_over_again_if_that_does_not_help() -> None:
     first = look(complete())
     second = look(complete(), first.state, 101.0)
-    assert not [one for one in second.actions if isinstance(one, PatchStatus)]
+    assert not [action for action in second.actions if isinstance(action, PatchStatus)]
     third = look(complete(), second.state, 104.0)
-    assert [type(one) for one in third.actions] == [PatchStatus]
+    assert [type(action) for action in third.actions] == [PatchStatus]
 
 
 def test_another_status_is_written_at_once() -> None:
     first = look(complete())
     second = look(complete(nodes={"one": node(ready=False)}), first.state, 100.1)
-    assert [one for one in second.actions if isinstance(one, PatchStatus)]
+    assert [action for action in second.actions if isinstance(action, PatchStatus)]

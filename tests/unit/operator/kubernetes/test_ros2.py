@@ -65,16 +65,18 @@ def of2(ros2: Ros2Spec | None = None, **changes: Any) -> RosProxy:
 
 
 def pod(*containers: PodContainer, **changes: Any) -> Pod:
-    words: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "wired_master_uri": "",
         "static_peers": ADDRESS,
         "containers": containers,
     }
-    return some.pod(**words | changes)
+    return some.pod(**defaults | changes)
 
 
 def env_of(body: Json) -> dict[str, str]:
-    return {one["name"]: one["value"] for one in body["spec"]["containers"][0]["env"]}
+    return {
+        variable["name"]: variable["value"] for variable in body["spec"]["containers"][0]["env"]
+    }
 
 
 def specified(**spec: Any) -> Any:
@@ -83,17 +85,17 @@ def specified(**spec: Any) -> Any:
 
 
 def test_what_is_read():
-    found = specified(ros=2, domain=7, peers=["Robot", "192.0.2.9:11400"], multicast=True)
+    spec = specified(ros=2, domain=7, peers=["Robot", "192.0.2.9:11400"], multicast=True)
 
-    assert (found.ros1, found.master) == (False, MasterSpec())
-    assert found.ros2 == Ros2Spec(7, ("192.0.2.9:11400", "robot"), True)
+    assert (spec.ros1, spec.master) == (False, MasterSpec())
+    assert spec.ros2 == Ros2Spec(7, ("192.0.2.9:11400", "robot"), True)
     both = specified(ros="1, 2", **GOOD)
     assert (both.ros1, both.ros2) == (True, Ros2Spec())
     assert specified(**GOOD).ros2 is None
 
 
 @pytest.mark.parametrize(
-    ("spec", "words"),
+    ("spec", "text"),
     [
         ({"ros": 3}, "spec.ros: 3 is unknown"),
         ({"ros": True}, "spec.ros: True is unknown"),
@@ -108,10 +110,10 @@ def test_what_is_read():
         ({"ros": "1,2"}, "give either uri"),
     ],
 )
-def test_what_is_refused(spec: Any, words: str):
+def test_what_is_refused(spec: Any, text: str):
     with pytest.raises(InvalidField) as refused:
         specified(**spec)
-    assert words in str(refused.value)
+    assert text in str(refused.value)
 
 
 def test_a_proxy_understands_its_variables_and_takes_ports_of_udp():
@@ -127,53 +129,60 @@ def test_a_proxy_understands_its_variables_and_takes_ports_of_udp():
     assert settings.ros2_ear == HostPort("192.0.2.1", 11407)
     assert settings.ports.listen == PortRange(11400, 11406)
     taken = body["spec"]["containers"][0]["ports"]
-    assert {one["protocol"] for one in taken} == {"UDP"}
-    assert [one["hostPort"] for one in taken] == list(range(11400, 11407))
+    assert {port["protocol"] for port in taken} == {"UDP"}
+    assert [port["hostPort"] for port in taken] == list(range(11400, 11407))
 
 
 def test_one_for_both_versions_has_both_kinds_of_ports():
-    found = proxy(some.rosproxy(ros2=Ros2Spec()))
-    assert found.pod.host_ports == found.pod.udp_ports == set(RANGE.ports())
+    proxy_pod = proxy(some.rosproxy(ros2=Ros2Spec()))
+    assert proxy_pod.pod.host_ports == proxy_pod.pod.udp_ports == set(RANGE.ports())
 
 
 def test_peers_come_and_go_without_a_proxy_being_made_anew():
     place = site(of2(), node())
-    other = replace(place, peers=("192.0.2.2:11400",))
-    one, two = (manifests.proxy_pod(each, SETTINGS) for each in (place, other))
-    assert manifests.fingerprint_of(one) == manifests.fingerprint_of(two)
-    assert one != two
+    place_with_peer = replace(place, peers=("192.0.2.2:11400",))
+    body, body_with_peer = (
+        manifests.proxy_pod(proxy_site, SETTINGS) for proxy_site in (place, place_with_peer)
+    )
+    assert manifests.fingerprint_of(body) == manifests.fingerprint_of(body_with_peer)
+    assert body != body_with_peer
 
 
 def test_the_service_leads_to_the_well_known_port():
     (port,) = manifests.service(of2(Ros2Spec(2)))["spec"]["ports"]
     assert (port["port"], port["protocol"]) == (7410 + 500, "UDP")
     both = manifests.service(some.rosproxy(ros2=Ros2Spec()))["spec"]["ports"]
-    assert [one["protocol"] for one in both] == ["TCP", "UDP"]
+    assert [service_port["protocol"] for service_port in both] == ["TCP", "UDP"]
 
 
 def test_proxies_of_several_nodes_are_each_others_peers():
     of, far = of2(Ros2Spec(peers=("robot",))), node("two", addresses={"InternalIP": "192.0.2.2"})
-    there = (pod(), pod(name="b", on="two"), proxy(of), proxy(of, far, PortRange(11410, 11413)))
+    pods_and_proxies = (
+        pod(),
+        pod(name="b", on="two"),
+        proxy(of),
+        proxy(of, far, PortRange(11410, 11413)),
+    )
 
-    found = look(observed(of, service(of), node(), far, *there))
+    plan = look(observed(of, service(of), node(), far, *pods_and_proxies))
 
-    here = ("192.0.2.1:11400", "robot"), ("192.0.2.2:11410", "robot")
-    assert set(found.peers.values()) == set(here)
+    expected_peers = ("192.0.2.1:11400", "robot"), ("192.0.2.2:11410", "robot")
+    assert set(plan.peers.values()) == set(expected_peers)
 
 
 def test_ports_of_udp_are_kept_clear_of_others():
     of = of2()
     tcp, udp = pod(name="tcp", ports=()), pod(name="udp", labels={}, udp_ports=frozenset({11402}))
     tcp = replace(tcp, labels={}, host_ports=frozenset({11400}))
-    found = creation(look(observed(of, service(of), pod(), tcp, udp)))
-    assert some.ports_of(found) == "11403-11406"
+    action = creation(look(observed(of, service(of), pod(), tcp, udp)))
+    assert some.ports_of(action) == "11403-11406"
 
 
 def test_the_well_known_ports_are_none_of_a_range():
     window = PortRange(7409, 7420)
     of = of2(window=window)
-    found = creation(look(observed(of, service(of), pod())))
-    assert some.ports_of(found) == "7411-7414"
+    action = creation(look(observed(of, service(of), pod())))
+    assert some.ports_of(action) == "7411-7414"
 
 
 def hearing(**changes: Any) -> tuple[RosProxy, Any]:
@@ -185,15 +194,15 @@ def ear(of: RosProxy, address: str = "10.244.1.200", **changes: Any) -> EarPod:
     place = site(of, node(), PortRange(11400, 11404))
     assert place.ear is not None
     body = ear_pod(place, place.ear, address, SETTINGS)
-    found = objects.ear_pod({**body, "status": {"phase": "Running"}})
-    assert found is not None
-    own = replace(found.pod, uid="uid-ear", node="one")
-    return replace(found, **{"pod": own, "ready": True, **changes})
+    parsed = objects.ear_pod({**body, "status": {"phase": "Running"}})
+    assert parsed is not None
+    own = replace(parsed.pod, uid="uid-ear", node="one")
+    return replace(parsed, **{"pod": own, "ready": True, **changes})
 
 
 def test_an_ear_is_made_once_its_proxy_has_an_address():
-    of, there = hearing()
-    seen = observed(of, service(of), pod(), there)
+    of, proxy_pod = hearing()
+    seen = observed(of, service(of), pod(), proxy_pod)
 
     (action,) = done(look(seen))
 
@@ -205,18 +214,18 @@ def test_an_ear_is_made_once_its_proxy_has_an_address():
     assert body["spec"]["containers"][0]["securityContext"]["capabilities"] == {"drop": ["ALL"]}
     assert not names.own_labels("robot").items() <= body["metadata"]["labels"].items()
     assert done(look(replace(seen, ears=(ear(of),)))) == []
-    starting = replace(there, pod=replace(there.pod, ip=""), ready=False)
+    starting = replace(proxy_pod, pod=replace(proxy_pod.pod, ip=""), ready=False)
     assert done(look(observed(of, service(of), pod(), starting))) == []
 
 
 @pytest.mark.parametrize("why", ["address", "not asked for"])
 def test_an_ear_that_is_not_right_goes(why: str):
-    of, there = hearing()
-    found = ear(of, "10.244.1.9" if why == "address" else "10.244.1.200")
+    of, proxy_pod = hearing()
+    wrong_ear = ear(of, "10.244.1.9" if why == "address" else "10.244.1.200")
     if why == "not asked for":
         of = of2(ports=5)
-        there = proxy(of, ports=PortRange(11400, 11404))
-    (action,) = done(look(observed(of, service(of), pod(), there, ears=(found,))))
+        proxy_pod = proxy(of, ports=PortRange(11400, 11404))
+    (action,) = done(look(observed(of, service(of), pod(), proxy_pod, ears=(wrong_ear,))))
     assert isinstance(action, DeleteEar)
 
 
@@ -228,18 +237,18 @@ def test_an_ear_stays_while_its_proxy_is_made_anew():
 
 def test_an_ear_stays_until_its_proxy_has_left_its_ports():
     """It carries to the LAN that the proxy's participants have ended."""
-    _, there = hearing()
+    _, proxy_pod = hearing()
     moved = of2(HEARING, ports=5, window=PortRange(13000, 13099))
-    (action,) = done(look(observed(moved, service(moved), pod(), there, ears=(ear(moved),))))
+    (action,) = done(look(observed(moved, service(moved), pod(), proxy_pod, ears=(ear(moved),))))
     assert isinstance(action, DeleteProxy)
     assert action.retire
 
 
 def test_an_ear_that_does_not_run_is_told():
-    of, there = hearing()
+    of, proxy_pod = hearing()
     deaf = pod_failure({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
-    found = ear(of, stuck=deaf[0], message=deaf[1])
-    plan = look(observed(of, service(of), pod(), there, ears=(found,)))
+    stuck_ear = ear(of, stuck=deaf[0], message=deaf[1])
+    plan = look(observed(of, service(of), pod(), proxy_pod, ears=(stuck_ear,)))
     assert "so that the LAN is not heard" in told(plan, "EarStuck")[0]
 
 
@@ -266,27 +275,27 @@ def test_what_the_webhook_sets():
     to = target_of(of2(Ros2Spec(5)), ADDRESS)
     assert to == Target("", ADDRESS, 5)
 
-    found = wire(admitted(), to)
+    wiring = wire(admitted(), to)
 
-    assert found.spec is not None
+    assert wiring.spec is not None
     peers = {"name": "ROS_STATIC_PEERS", "value": ADDRESS}
     domain = {"name": "ROS_DOMAIN_ID", "value": "5"}
-    assert found.spec["containers"][0]["env"] == [domain, peers][::-1]
-    assert found.annotations == {names.STATIC_PEERS: ADDRESS}
+    assert wiring.spec["containers"][0]["env"] == [domain, peers][::-1]
+    assert wiring.annotations == {names.STATIC_PEERS: ADDRESS}
     own = ({"name": "ROS_STATIC_PEERS", "value": "a"}, {"name": "ROS_DOMAIN_ID", "value": "4"})
     assert wire(admitted(*own), to).spec is None
     both = wire(admitted(), target_of(some.rosproxy(ros2=Ros2Spec()), ADDRESS))
     assert both.spec is not None
-    set_ = [one["name"] for one in both.spec["containers"][0]["env"]]
+    set_ = [variable["name"] for variable in both.spec["containers"][0]["env"]]
     assert set_ == ["ROS_MASTER_URI", "ROS_STATIC_PEERS", "ROS_IP"]
 
 
 def test_a_copy_of_a_wired_pod_is_wired_anew():
     old = admitted({"name": "ROS_STATIC_PEERS", "value": "10.96.9.9"})
     old["metadata"]["annotations"] = {names.STATIC_PEERS: "10.96.9.9"}
-    found = wire(old, Target(static_peers=ADDRESS))
-    assert found.spec is not None
-    assert found.spec["containers"][0]["env"][0]["value"] == ADDRESS
+    wiring = wire(old, Target(static_peers=ADDRESS))
+    assert wiring.spec is not None
+    assert wiring.spec["containers"][0]["env"][0]["value"] == ADDRESS
 
 
 @pytest.mark.parametrize(
@@ -302,10 +311,10 @@ def test_a_copy_of_a_wired_pod_is_wired_anew():
     ],
 )
 def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
-    (found,) = ros2_findings(pod(container), of2(), ADDRESS)
-    assert (found.reason, found.fatal) == (reason, False)
-    assert found.about is not None
-    assert found.about.kind == "Pod"
+    (finding,) = ros2_findings(pod(container), of2(), ADDRESS)
+    assert (finding.reason, finding.fatal) == (reason, False)
+    assert finding.about is not None
+    assert finding.about.kind == "Pod"
     assert list(ros2_findings(pod(container), some.rosproxy(), ADDRESS)) == []
 
 
@@ -324,10 +333,10 @@ def test_what_is_well_is_not_told(container: PodContainer):
 
 
 def test_a_pod_that_no_webhook_has_seen_is_told():
-    (found,) = ros2_findings(pod(static_peers=""), of2(), ADDRESS)
-    assert (found.reason, "create the pod anew" in found.text) == ("NotWired", True)
-    (found,) = ros2_findings(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
-    assert "its proxy is at 10.96.1.1 now" in found.text
+    (finding,) = ros2_findings(pod(static_peers=""), of2(), ADDRESS)
+    assert (finding.reason, "create the pod anew" in finding.text) == ("NotWired", True)
+    (finding,) = ros2_findings(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
+    assert "its proxy is at 10.96.1.1 now" in finding.text
 
 
 @pytest.mark.parametrize(
@@ -341,9 +350,9 @@ def test_a_pod_that_no_webhook_has_seen_is_told():
 )
 def test_what_the_administrator_allows(bounds: Bounds, field: str):
     of = of2(Ros2Spec(peers=("robot",), multicast=True), ports=5)
-    found = bounds_violation(of, {}, ClusterSettings(bounds=bounds))
-    assert found.startswith(field)
-    assert bool(found) == bool(field)
+    violation = bounds_violation(of, {}, ClusterSettings(bounds=bounds))
+    assert violation.startswith(field)
+    assert bool(violation) == bool(field)
 
 
 def test_a_network_policy_lets_udp_in():
@@ -358,49 +367,55 @@ def test_a_network_policy_lets_udp_in():
 
 def test_a_participant_of_a_pod_that_is_gone_is_told_to_the_proxy():
     of = of2()
-    there = proxy(of)
-    seen = observed(of, service(of), pod(ip="10.244.1.5"), there)
-    known = look(seen).state
+    proxy_pod = proxy(of)
+    seen = observed(of, service(of), pod(ip="10.244.1.5"), proxy_pod)
+    state = look(seen).state
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)})
-    gone = observed(of, service(of), there, reports={there.pod.uid: report})
-    assert look(gone, known, 101.0).departed_addresses == {there.pod.uid: ("10.244.1.5",)}
+    gone = observed(of, service(of), proxy_pod, reports={proxy_pod.pod.uid: report})
+    assert look(gone, state, 101.0).departed_addresses == {proxy_pod.pod.uid: ("10.244.1.5",)}
 
 
 def test_what_users_are_told():
     of = of2(Ros2Spec(7))
-    there = proxy(of)
+    proxy_pod = proxy(of)
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01", "02")})
-    seen = observed(of, service(of), pod(), there, reports={there.pod.uid: report})
+    seen = observed(of, service(of), pod(), proxy_pod, reports={proxy_pod.pod.uid: report})
 
-    found = status(look(seen), ROBOT)
+    rosproxy_status = status(look(seen), ROBOT)
 
-    assert (found["domain"], found["participants"], found["staticPeers"]) == (7, 2, ADDRESS)
-    assert "master" not in found
-    assert found["perNode"][0]["participants"] == 2
-    kinds = [one["type"] for one in found["conditions"]]
+    assert (
+        rosproxy_status["domain"],
+        rosproxy_status["participants"],
+        rosproxy_status["staticPeers"],
+    ) == (7, 2, ADDRESS)
+    assert "master" not in rosproxy_status
+    assert rosproxy_status["perNode"][0]["participants"] == 2
+    kinds = [condition["type"] for condition in rosproxy_status["conditions"]]
     assert kinds == ["Ready", "PortsAllocated", "Degraded"]
-    assert "2 participants of domain 7" in found["conditions"][0]["message"]
+    assert "2 participants of domain 7" in rosproxy_status["conditions"][0]["message"]
     assert participants(seen) == {7: 2}
-    again = read({**rosproxy_obj(), "status": found})
+    again = read({**rosproxy_obj(), "status": rosproxy_status})
     assert again.cluster_ip == ADDRESS
 
 
 def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
     """Until it has participants itself; one that was started again in its pod is not told."""
     of = of2()
-    there = proxy(of)
+    proxy_pod = proxy(of)
     leases = {"01": (11401, 11402)}
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)}, leases=leases)
-    seen = observed(of, service(of), pod(), there, reports={there.pod.uid: report})
-    known = look(seen).state
-    assert look(seen, known).former_ports == {}
+    seen = observed(of, service(of), pod(), proxy_pod, reports={proxy_pod.pod.uid: report})
+    state = look(seen).state
+    assert look(seen, state).former_ports == {}
 
-    retired = replace(seen, reports={there.pod.uid: replace(report, participants={}, leases={})})
-    known = look(retired, known).state  # it has told outside that they ended, by datagrams
+    retired = replace(
+        seen, reports={proxy_pod.pod.uid: replace(report, participants={}, leases={})}
+    )
+    state = look(retired, state).state  # it has told outside that they ended, by datagrams
 
-    new = replace(there, pod=replace(there.pod, uid="uid-new"))
+    new = replace(proxy_pod, pod=replace(proxy_pod.pod, uid="uid-new"))
     starting = observed(of, service(of), pod(), new, reports={"uid-new": ProxyReport(True, True)})
-    found = look(starting, known)
-    assert found.former_ports == {"uid-new": leases}
+    plan = look(starting, state)
+    assert plan.former_ports == {"uid-new": leases}
     complete = replace(starting, reports={"uid-new": report})
-    assert look(complete, found.state).former_ports == {}
+    assert look(complete, plan.state).former_ports == {}

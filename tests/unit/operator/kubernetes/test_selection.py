@@ -53,9 +53,9 @@ def test_label_selectors(selector, labels, fits):
     ],
 )
 def test_a_pod_is_taken_by_its_label_in_its_namespace(more, taken):
-    one = rosproxy()
+    arm = rosproxy()
 
-    assert select_rosproxy(pod(**more), [one]) is (one if taken else None)
+    assert select_rosproxy(pod(**more), [arm]) is (arm if taken else None)
 
 
 @pytest.mark.parametrize(
@@ -88,22 +88,22 @@ def test_of_two_the_label_decides():
 def test_a_pod_that_two_select_has_none(labels):
     arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
 
-    found = select_rosproxy(pod(labels=labels), [leg, arm])
+    finding = select_rosproxy(pod(labels=labels), [leg, arm])
 
-    assert isinstance(found, ClusterFinding)
-    assert (found.reason, found.of) == ("Ambiguous", arm.id)
-    assert found.subject == "pod robots/talker"
-    assert found.about is not None
-    assert (found.about.kind, found.about.uid) == ("Pod", "uid-talker")
-    assert "arm and leg" in found.text
-    assert f"{INJECT}=arm" in found.text
+    assert isinstance(finding, ClusterFinding)
+    assert (finding.reason, finding.of) == ("Ambiguous", arm.id)
+    assert finding.subject == "pod robots/talker"
+    assert finding.about is not None
+    assert (finding.about.kind, finding.about.uid) == ("Pod", "uid-talker")
+    assert "arm and leg" in finding.text
+    assert f"{INJECT}=arm" in finding.text
 
 
 def test_a_pod_in_its_nodes_own_network_is_left_out():
-    found = select_rosproxy(pod(host_network=True), [rosproxy()])
+    finding = select_rosproxy(pod(host_network=True), [rosproxy()])
 
-    assert isinstance(found, ClusterFinding)
-    assert (found.reason, found.of) == ("HostNetwork", Name("robots", "arm"))
+    assert isinstance(finding, ClusterFinding)
+    assert (finding.reason, finding.of) == ("HostNetwork", Name("robots", "arm"))
 
 
 def test_a_pod_that_is_not_labelled_needs_no_warning():
@@ -112,7 +112,7 @@ def test_a_pod_that_is_not_labelled_needs_no_warning():
 
 
 @pytest.mark.parametrize(
-    ("label", "there", "said"),
+    ("label", "rosproxies", "said"),
     [
         ("true", [], "no RosProxy in namespace robots"),
         ("true", [rosproxy("arm", namespace="other")], "no RosProxy in namespace robots"),
@@ -121,8 +121,8 @@ def test_a_pod_that_is_not_labelled_needs_no_warning():
         ("arm", [rosproxy("arm", Selector({"app": "x"}))], "spec.podSelector of RosProxy arm"),
     ],
 )
-def test_why_no_rosproxy_takes_a_labelled_pod(label, there, said):
-    text = why_not_selected(pod(labels={INJECT: label}), there)
+def test_why_no_rosproxy_takes_a_labelled_pod(label, rosproxies, said):
+    text = why_not_selected(pod(labels={INJECT: label}), rosproxies)
 
     assert said in text
     assert "create" in text
@@ -132,7 +132,7 @@ def test_why_no_rosproxy_takes_a_labelled_pod(label, there, said):
     ("wanted", "fits"), [({}, True), ({"disk": "ssd"}, True), ({"disk": "hdd"}, False)]
 )
 def test_nodes_that_may_have_a_proxy(wanted, fits):
-    one = rosproxy()
-    picky = replace(one, spec=replace(one.spec, node_selector=wanted))
+    arm = rosproxy()
+    picky = replace(arm, spec=replace(arm.spec, node_selector=wanted))
 
     assert on_node(picky, ClusterNode("node1", {"disk": "ssd"})) is fits

@@ -58,7 +58,7 @@ class Woken:
 
 
 class Running:
-    """A watch with its surroundings."""
+    """What a replica serves, the webhook and its liveness, before an API server."""
 
     def __init__(self, server: ApiServer, api: Api) -> None:
         self.server, self.controller, self.metrics = server, Woken(), ClusterMetrics()
@@ -92,8 +92,8 @@ class Running:
         response: dict[str, Any] = await in_thread(post, self.webhook, "/wire", review)
         assert response["response"]["uid"] == "u1"
         assert response["response"]["allowed"] is True
-        found: dict[str, Any] = response["response"]
-        return found
+        answer: dict[str, Any] = response["response"]
+        return answer
 
 
 @pytest.fixture
@@ -103,11 +103,11 @@ async def running(
     monkeypatch.setattr(serving, "BACK_OFF", (0.05,))
     monkeypatch.setattr(serving, "_BETWEEN_TRIES", (0.05,))
     serving.quiet_library_logs()
-    one = Running(server, api)
-    one.serving.start()
-    await until_alive(one)
-    yield one
-    await in_thread(one.serving.stop)
+    started = Running(server, api)
+    started.serving.start()
+    await until_alive(started)
+    yield started
+    await in_thread(started.serving.stop)
     assert "kopf" not in {thread.name for thread in threading.enumerate()}
 
 
@@ -181,13 +181,13 @@ def put_rosproxy(server: ApiServer) -> None:
 async def test_a_pod_is_wired(running: Running) -> None:
     put_rosproxy(running.server)
     pod = pod_obj("talker", INJECT)
-    found = await running.admit(pod)
-    assert "warnings" not in found
-    patch = json.loads(base64.b64decode(found["patch"]))
+    answer = await running.admit(pod)
+    assert "warnings" not in answer
+    patch = json.loads(base64.b64decode(answer["patch"]))
     wired = jsonpatch.apply_patch(pod, patch)
     (service,) = running.server.all("services")
     uri = f"http://{service['spec']['clusterIP']}:11311"
-    env = {one["name"]: one for one in wired["spec"]["containers"][0]["env"]}
+    env = {variable["name"]: variable for variable in wired["spec"]["containers"][0]["env"]}
     assert env["ROS_MASTER_URI"]["value"] == uri
     assert env["ROS_IP"]["valueFrom"]["fieldRef"]["fieldPath"] == "status.podIP"
     assert wired["metadata"]["annotations"]["rosproxy.io/master-uri"] == uri
@@ -209,8 +209,8 @@ async def test_a_pod_whose_service_does_not_come_is_admitted(
 ) -> None:
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.5)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert "has no cluster IP yet: kubectl -n robots describe rosproxy arm" in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert "has no cluster IP yet: kubectl -n robots describe rosproxy arm" in answer["warnings"][0]
     assert running.controller.times > 0
 
 
@@ -223,15 +223,15 @@ async def test_a_service_that_is_about_to_go_is_waited_for(
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     running.server.put("services", service_obj(**change), NAMESPACE)
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert "has no cluster IP yet" in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert "has no cluster IP yet" in answer["warnings"][0]
 
 
 async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> None:
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     running.server.put("services", service_obj(labels={}), NAMESPACE)
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert "is not the operator's: delete or rename it" in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert "is not the operator's: delete or rename it" in answer["warnings"][0]
 
 
 @pytest.mark.parametrize(
@@ -248,8 +248,8 @@ async def test_a_pod_of_a_rosproxy_that_asks_for_too_much_does_not_wait(
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
     server = running.server
     server.put("rosproxies", rosproxy_obj(spec), NAMESPACE)
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert said in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert said in answer["warnings"][0]
     agreed = {"metadata": {"name": "m", "annotations": {"rosproxy.io/allow-from": NAMESPACE}}}
     server.put("services", agreed, "other")
     server.put("rosproxies", rosproxy_obj(spec | {"ports": 64}), NAMESPACE)
@@ -262,8 +262,8 @@ async def test_a_dry_run_waits_for_no_service(
 ) -> None:
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
-    found = await running.admit(pod_obj("talker", INJECT), dryRun=True)
-    assert "has no cluster IP yet" in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT), dryRun=True)
+    assert "has no cluster IP yet" in answer["warnings"][0]
     assert not running.server.all("services")
 
 
@@ -273,9 +273,9 @@ async def test_a_pod_is_admitted_whatever_the_api_server_says(
 ) -> None:
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
     running.server.refuse("GET", "rosproxies", status, "no")
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert found["warnings"][0].startswith("rosproxy: this pod was not wired to a proxy: ")
-    assert "patch" not in found
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert answer["warnings"][0].startswith("rosproxy: this pod was not wired to a proxy: ")
+    assert "patch" not in answer
 
 
 async def test_an_api_server_that_is_just_starting_is_asked_again(running: Running) -> None:
@@ -303,10 +303,10 @@ async def test_a_pod_waits_for_a_service_that_is_just_made(
 
 
 async def test_a_pod_that_nobody_takes_is_told(running: Running) -> None:
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert "no RosProxy in namespace robots" in found["warnings"][0]
-    found = await running.admit(pod_obj("talker", {"rosproxy.io/inject": "false"}))
-    assert "warnings" not in found
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert "no RosProxy in namespace robots" in answer["warnings"][0]
+    answer = await running.admit(pod_obj("talker", {"rosproxy.io/inject": "false"}))
+    assert "warnings" not in answer
 
 
 async def test_a_mistake_of_ours_admits_the_pod(
@@ -316,13 +316,13 @@ async def test_a_mistake_of_ours_admits_the_pod(
         raise RuntimeError("oops")
 
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.objects.pod", broken)
-    found = await running.admit(pod_obj("talker", INJECT))
-    assert "the operator failed: RuntimeError('oops')" in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT))
+    assert "the operator failed: RuntimeError('oops')" in answer["warnings"][0]
 
 
 async def test_what_kopf_cannot_serve_is_admitted_too(running: Running) -> None:
-    found = await running.admit(pod_obj("talker", INJECT), userInfo=None)
-    assert "the operator failed" in found["warnings"][0]
+    answer = await running.admit(pod_obj("talker", INJECT), userInfo=None)
+    assert "the operator failed" in answer["warnings"][0]
 
 
 async def test_nonsense_is_refused(running: Running) -> None:
@@ -335,8 +335,8 @@ async def test_nonsense_is_refused(running: Running) -> None:
 
 async def test_everything_that_would_surprise_is_off() -> None:
     settings, controller = kopf.OperatorSettings(), cast(Any, Woken())
-    one = ClusterServing(KubernetesSettings(), controller, None)
-    await one.configure(settings)
+    cluster_serving = ClusterServing(KubernetesSettings(), controller, None)
+    await cluster_serving.configure(settings)
     assert not settings.posting.enabled
     assert settings.scanning.disabled
     assert settings.peering.standalone

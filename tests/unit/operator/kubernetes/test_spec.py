@@ -16,21 +16,21 @@ from tests.unit.operator.kubernetes.builders_api import NAMESPACE, rosproxy_obj
 
 
 def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
-    found = rosproxy(rosproxy_obj())
+    parsed = rosproxy(rosproxy_obj())
 
-    assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
-    spec = found.spec
+    assert (parsed.id, parsed.uid, parsed.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
+    spec = parsed.spec
     assert spec.master == MasterSpec(uri="http://robot:11311")
     assert (spec.ports, spec.window) == (32, PortRange(11412, 29999))
     assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, {}, ())
     assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
     assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
     assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", RESOURCES)
-    assert (found.former_ranges, found.cluster_ip, found.deleting) == ({}, "", False)
+    assert (parsed.former_ranges, parsed.cluster_ip, parsed.deleting) == ({}, "", False)
 
 
 def test_all_fields():
-    found = rosproxy(
+    spec = rosproxy(
         rosproxy_obj(
             {
                 "master": {"service": {"name": "roscore"}, "publish": 31100},
@@ -59,23 +59,23 @@ def test_all_fields():
         )
     ).spec
 
-    assert found.master == MasterSpec(service=Name(NAMESPACE, "roscore"), publish=31100)
-    assert (found.ports, found.window) == (8, PortRange(12000, 29999))
-    assert found.pod_selector == Selector(
+    assert spec.master == MasterSpec(service=Name(NAMESPACE, "roscore"), publish=31100)
+    assert (spec.ports, spec.window) == (8, PortRange(12000, 29999))
+    assert spec.pod_selector == Selector(
         {"app": "ros"},
         (
             ("example.org/tier", "In", frozenset({"a", ""})),
             ("off", "DoesNotExist", frozenset()),
         ),
     )
-    assert found.node_selector == {"disk": "ssd"}
-    assert found.tolerations == ({"operator": "Exists"},)
-    assert (found.advertise, found.slave_control) == (Advertise.HOSTNAME, "master")
-    assert (found.cleanup_after, found.grace, found.data_plane) == (0.0, 5.0, "kernel")
-    assert (found.image, found.image_pull_policy) == ("rosproxy:2", "Never")
-    assert found.image_pull_secrets == ({"name": "pull"},)
-    assert found.resources == {"requests": {"cpu": 1}}
-    assert found.host_aliases == ({"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]},)
+    assert spec.node_selector == {"disk": "ssd"}
+    assert spec.tolerations == ({"operator": "Exists"},)
+    assert (spec.advertise, spec.slave_control) == (Advertise.HOSTNAME, "master")
+    assert (spec.cleanup_after, spec.grace, spec.data_plane) == (0.0, 5.0, "kernel")
+    assert (spec.image, spec.image_pull_policy) == ("rosproxy:2", "Never")
+    assert spec.image_pull_secrets == ({"name": "pull"},)
+    assert spec.resources == {"requests": {"cpu": 1}}
+    assert spec.host_aliases == ({"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]},)
 
 
 @pytest.mark.parametrize(
@@ -96,8 +96,8 @@ def test_masters(uri, read):
 
 def test_directions():
     def read(**spec):
-        found = rosproxy(rosproxy_obj({"master": {"uri": "http://robot"}, **spec})).spec
-        return found.direction, found.pod_egress, found.udp
+        parsed = rosproxy(rosproxy_obj({"master": {"uri": "http://robot"}, **spec})).spec
+        return parsed.direction, parsed.pod_egress, parsed.udp
 
     assert read() == ("out", "any", False)
     assert read(direction="Both") == ("both", "any", False)
@@ -124,11 +124,13 @@ def test_what_the_status_holds():
         "strange",
     ]
 
-    found = rosproxy(rosproxy_obj(status={"masterURI": "http://10.96.7.7:11311", "perNode": lines}))
+    parsed = rosproxy(
+        rosproxy_obj(status={"masterURI": "http://10.96.7.7:11311", "perNode": lines})
+    )
 
-    assert found.former_ranges == {"node1": PortRange(11400, 11431)}
-    assert found.cluster_ip == "10.96.7.7"
-    assert found.status["perNode"] == lines
+    assert parsed.former_ranges == {"node1": PortRange(11400, 11431)}
+    assert parsed.cluster_ip == "10.96.7.7"
+    assert parsed.status["perNode"] == lines
 
 
 def test_one_that_is_being_deleted():
@@ -139,8 +141,8 @@ def test_one_that_is_being_deleted():
 
 
 def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> dict[str, Any]:
-    one: dict[str, Any] = {"key": key, "operator": operator}
-    return {"podSelector": {"matchExpressions": [{**one, "values": list(values)}]}}
+    requirement: dict[str, Any] = {"key": key, "operator": operator}
+    return {"podSelector": {"matchExpressions": [{**requirement, "values": list(values)}]}}
 
 
 @pytest.mark.parametrize(
@@ -253,11 +255,15 @@ def test_the_longest_name():
 def test_what_is_left_of_one_that_can_not_be_used():
     obj = rosproxy_obj({"ports": 0}, status={"masterURI": "http://10.96.7.7:11311"})
 
-    found = invalid(obj, InvalidField("spec.ports: 0"))
+    unusable = invalid(obj, InvalidField("spec.ports: 0"))
 
-    assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
-    assert found.text == "spec.ports: 0"
-    assert found.status == {"masterURI": "http://10.96.7.7:11311"}
+    assert (unusable.id, unusable.uid, unusable.generation) == (
+        Name(NAMESPACE, "arm"),
+        "uid-arm",
+        3,
+    )
+    assert unusable.text == "spec.ports: 0"
+    assert unusable.status == {"masterURI": "http://10.96.7.7:11311"}
 
 
 _FIELDS = [
@@ -327,7 +333,7 @@ def test_rules_of_a_policy_are_one_layer():
     assert (layer.name, layer.mode.value, layer.addresses) == (
         f"RosProxy {NAMESPACE}/arm", "audit", None,
     )  # fmt: skip
-    assert [str(each) for each in layer.rules] == [
+    assert [str(r) for r in layer.rules] == [
         "deny publish /a by /x",
         "deny publish /a by /y*",
         "deny publish /b by /x",
@@ -342,10 +348,10 @@ def test_without_rules_there_is_no_layer():
     assert policy() == policy(mode="Audit") == rosproxy(rosproxy_obj()).spec.policy == ()
 
 
-@pytest.mark.parametrize("kind", [one.value for one in RuleKind])
+@pytest.mark.parametrize("kind", [rule_kind.value for rule_kind in RuleKind])
 def test_every_kind_of_rule_has_a_word(kind):
-    word = "".join(part.capitalize() for part in kind.split("-"))
-    assert policy(rule(kind=word))[0].rules[0].kind.value == kind
+    camel_case = "".join(segment.capitalize() for segment in kind.split("-"))
+    assert policy(rule(kind=camel_case))[0].rules[0].kind.value == kind
 
 
 @pytest.mark.parametrize(

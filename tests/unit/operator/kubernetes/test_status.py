@@ -38,9 +38,11 @@ from tests.unit.operator.kubernetes.builders_api import (
 
 
 def test_all_is_well():
-    found = status(state("node2", answer=answer("/a", "/b")), state("node1"))
+    rosproxy_status = status(state("node2", answer=answer("/a", "/b")), state("node1"))
 
-    assert {key: value for key, value in found.items() if key not in ("perNode", "conditions")} == {
+    assert {
+        key: value for key, value in rosproxy_status.items() if key not in ("perNode", "conditions")
+    } == {
         "observedGeneration": 3,
         "master": ROBOT,
         "masterURI": URI,
@@ -50,21 +52,21 @@ def test_all_is_well():
         "topics": 1,
         "ports": "11400-11431",
     }
-    assert [(one["type"], one["status"], one["reason"]) for one in found["conditions"]] == [
+    assert [(c["type"], c["status"], c["reason"]) for c in rosproxy_status["conditions"]] == [
         ("Ready", "True", "Serving"),
         ("PortsAllocated", "True", "Allocated"),
         ("MasterReachable", "True", "Reached"),
         ("Degraded", "False", "AsExpected"),
     ]
-    assert message(found) == "2 of 2 proxies serve 3 ROS nodes"
-    assert {one["lastTransitionTime"] for one in found["conditions"]} == {STAMP}
-    assert {one["observedGeneration"] for one in found["conditions"]} == {3}
+    assert message(rosproxy_status) == "2 of 2 proxies serve 3 ROS nodes"
+    assert {c["lastTransitionTime"] for c in rosproxy_status["conditions"]} == {STAMP}
+    assert {c["observedGeneration"] for c in rosproxy_status["conditions"]} == {3}
 
 
 def test_a_node_in_the_status():
-    found = status(state())
+    rosproxy_status = status(state())
 
-    assert found["perNode"] == [
+    assert rosproxy_status["perNode"] == [
         {
             "name": "node1",
             "advertiseHost": "192.0.2.11",
@@ -80,11 +82,11 @@ def test_a_node_in_the_status():
 
 
 def test_a_node_that_only_keeps_its_range():
-    kept = RosProxyOnNode("node9", "", PortRange(12000, 12031))
+    former_node = RosProxyOnNode("node9", "", PortRange(12000, 12031))
 
-    found = status(state(), kept)
+    rosproxy_status = status(state(), former_node)
 
-    assert found["perNode"][1] == {
+    assert rosproxy_status["perNode"][1] == {
         "name": "node9",
         "ports": "12000-12031",
         "ready": False,
@@ -93,24 +95,32 @@ def test_a_node_that_only_keeps_its_range():
         "names": [],
         "topics": 0,
     }
-    assert (found["nodes"], found["proxies"], found["ports"]) == (1, "1/1", "11400-11431")
-    assert judged(found, "Ready") == ("True", "Serving")
+    assert (rosproxy_status["nodes"], rosproxy_status["proxies"], rosproxy_status["ports"]) == (
+        1,
+        "1/1",
+        "11400-11431",
+    )
+    assert judged(rosproxy_status, "Ready") == ("True", "Serving")
 
 
 def test_ports_that_differ_are_told_by_node():
-    other = state("node2", range=PortRange(12000, 12031))
+    node2 = state("node2", range=PortRange(12000, 12031))
 
-    assert status(other, state())["ports"] == "node1: 11400-11431, node2: 12000-12031"
+    assert status(node2, state())["ports"] == "node1: 11400-11431, node2: 12000-12031"
 
 
 def test_no_pod_is_selected():
-    found = status()
+    rosproxy_status = status()
 
-    assert judged(found, "Ready") == ("True", "NoPods")
-    assert message(found) == "no pod is selected: label pods with rosproxy.io/inject=true"
-    assert judged(found, "PortsAllocated") == ("True", "NoPods")
-    assert judged(found, "MasterReachable") == ("Unknown", "NoProxies")
-    assert (found["nodes"], found["proxies"], found["ports"]) == (0, "0/0", "")
+    assert judged(rosproxy_status, "Ready") == ("True", "NoPods")
+    assert message(rosproxy_status) == "no pod is selected: label pods with rosproxy.io/inject=true"
+    assert judged(rosproxy_status, "PortsAllocated") == ("True", "NoPods")
+    assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NoProxies")
+    assert (rosproxy_status["nodes"], rosproxy_status["proxies"], rosproxy_status["ports"]) == (
+        0,
+        "0/0",
+        "",
+    )
 
 
 def test_no_pod_is_selected_by_labels_of_its_own():
@@ -139,7 +149,7 @@ def test_a_controller_that_has_just_started_changes_nothing():
     asked = [state(), state("node2", answer=answer("/b", topics=frozenset({"/other"})))]
     first = status(*asked)
 
-    silent = [replace(one, answer=None) for one in asked]
+    silent = [replace(node_state, answer=None) for node_state in asked]
 
     assert status(*silent, of=rosproxy(status=first), stamp=LATER) == first
 
@@ -148,17 +158,17 @@ def test_what_was_known_of_the_master_holds_on_until_a_proxy_has_told():
     down = state(proxy=proxy(ready=False), answer=ProxyReport(True, False, "refused"))
     first = status(down)
 
-    found = status(replace(down, answer=None), of=rosproxy(status=first), stamp=LATER)
+    rosproxy_status = status(replace(down, answer=None), of=rosproxy(status=first), stamp=LATER)
 
-    assert condition(found, "MasterReachable") == condition(first, "MasterReachable")
+    assert condition(rosproxy_status, "MasterReachable") == condition(first, "MasterReachable")
 
 
 def test_the_address_of_a_service_that_is_gone_is_kept():
     first = status(state())
 
-    found = status(state(), of=rosproxy(status=first), cluster_ip="")
+    rosproxy_status = status(state(), of=rosproxy(status=first), cluster_ip="")
 
-    assert found["masterURI"] == URI
+    assert rosproxy_status["masterURI"] == URI
     assert status(cluster_ip="")["masterURI"] == ""
 
 
@@ -167,18 +177,20 @@ def test_one_that_can_not_be_read_keeps_what_it_has():
     text = "spec.ports: 0 is not valid: write an integer from 1 to 500"
     bad = InvalidRosProxy(rosproxy().id, "uid-arm", 4, text, first)
 
-    found = status_of_invalid(bad, LATER)
+    rosproxy_status = status_of_invalid(bad, LATER)
 
     assert {
-        key: found[key] for key in first if key not in ("conditions", "observedGeneration")
+        key: rosproxy_status[key]
+        for key in first
+        if key not in ("conditions", "observedGeneration")
     } == {key: first[key] for key in first if key not in ("conditions", "observedGeneration")}
-    assert found["observedGeneration"] == 4
-    assert judged(found, "Ready") == ("False", "Invalid")
-    assert message(found) == text
-    assert judged(found, "Degraded") == ("True", "Invalid")
-    assert condition(found, "MasterReachable")["lastTransitionTime"] == STAMP
-    again = status_of_invalid(replace(bad, status=found), "2026-11-21T16:00:00Z")
-    assert again == found
+    assert rosproxy_status["observedGeneration"] == 4
+    assert judged(rosproxy_status, "Ready") == ("False", "Invalid")
+    assert message(rosproxy_status) == text
+    assert judged(rosproxy_status, "Degraded") == ("True", "Invalid")
+    assert condition(rosproxy_status, "MasterReachable")["lastTransitionTime"] == STAMP
+    again = status_of_invalid(replace(bad, status=rosproxy_status), "2026-11-21T16:00:00Z")
+    assert again == rosproxy_status
 
 
 def test_one_that_could_never_be_read():
@@ -198,29 +210,29 @@ def test_a_large_cluster_is_told_in_bounds():
         )
         for i in range(MOST_NODES + 50)
     ]
-    kept = [RosProxyOnNode(f"a{i}", "", PortRange(12000, 12031)) for i in range(10)]
+    former_nodes = [RosProxyOnNode(f"a{i}", "", PortRange(12000, 12031)) for i in range(10)]
 
-    found = status(*states, *kept)
+    rosproxy_status = status(*states, *former_nodes)
 
-    assert len(found["perNode"]) == MOST_NODES
-    assert all(line["pods"] for line in found["perNode"])
-    assert all(line["rosNodes"] == 80 for line in found["perNode"])
-    assert found["nodes"] == MOST_NODES + 50
-    assert all(len(one["message"]) <= LONGEST for one in found["conditions"])
-    assert len(json.dumps(found)) < 700_000
+    assert len(rosproxy_status["perNode"]) == MOST_NODES
+    assert all(line["pods"] for line in rosproxy_status["perNode"])
+    assert all(line["rosNodes"] == 80 for line in rosproxy_status["perNode"])
+    assert rosproxy_status["nodes"] == MOST_NODES + 50
+    assert all(len(c["message"]) <= LONGEST for c in rosproxy_status["conditions"])
+    assert len(json.dumps(rosproxy_status)) < 700_000
 
 
 def test_so_many_names_of_a_node_are_told():
-    found = status(state(answer=answer(*(f"/n{i:03}" for i in range(80)))))
+    rosproxy_status = status(state(answer=answer(*(f"/n{i:03}" for i in range(80)))))
 
-    assert len(found["perNode"][0]["names"]) == MOST_NAMES
-    assert found["perNode"][0]["rosNodes"] == 80
+    assert len(rosproxy_status["perNode"][0]["names"]) == MOST_NAMES
+    assert rosproxy_status["perNode"][0]["rosNodes"] == 80
 
 
 def test_names_are_harmless():
-    found = status(state(answer=answer("/a\x1b[2J")))
+    rosproxy_status = status(state(answer=answer("/a\x1b[2J")))
 
-    assert found["perNode"][0]["names"] == ["/a\\x1b[2J"]
+    assert rosproxy_status["perNode"][0]["names"] == ["/a\\x1b[2J"]
 
 
 _answers = st.none() | st.builds(
@@ -249,25 +261,25 @@ _states = st.lists(
         st.none() | st.builds(Obstacle, st.sampled_from(["Reason", "no reason"]), st.just("wrong")),
     ),
     max_size=3,
-    unique_by=lambda one: one.name,
+    unique_by=lambda node_state: node_state.name,
 ).map(tuple)
 
 
 @given(_states)
 def test_every_status_is_one_that_the_api_server_takes(states):
-    found = status(*states)
+    rosproxy_status = status(*states)
 
-    assert json.loads(json.dumps(found)) == found
-    assert [one["type"] for one in found["conditions"]] == [
+    assert json.loads(json.dumps(rosproxy_status)) == rosproxy_status
+    assert [c["type"] for c in rosproxy_status["conditions"]] == [
         "Ready",
         "PortsAllocated",
         "MasterReachable",
         "Degraded",
     ]
-    for one in found["conditions"]:
-        assert one["status"] in ("True", "False", "Unknown")
-        assert one["reason"].isidentifier()
-        assert one["message"]
+    for status_condition in rosproxy_status["conditions"]:
+        assert status_condition["status"] in ("True", "False", "Unknown")
+        assert status_condition["reason"].isidentifier()
+        assert status_condition["message"]
 
 
 @given(_states, _states)
@@ -279,16 +291,16 @@ def test_a_status_settles_at_once(before, states):
 
 @given(_states)
 def test_ready_means_that_every_node_with_pods_is_served(states):
-    found = status(*states)
+    rosproxy_status = status(*states)
 
     served = [
-        one.proxy is not None
-        and not one.proxy.pod.deleting
-        and one.proxy.ready
-        and one.proxy.stuck is None
-        and (one.answer is None or one.answer.answered)
-        for one in states
-        if one.pods
+        node_state.proxy is not None
+        and not node_state.proxy.pod.deleting
+        and node_state.proxy.ready
+        and node_state.proxy.stuck is None
+        and (node_state.answer is None or node_state.answer.answered)
+        for node_state in states
+        if node_state.pods
     ]
-    assert condition(found, "Ready")["status"] == str(all(served))
-    assert found["proxies"] == f"{sum(served)}/{len(served)}"
+    assert condition(rosproxy_status, "Ready")["status"] == str(all(served))
+    assert rosproxy_status["proxies"] == f"{sum(served)}/{len(served)}"

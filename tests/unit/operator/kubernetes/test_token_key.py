@@ -23,7 +23,7 @@ def put(server: ApiServer, data: dict[str, str] | None = None) -> None:
     server.put("secrets", {**body, **({"data": data} if data else {})})
 
 
-def kept(server: ApiServer) -> bytes:
+def stored_key(server: ApiServer) -> bytes:
     return base64.b64decode(server.get("secrets", "key")["data"]["key"])
 
 
@@ -31,16 +31,16 @@ async def test_it_is_made_once(server: ApiServer, api: Api) -> None:
     put(server)
     key = await read(TokenKey(api, SECRET))
     assert len(key) == LENGTH
-    assert kept(server) == key
+    assert stored_key(server) == key
     assert await read(TokenKey(api, SECRET)) == key
     assert len(server.asked("PATCH", "secrets")) == 1
 
 
-@pytest.mark.parametrize("there", ["", "????", base64.b64encode(b"short").decode()])
-async def test_what_is_no_key_is_replaced(server: ApiServer, api: Api, there: str) -> None:
-    put(server, {"key": there, "other": "eA=="})
+@pytest.mark.parametrize("stored", ["", "????", base64.b64encode(b"short").decode()])
+async def test_what_is_no_key_is_replaced(server: ApiServer, api: Api, stored: str) -> None:
+    put(server, {"key": stored, "other": "eA=="})
     key = await read(TokenKey(api, SECRET))
-    assert kept(server) == key
+    assert stored_key(server) == key
     assert server.get("secrets", "key")["data"]["other"] == "eA=="
 
 
@@ -48,11 +48,11 @@ async def test_a_key_that_was_taken_away_is_replaced_by_another(
     server: ApiServer, api: Api
 ) -> None:
     put(server)
-    one = TokenKey(api, SECRET)
-    first = await read(one)
+    token_key = TokenKey(api, SECRET)
+    first = await read(token_key)
     put(server)
-    assert await read(one) != first
-    assert kept(server) == await read(one)
+    assert await read(token_key) != first
+    assert stored_key(server) == await read(token_key)
 
 
 @pytest.mark.parametrize("status", [403, 404])
@@ -60,23 +60,23 @@ async def test_without_its_secret_it_lasts_as_long_as_the_operator(
     server: ApiServer, api: Api, status: int
 ) -> None:
     put(server)
-    one = TokenKey(api, SECRET)
-    key = await read(one)
-    assert not one.problems
+    token_key = TokenKey(api, SECRET)
+    key = await read(token_key)
+    assert not token_key.problems
     server.refuse("GET", "secrets", status, "no")
-    assert await read(one) == key
-    text = "".join(problem.text for problem in one.problems)
+    assert await read(token_key) == key
+    text = "".join(problem.text for problem in token_key.problems)
     assert text.count("Secret ns/key") == 1
     assert ("create an empty Secret" in text) == (status == 404)
     server.refusals.clear()
-    assert await read(one) == key
-    assert not one.problems
+    assert await read(token_key) == key
+    assert not token_key.problems
 
 
 async def test_without_any_secret_it_is_the_processs_own(api: Api) -> None:
-    one = TokenKey(api, None)
-    key = await read(one)
-    assert await read(one) == key
+    token_key = TokenKey(api, None)
+    key = await read(token_key)
+    assert await read(token_key) == key
     assert await read(TokenKey(api, None)) != key
 
 
@@ -91,16 +91,16 @@ async def test_whoever_was_faster_has_the_right_one(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put(server)
-    one, other = TokenKey(api, SECRET), TokenKey(api, SECRET)
+    slower, faster = TokenKey(api, SECRET), TokenKey(api, SECRET)
     real = api.get
 
     def get(*words: Any) -> dict[str, Any]:
-        found = real(*words)
+        secret = real(*words)
         monkeypatch.setattr(api, "get", real)
-        other.read()
-        return found
+        faster.read()
+        return secret
 
     monkeypatch.setattr(api, "get", get)
     with pytest.raises(ApiUnavailable):
-        await read(one)
-    assert await read(one) == await read(other)
+        await read(slower)
+    assert await read(slower) == await read(faster)

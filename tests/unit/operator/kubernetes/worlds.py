@@ -46,8 +46,8 @@ def spec(number: int = 0) -> Object:
 
 
 def container_of(pod: Object) -> Object:
-    found: Object = pod["spec"]["containers"][0]
-    return found
+    container: Object = pod["spec"]["containers"][0]
+    return container
 
 
 class World:
@@ -61,7 +61,7 @@ class World:
             self.cluster.add_node(name, ip)
         self.cluster.add_rosproxy("robot", spec())
         self.pods = 0
-        self.held: dict[ProxyPlace, PortRange] = {}
+        self.served_ranges: dict[ProxyPlace, PortRange] = {}
         self.may_move: set[ProxyPlace] = set()
 
     @property
@@ -78,17 +78,19 @@ class World:
         for pod in self.own():
             if is_ear(pod):
                 continue
-            found = objects.proxy_pod(pod)
-            assert found is not None
-            yield pod, found
+            proxy = objects.proxy_pod(pod)
+            assert proxy is not None
+            yield pod, proxy
 
     # what the operator does
 
     def observe(self) -> ClusterSnapshot:
         """As the operator sees it."""
-        found = self.cluster.observe(self.controller.old, self.controller.failures)
-        selected = (pod for pod in found.pods if any(selects(of, pod) for of in found.rosproxies))
-        return replace(found, selected=frozenset(pod.uid for pod in selected))
+        snapshot = self.cluster.observe(self.controller.old, self.controller.failures)
+        selected = (
+            pod for pod in snapshot.pods if any(selects(of, pod) for of in snapshot.rosproxies)
+        )
+        return replace(snapshot, selected=frozenset(pod.uid for pod in selected))
 
     def in_status(self, place: ProxyPlace) -> PortRange | None:
         rosproxy = self.cluster.state.rosproxies.get(place.of)
@@ -96,25 +98,25 @@ class World:
 
     def seen(self) -> ClusterPlan:
         """A look, which must not take a pod for gone that runs."""
-        found = self.controller.look()
+        plan = self.controller.look()
         pods = self.cluster.state.pods.values()
         live = {meta(pod)["uid"] for pod in pods if not ended(pod)}
-        here = {ip for uid, ip in self.cluster.addresses.items() if uid in live}
-        assert not here & {ip for some in found.departed_addresses.values() for ip in some}, (
-            "it runs"
-        )
-        return found
+        live_addresses = {ip for uid, ip in self.cluster.addresses.items() if uid in live}
+        assert not live_addresses & {
+            ip for addresses in plan.departed_addresses.values() for ip in addresses
+        }, "it runs"
+        return plan
 
-    def carry_out(self, found: ClusterPlan, most: int | None = None) -> None:
-        for action in found.actions:
+    def carry_out(self, plan: ClusterPlan, most: int | None = None) -> None:
+        for action in plan.actions:
             if isinstance(action, CreateProxy):
                 self.check_new_range(action)
                 assert self.seen_ready(self.place_of(action).node)
             elif isinstance(action, DeleteProxy):
-                on = {one.pod.uid: one.node for _, one in self.proxies()}.get(action.uid, "")
+                on = {proxy.pod.uid: proxy.node for _, proxy in self.proxies()}.get(action.uid, "")
                 gone = action.why == "its RosProxy is gone"
                 assert gone or on not in self.nodes or self.seen_ready(on)
-        self.controller.carry_out(found, most)
+        self.controller.carry_out(plan, most)
 
     def seen_ready(self, node: str) -> bool:
         """Whether a node is ready, as far as the operator sees."""
@@ -131,13 +133,13 @@ class World:
         text = action.body["metadata"]["annotations"][names.PORT_RANGE]
         first, last = map(int, text.split("-"))
         assert self.is_lawful(action.of, PortRange(first, last))
-        before = self.held.get(place)
+        before = self.served_ranges.get(place)
         if before is None and self.in_status(place) is None:
             seen = self.controller.old or self.cluster.state
-            there = [pod for pod in seen.pods.values() if node_of(pod) == place.node]
-            others = (pod for pod in there if not ended(pod) and not is_own(pod))
+            pods_on_node = [pod for pod in seen.pods.values() if node_of(pod) == place.node]
+            other_pods = (pod for pod in pods_on_node if not ended(pod) and not is_own(pod))
             of = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[action.of])
-            taken = {port for pod in others for port in objects.pod(pod).ports_of(of.spec)}
+            taken = {port for pod in other_pods for port in objects.pod(pod).ports_of(of.spec)}
             assert not taken.intersection(range(first, last + 1)), "held by others"
         if before is not None and place not in self.may_move:
             count = self.cluster.state.rosproxies[action.of]["spec"]["ports"]
@@ -157,8 +159,8 @@ class World:
 
     def note_conflicts(self) -> None:
         """Who does not get his ports, or whose ports somebody else has, may move."""
-        for place, ports in self.held.items():
-            others = [
+        for place, ports in self.served_ranges.items():
+            other_pods = [
                 pod
                 for state in (self.cluster.state, self.controller.old)
                 for pod in (state.pods.values() if state else ())
@@ -166,7 +168,7 @@ class World:
                 and name_of(pod) != names.proxy_id(place.of, place.node)
                 and name_of(pod) != names.ear_id(place.of, place.node)
             ]
-            taken = {port for pod in others for port in objects.pod(pod).every_port}
+            taken = {port for pod in other_pods for port in objects.pod(pod).every_port}
             refused = {port for node, port in self.controller.state.taken if node == place.node}
             if any(port in ports for port in taken | refused):
                 self.may_move.add(place)
@@ -177,17 +179,17 @@ class World:
     def check(self) -> None:
         """What holds at any moment."""
         self.note_conflicts()
-        there: list[ProxyPlace] = []
+        live_places: list[ProxyPlace] = []
         for pod, proxy in self.proxies():
             place = ProxyPlace(proxy.of, proxy.node)
             if not ended(pod) and not deleting(pod):
-                there.append(place)
+                live_places.append(place)
             if pod["status"]["phase"] == "Running" and place.of in self.cluster.state.rosproxies:
                 uid = meta(self.cluster.state.rosproxies[place.of])["uid"]
                 if proxy.owner == uid and place.node in self.nodes:
-                    self.held[place] = proxy.range
+                    self.served_ranges[place] = proxy.range
                     self.may_move.discard(place)
-        assert len(there) == len(set(there)), "one proxy for each RosProxy on a node"
+        assert len(live_places) == len(set(live_places)), "one proxy for each RosProxy on a node"
         for node in self.nodes:
             pods = [p for p in self.cluster.state.pods.values() if node_of(p) == node]
             ports = [port for p in pods if not ended(p) for port in sorted(host_ports(p))]
@@ -200,19 +202,19 @@ class World:
         self.check()
         self.cluster.made = 0
         for _ in range(100):
-            found = self.seen()
-            self.carry_out(found)
+            plan = self.seen()
+            self.carry_out(plan)
             self.cluster.step()
             self.check()
-            if not found.actions and found.next_look_in is None:
+            if not plan.actions and plan.next_look_in is None:
                 break
-            self.controller.now += 1.0 if found.next_look_in is None else found.next_look_in
+            self.controller.now += 1.0 if plan.next_look_in is None else plan.next_look_in
         else:
-            raise AssertionError(f"never comes to rest: {found.actions} {found.next_look_in}")
+            raise AssertionError(f"never comes to rest: {plan.actions} {plan.next_look_in}")
         assert self.cluster.made <= 40, "it is done over and over again"
-        self.check_all_is_as_wished(found)
+        self.check_all_is_as_wished(plan)
 
-    def check_all_is_as_wished(self, found: ClusterPlan) -> None:
+    def check_all_is_as_wished(self, plan: ClusterPlan) -> None:
         state = self.cluster.state
         rosproxies = [parse_rosproxy.rosproxy(copy.deepcopy(r)) for r in state.rosproxies.values()]
         wanted = set()
@@ -228,65 +230,66 @@ class World:
             ):
                 wanted.add(ProxyPlace(of.id, pod.node))
         unready = {node for node in self.nodes if not self.cluster.is_ready(node)}
-        self.check_proxies(found, {place for place in wanted if place.node not in unready}, unready)
-        services = [one for one in state.services.values() if is_own(one)]
-        owners = sorted(one["metadata"]["ownerReferences"][0]["uid"] for one in services)
-        assert owners == sorted(one.uid for one in rosproxies)
+        self.check_proxies(plan, {place for place in wanted if place.node not in unready}, unready)
+        services = [service for service in state.services.values() if is_own(service)]
+        owners = sorted(service["metadata"]["ownerReferences"][0]["uid"] for service in services)
+        assert owners == sorted(rosproxy.uid for rosproxy in rosproxies)
         policies = state.policies.values()
-        assert sorted(one["metadata"]["ownerReferences"][0]["uid"] for one in policies) == owners
-        for one in rosproxies:
-            there = objects.policy(state.policies[names.policy_id(one.id)])
-            assert there is not None
-            assert there.spec == policy(one, SETTINGS)["spec"]
+        assert sorted(p["metadata"]["ownerReferences"][0]["uid"] for p in policies) == owners
+        for rosproxy in rosproxies:
+            stored_policy = objects.policy(state.policies[names.policy_id(rosproxy.id)])
+            assert stored_policy is not None
+            assert stored_policy.spec == policy(rosproxy, SETTINGS)["spec"]
         self.check_addresses(unready)
-        self.check_ears(found, unready)
+        self.check_ears(plan, unready)
 
-    def check_ears(self, found: ClusterPlan, unready: set[str]) -> None:
+    def check_ears(self, plan: ClusterPlan, unready: set[str]) -> None:
         """Each proxy that hears the LAN has an ear, which knows its address; nobody else has.
 
         A proxy stays as it was where an obstacle is told of, and gets no ear before that is gone.
         """
-        there = {}
+        ears = {}
         for pod in self.own():
             if ear := objects.ear_pod(pod):
-                there[ProxyPlace(ear.of, ear.node)] = pod, ear
+                ears[ProxyPlace(ear.of, ear.node)] = pod, ear
         wanted = {}
         for _, proxy in self.proxies():
             of = self.cluster.state.rosproxies.get(proxy.of)
             if of and of["spec"].get("multicast"):
                 wanted[ProxyPlace(proxy.of, proxy.node)] = proxy
-        assert {p for p in there if p.node not in unready} <= wanted.keys()
+        assert {p for p in ears if p.node not in unready} <= wanted.keys()
         for place, proxy in wanted.items():
-            if place.node in unready or not proxy.pod.ip or self.obstacles(found, place):
+            if place.node in unready or not proxy.pod.ip or self.obstacles(plan, place):
                 continue
-            env = {one["name"]: one["value"] for one in container_of(there[place][0])["env"]}
+            env = {
+                variable["name"]: variable["value"]
+                for variable in container_of(ears[place][0])["env"]
+            }
             assert env["ROSPROXY_EAR_PROXY"] == f"{proxy.pod.ip}:{proxy.range.first}"
             assert env["ROSPROXY_EAR_BIND"] == f"{self.names[place.node]}:{proxy.range.last}"
             assert proxy.range.last not in proxy.pod.udp_ports
 
-    def check_proxies(self, found: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:
-        there = {ProxyPlace(one.of, one.node): (pod, one) for pod, one in self.proxies()}
-        assert {place for place in there if place.node not in unready} <= wanted
+    def check_proxies(self, plan: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:
+        proxies = {ProxyPlace(proxy.of, proxy.node): (pod, proxy) for pod, proxy in self.proxies()}
+        assert {place for place in proxies if place.node not in unready} <= wanted
         for place in wanted:
             rosproxy = self.cluster.state.rosproxies[place.of]["spec"]
-            if self.obstacles(found, place):
+            if self.obstacles(plan, place):
                 continue
-            pod, proxy = there[place]
+            pod, proxy = proxies[place]
             assert not deleting(pod)
             container = pod["spec"]["containers"][0]
             assert container["image"] == rosproxy.get("image", "rosproxy:1")
             assert pod["status"]["phase"] == "Running" or container["image"] == BAD_IMAGE
-            assert len(proxy.range) == rosproxy["ports"] or self.told(
-                found, place, "PortsExhausted"
-            )
-            env = {one["name"]: one["value"] for one in container["env"]}
+            assert len(proxy.range) == rosproxy["ports"] or self.told(plan, place, "PortsExhausted")
+            env = {variable["name"]: variable["value"] for variable in container["env"]}
             self.check_versions(place, proxy, env)
             token = names.token_of(self.cluster.key, proxy.pod.id, place.node)
             assert env["ROSPROXY_ADMIN_TOKEN_HASH"] == hash_token(token)
             service, master = "http://roscore.ros.svc:11311", rosproxy["master"]
             assert env.get("ROS_MASTER_URI") == (master and master.get("uri", service))
             publish = master and master.get("publish")
-            if publish and not self.told(found, place, "PortConflict"):
+            if publish and not self.told(plan, place, "PortConflict"):
                 assert env["ROSPROXY_PUBLISH_MASTER"] == str(publish)
 
     def check_versions(self, place: ProxyPlace, proxy: ProxyPod, env: dict[str, str]) -> None:
@@ -297,20 +300,20 @@ class World:
         domain = str(spec.ros2.number) if spec.ros2 else None
         assert env.get("ROSPROXY_ROS2_DOMAINS") == domain
 
-    def obstacles(self, found: ClusterPlan, place: ProxyPlace) -> bool:
+    def obstacles(self, plan: ClusterPlan, place: ProxyPlace) -> bool:
         reasons = ("MasterUnknown", "NoAdvertiseHost", "NameTaken")
-        fatal = self.told(found, place, "PortsExhausted", fatal=True)
-        return fatal or any(self.told(found, place, reason) for reason in reasons)
+        fatal = self.told(plan, place, "PortsExhausted", fatal=True)
+        return fatal or any(self.told(plan, place, reason) for reason in reasons)
 
     def told(
-        self, found: ClusterPlan, place: ProxyPlace, reason: str, fatal: bool | None = None
+        self, plan: ClusterPlan, place: ProxyPlace, reason: str, fatal: bool | None = None
     ) -> bool:
         return any(
-            one.reason == reason
-            and one.of == place.of
-            and place.node in f"{one.subject} {one.text}".split(": ")[0] + one.text
-            and fatal in (None, one.fatal)
-            for one in found.problems
+            finding.reason == reason
+            and finding.of == place.of
+            and place.node in f"{finding.subject} {finding.text}".split(": ")[0] + finding.text
+            and fatal in (None, finding.fatal)
+            for finding in plan.problems
         )
 
     def check_addresses(self, unready: set[str]) -> None:
@@ -318,6 +321,6 @@ class World:
         for pod, proxy in self.proxies():
             if proxy.node in unready or proxy.pod.uid not in self.cluster.running():
                 continue
-            live = [one for one in self.users() if node_of(one) == proxy.node and not ended(one)]
-            here = {self.cluster.addresses[meta(one)["uid"]] for one in live}
-            assert self.cluster.ros.get(meta(pod)["uid"], set()) <= here
+            live = [p for p in self.users() if node_of(p) == proxy.node and not ended(p)]
+            live_addresses = {self.cluster.addresses[meta(p)["uid"]] for p in live}
+            assert self.cluster.ros.get(meta(pod)["uid"], set()) <= live_addresses

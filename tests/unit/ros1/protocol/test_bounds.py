@@ -24,19 +24,19 @@ REGISTRATIONS = {
     "subscribeParam": ("caller_id", "caller_api", "name"),
 }
 MOST = {"caller_api": LONGEST_URI, "service_api": LONGEST_URI}
-FIELDS = [(method, what) for method, names in REGISTRATIONS.items() for what in names]
+FIELDS = [(method, field) for method, names in REGISTRATIONS.items() for field in names]
 
 
-@pytest.mark.parametrize(("method", "what"), FIELDS)
-def test_what_is_too_long_to_register_is_named_with_its_bound(method: str, what: str) -> None:
-    most = MOST.get(what, LONGEST_NAME)
+@pytest.mark.parametrize(("method", "field"), FIELDS)
+def test_what_is_too_long_to_register_is_named_with_its_bound(method: str, field: str) -> None:
+    most = MOST.get(field, LONGEST_NAME)
 
     def said(size: int) -> str | None:
-        given = ["x" * size if name == what else "/x" for name in REGISTRATIONS[method]]
+        given = ["x" * size if name == field else "/x" for name in REGISTRATIONS[method]]
         return too_long_to_register(parse_call(py_call(method, *given)))
 
     assert said(most) is None
-    assert said(most + 1) == f"{what} has {most + 1} characters, at most {most} are accepted"
+    assert said(most + 1) == f"{field} has {most + 1} characters, at most {most} are accepted"
 
 
 @pytest.mark.parametrize(

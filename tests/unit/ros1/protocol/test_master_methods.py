@@ -39,12 +39,12 @@ def test_every_method_with_an_address_has_a_row() -> None:
 
 @pytest.mark.parametrize("method", SIGNATURES)
 def test_positions_are_those_of_the_signature(method: str) -> None:
-    found = method_spec(method)
-    assert found.caller_api == position(method, "caller_api")
-    assert found.service_api == position(method, "service_api")
-    assert found.type == position(method, "topic_type")
-    if found.registers or found.unregisters:
-        assert found.name == position(method, *NAMES)
+    spec = method_spec(method)
+    assert spec.caller_api == position(method, "caller_api")
+    assert spec.service_api == position(method, "service_api")
+    assert spec.type == position(method, "topic_type")
+    if spec.registers or spec.unregisters:
+        assert spec.name == position(method, *NAMES)
 
 
 @pytest.mark.parametrize(
@@ -66,8 +66,8 @@ def test_positions_are_those_of_the_signature(method: str) -> None:
 def test_what_a_method_does(
     method: str, registers: Kind | None, unregisters: Kind | None, reply: Reply
 ) -> None:
-    found = method_spec(method)
-    assert (found.registers, found.unregisters, found.reply) == (registers, unregisters, reply)
+    spec = method_spec(method)
+    assert (spec.registers, spec.unregisters, spec.reply) == (registers, unregisters, reply)
 
 
 @pytest.mark.parametrize(

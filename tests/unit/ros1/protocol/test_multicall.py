@@ -75,7 +75,9 @@ def test_the_end_of_a_rospy_node(dialect: str) -> None:
         Kind.PUBLISHER,
         Kind.SERVICE,
     ]
-    assert [held.kind for _, held in addressing.registry.registrations()] == [Kind.PARAM]
+    assert [registration.kind for _, registration in addressing.registry.registrations()] == [
+        Kind.PARAM
+    ]
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)

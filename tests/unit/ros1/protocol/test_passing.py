@@ -107,8 +107,8 @@ def test_what_could_be_another_method_is_refused_however_it_is_cut(
 
 @given(st.text(max_size=300), st.integers(1, 100))
 def test_parameters_pass_whatever_they_say(text: str, size: int) -> None:
-    held = [text, {text: text}, ["methodName", "registerPublisher", "&lt;methodName>"]]
-    body = py_call("setParam", "/n", "/key", held).replace(b"\0", b"")
+    value = [text, {text: text}, ["methodName", "registerPublisher", "&lt;methodName>"]]
+    body = py_call("setParam", "/n", "/key", value).replace(b"\0", b"")
     see(CallWatch(), body, size)
 
 

@@ -68,13 +68,13 @@ AUTHORITIES = {
 }
 
 
-@pytest.mark.parametrize(("text", "where"), AUTHORITIES.items())
-def test_host_and_port(text: str, where: HostPort | None) -> None:
-    assert parse_host_port(text) == where
-    assert parse_slave_uri(f"http://{text}/") == where
-    assert parse_slave_uri(f"http://{text}") == where
-    assert parse_slave_uri(f"http://{text}/RPC2?x#y") == where
-    assert parse_service_uri(f"rosrpc://{text}") == where
+@pytest.mark.parametrize(("text", "expected"), AUTHORITIES.items())
+def test_host_and_port(text: str, expected: HostPort | None) -> None:
+    assert parse_host_port(text) == expected
+    assert parse_slave_uri(f"http://{text}/") == expected
+    assert parse_slave_uri(f"http://{text}") == expected
+    assert parse_slave_uri(f"http://{text}/RPC2?x#y") == expected
+    assert parse_service_uri(f"rosrpc://{text}") == expected
 
 
 @pytest.mark.parametrize(
@@ -103,10 +103,10 @@ def test_what_is_no_service_uri(uri: str) -> None:
 
 
 @given(PLACES)
-def test_uris_round_trip(where: HostPort) -> None:
-    assert parse_host_port(str(where)) == where
-    assert parse_slave_uri(slave_uri(where)) == where
-    assert parse_service_uri(service_uri(where)) == where
+def test_uris_round_trip(address: HostPort) -> None:
+    assert parse_host_port(str(address)) == address
+    assert parse_slave_uri(slave_uri(address)) == address
+    assert parse_service_uri(service_uri(address)) == address
 
 
 @given(st.text())
@@ -139,11 +139,11 @@ def test_the_inside_address_in_a_path(node: HostPort, address: str, path: str) -
 
 @given(PLACES, ADDRESSES, PLACES)
 def test_inside_paths_round_trip(node: HostPort, address: str, outside: HostPort) -> None:
-    held = None if node.host == address else address
-    uri = slave_uri(outside, inside_path(InsidePath(node, held)))
-    found = parse_inside_path(uri)
-    assert found is not None
-    assert (found.node, found.address or found.node.host) == (node, address)
+    path_address = None if node.host == address else address
+    uri = slave_uri(outside, inside_path(InsidePath(node, path_address)))
+    parsed = parse_inside_path(uri)
+    assert parsed is not None
+    assert (parsed.node, parsed.address or parsed.node.host) == (node, address)
     assert parse_slave_uri(uri) == outside
 
 
@@ -154,10 +154,10 @@ def test_the_uri_that_another_proxy_advertises_is_kept(
     """Of two proxies in a row the outer one's URI carries the inner one's, with all it carries."""
     inner = slave_uri(first, inside_path(InsidePath(node, "10.0.0.5")))
     outer = slave_uri(second, inside_path(InsidePath(first, "10.0.0.9", path_of(inner))))
-    found = parse_inside_path(outer)
-    assert found is not None
-    assert slave_uri(found.node, found.path) == inner
-    assert found.slave == HostPort("10.0.0.9", first.port)
+    parsed = parse_inside_path(outer)
+    assert parsed is not None
+    assert slave_uri(parsed.node, parsed.path) == inner
+    assert parsed.slave == HostPort("10.0.0.9", first.port)
 
 
 def test_a_path_that_is_too_long_is_not_carried() -> None:

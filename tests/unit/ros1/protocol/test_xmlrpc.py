@@ -53,12 +53,14 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize(("sent", "found"), VALUES.items())
-def test_a_value_is_found_with_its_kind_text_and_place(sent: str, found: tuple[str, str]) -> None:
+@pytest.mark.parametrize(("sent", "expected"), VALUES.items())
+def test_a_value_is_found_with_its_kind_text_and_place(
+    sent: str, expected: tuple[str, str]
+) -> None:
     for body in (raw_call("<value>0</value>", sent, "<value>9</value>"), raw_call(sent)):
         params = xmlrpc.parse_call(body).params
         value = params[len(params) // 2]
-        assert (value.kind, value.text) == found
+        assert (value.kind, value.text) == expected
         assert value.raw.decode() == sent.strip()
 
 

@@ -49,8 +49,8 @@ def read(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, Any]:
 
 
 def plainly(body: bytes) -> Call | Value | None:
-    found = fast.call(body)
-    return Call(*found) if found else fast.response(body)
+    call = fast.call(body)
+    return Call(*call) if call else fast.response(body)
 
 
 @given(st.lists(VALUES, max_size=4))
@@ -142,10 +142,10 @@ def test_lists_of_names_and_numbers_are_read_as_they_are(value: list[Any]) -> No
 def test_what_is_taken_for_lists_is_what_expat_reads(soup: str) -> None:
     for inner in (soup, f"<value><array><data>{soup}</data></array></value>"):
         body = f"<methodResponse><params><param>{inner}</param></params></methodResponse>".encode()
-        found = fast.lists(body)
-        if found is not None:
+        read_lists = fast.lists(body)
+        if read_lists is not None:
             _, (value, _) = by_expat(body)
-            assert xmlrpc.python_value(value) == found
+            assert xmlrpc.python_value(value) == read_lists
 
 
 @given(VALUES, st.integers(0, 40))

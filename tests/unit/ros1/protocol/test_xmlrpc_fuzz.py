@@ -64,7 +64,7 @@ METHODS = ["getParam", "registerPublisher", "lookupService", "system.multicall",
 
 def strings(value: Value) -> list[Value]:
     """All strings in a value, to any depth."""
-    inner = [found for item in value.items for found in strings(item)]
+    inner = [string for item in value.items for string in strings(item)]
     return [value, *inner] if value.kind == "string" else inner
 
 
@@ -80,12 +80,12 @@ def swapped(value: Any, old: str, new: str) -> Any:
 @given(st.lists(VALUES, max_size=4), TEXT, st.data())
 def test_only_the_replaced_strings_change(values: list[Any], new: str, data: st.DataObject) -> None:
     body = py_call("m", *values)
-    found = [string for param in xmlrpc.parse_call(body).params for string in strings(param)]
-    old = data.draw(st.sampled_from([string.text for string in found])) if found else ""
-    edits = [string.with_text(new) for string in found if string.text == old]
+    all_strings = [string for param in xmlrpc.parse_call(body).params for string in strings(param)]
+    old = data.draw(st.sampled_from([string.text for string in all_strings])) if all_strings else ""
+    edits = [string.with_text(new) for string in all_strings if string.text == old]
     before = python_values(body)
     assert python_values(xmlrpc.apply(body, edits)) == swapped(before, old, new)
-    assert xmlrpc.apply(body, [string.with_text(string.text) for string in found]) == body
+    assert xmlrpc.apply(body, [string.with_text(string.text) for string in all_strings]) == body
 
 
 @given(st.lists(PLAIN, max_size=4), st.sampled_from([py_call, cpp_call]))

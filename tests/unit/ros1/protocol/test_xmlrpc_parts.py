@@ -16,11 +16,11 @@ PARAMS = ["/n", "", "a<&>'\"é", 5, True, 1.5, [[], [1, "x"]], {"a": {"b": "c"}}
 def test_a_call_of_a_multicall_stands_alone(dialect: str) -> None:
     call, _ = DIALECTS[dialect]
     elements = [{"methodName": "a", "params": PARAMS}, {"methodName": "b&<c>é", "params": []}]
-    one, other = multicall.inner_calls(xmlrpc.parse_call(call("system.multicall", elements)))
-    assert one
-    assert other
-    assert decoded(multicall.single_call(one)) == (tuple(PARAMS), "a")
-    assert decoded(multicall.single_call(other)) == ((), "b&<c>é")
+    first, second = multicall.inner_calls(xmlrpc.parse_call(call("system.multicall", elements)))
+    assert first
+    assert second
+    assert decoded(multicall.single_call(first)) == (tuple(PARAMS), "a")
+    assert decoded(multicall.single_call(second)) == ((), "b&<c>é")
 
 
 def test_a_part_of_a_latin1_document_is_taken_out_in_utf8() -> None:

@@ -34,8 +34,8 @@ def test_a_lease_is_a_line() -> None:
         first.note_service_port(port)
     text = memory.leases_text(addressing.registry, addressing.ports)
     assert text == "45000 /10.0.0.5:40001/ 41234 41235\n45001 /c6:40001/10.0.0.6/\n"
-    found = read_leases(text, addressing.ports)
-    assert found == {
+    leases = read_leases(text, addressing.ports)
+    assert leases == {
         45000: RememberedLease(PLACE, (41234, 41235)),
         45001: RememberedLease(InsidePath(HostPort("c6", 40001), "10.0.0.6")),
     }
@@ -58,10 +58,14 @@ def test_so_many_ports_of_services_are_kept_the_newest() -> None:
 
 
 def test_what_any_proxy_has_at_an_address_is_told() -> None:
-    held = {"leases_robot_30000": "30003 /10.0.0.5:40001/\n", "leases_robot_45000": "x", "y": 1}
-    assert lease_at(held, HostPort("robot", 30003)) == RememberedLease(PLACE)
-    assert lease_at(held, HostPort("robot", 30004)) is None
-    assert lease_at(held, HostPort("laptop", 30003)) is None
+    parameters = {
+        "leases_robot_30000": "30003 /10.0.0.5:40001/\n",
+        "leases_robot_45000": "x",
+        "y": 1,
+    }
+    assert lease_at(parameters, HostPort("robot", 30003)) == RememberedLease(PLACE)
+    assert lease_at(parameters, HostPort("robot", 30004)) is None
+    assert lease_at(parameters, HostPort("laptop", 30003)) is None
     assert lease_at("nothing", HostPort("robot", 30003)) is None
 
 

@@ -43,16 +43,16 @@ def register(
     registry: Registry, endpoint: Endpoint, kind: Kind, name: str, caller_id: str = "/node"
 ) -> Registration:
     api = f"rosrpc://{endpoint.node.host}:50001" if kind is SRV else None
-    held = Registration(kind, name, caller_id, service_api=api)
-    registry.register(endpoint, held)
-    return held
+    registration = Registration(kind, name, caller_id, service_api=api)
+    registry.register(endpoint, registration)
+    return registration
 
 
 def at(uri: str) -> HostPort:
     """Host and port of a URI."""
-    found = parse_slave_uri(uri)
-    assert found
-    return found
+    address = parse_slave_uri(uri)
+    assert address
+    return address
 
 
 def test_an_endpoint_is_keyed_by_address_and_port() -> None:
@@ -68,15 +68,15 @@ def test_an_endpoint_is_keyed_by_address_and_port() -> None:
 
 def test_two_containers_with_the_same_uri_are_two_endpoints() -> None:
     registry, uri = make_registry(), "http://node:40001/"
-    one, other = admit(registry, uri, "10.0.0.5"), admit(registry, uri, "10.0.0.6")
-    assert one is not other
-    assert registry.by_node(at(uri)) == [one, other]
-    assert registry.admitted(at(uri), "10.0.0.5") is one
-    assert registry.admitted(at(uri), "10.0.0.6") is other
+    first, second = admit(registry, uri, "10.0.0.5"), admit(registry, uri, "10.0.0.6")
+    assert first is not second
+    assert registry.by_node(at(uri)) == [first, second]
+    assert registry.admitted(at(uri), "10.0.0.5") is first
+    assert registry.admitted(at(uri), "10.0.0.6") is second
     assert registry.admitted(at(uri), "10.0.0.7") is None
-    registry.remove(one)
+    registry.remove(first)
     assert registry.admitted(at(uri), "10.0.0.5") is None
-    assert registry.admitted(at(uri), "10.0.0.6") is other
+    assert registry.admitted(at(uri), "10.0.0.6") is second
 
 
 def test_a_node_that_changes_its_uri_keeps_its_lease() -> None:
@@ -146,8 +146,8 @@ def test_an_exhausted_range_says_what_to_do_and_leaves_no_trace() -> None:
     node(registry, 5)
     with pytest.raises(RangeExhausted) as caught:
         node(registry, 6)
-    for part in ("45000-45001", "1 leases held", "1 taken by other programs", "--port-range"):
-        assert part in str(caught.value)
+    for text in ("45000-45001", "1 leases held", "1 taken by other programs", "--port-range"):
+        assert text in str(caught.value)
     assert len(registry) == 1
     assert registry.by_node(at(own_uri("10.0.0.6"))) == []
     assert node(registry, 5).port == 45000
@@ -166,9 +166,9 @@ def test_the_endpoint_that_was_idle_longest_is_given_up_first() -> None:
     idle(registry, 7, 20.0)
     assert registry.longest_idle() is longest
     longest.connections = 1
-    found = registry.longest_idle()
-    assert found
-    assert found.node.host == "10.0.0.7"
+    endpoint = registry.longest_idle()
+    assert endpoint
+    assert endpoint.node.host == "10.0.0.7"
 
 
 def test_an_endpoint_that_waits_for_the_masters_reply_is_not_given_up() -> None:
@@ -203,16 +203,16 @@ def test_a_call_under_way_keeps_an_endpoint() -> None:
 
 def test_restored_endpoints_have_the_port_that_they_had() -> None:
     registry = make_registry()
-    where, place = (
+    address, place = (
         HostPort("10.0.0.5", 40001),
         NodeLocation("10.0.0.5", named=True, confirmed=False),
     )
-    endpoint = registry.restore(own_uri("10.0.0.5"), where, place, 45002)
+    endpoint = registry.restore(own_uri("10.0.0.5"), address, place, 45002)
     assert endpoint
     assert (endpoint.port, endpoint.trusted) == (45002, False)
     assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.5") is endpoint
     other = HostPort("10.0.0.6", 40001), NodeLocation("10.0.0.6", named=True)
-    assert registry.restore(own_uri("10.0.0.5"), where, place, 45003) is None  # is there
+    assert registry.restore(own_uri("10.0.0.5"), address, place, 45003) is None  # is there
     assert registry.restore(own_uri("10.0.0.6"), *other, 45002) is None  # port is taken
     assert registry.restore(own_uri("10.0.0.6"), *other, 44000) is None  # not in the range
     assert registry.pool.free == 3
@@ -258,11 +258,11 @@ def test_a_service_has_one_provider() -> None:
     registry = make_registry()
     old, new = node(registry, 5), node(registry, 6)
     register(registry, old, SRV, "/s", "/old")
-    held = register(registry, new, SRV, "/s", "/new")
-    assert registry.services.get("/s") == (new, held)
+    registration = register(registry, new, SRV, "/s", "/new")
+    assert registry.services.get("/s") == (new, registration)
     assert old.names(SRV) == []
     registry.unregister(SRV, "/s", "/old")  # too late: the service is somebody else's
-    assert registry.services.get("/s") == (new, held)
+    assert registry.services.get("/s") == (new, registration)
     registry.unregister(SRV, "/s", "/new")
     assert registry.services.get("/s") is None
 
@@ -345,7 +345,7 @@ def test_endpoints_may_be_removed_while_they_are_gone_through() -> None:
 def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
     registry = make_registry()
     endpoint, port = node(registry, 5), 45000
-    held = register(registry, endpoint, PUB, "/a")
+    registration = register(registry, endpoint, PUB, "/a")
     assert registry.move({endpoint: NodeLocation("10.0.0.9", False)}) == [endpoint]
     assert (endpoint.slave, endpoint.port, endpoint.uri) == (
         HostPort("10.0.0.9", 40001),
@@ -356,7 +356,7 @@ def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
     assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is None
     assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.9") is endpoint
     assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.5") is None
-    assert endpoint.registrations == {held.key: held}
+    assert endpoint.registrations == {registration.key: registration}
     another = node(registry, 5)
     assert another is not endpoint
     assert another.port != port
@@ -372,26 +372,26 @@ def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> Non
 
 def test_two_nodes_may_swap_their_addresses() -> None:
     registry = make_registry()
-    one, other = node(registry, 5), node(registry, 6)
-    places = {one: NodeLocation("10.0.0.6", False), other: NodeLocation("10.0.0.5", False)}
-    assert registry.move(places) == [one, other]
-    assert registry.by_slave.get(HostPort("10.0.0.6", 40001)) is one
-    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is other
-    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.6") is one
-    assert registry.admitted(at(own_uri("10.0.0.6")), "10.0.0.5") is other
+    first, second = node(registry, 5), node(registry, 6)
+    places = {first: NodeLocation("10.0.0.6", False), second: NodeLocation("10.0.0.5", False)}
+    assert registry.move(places) == [first, second]
+    assert registry.by_slave.get(HostPort("10.0.0.6", 40001)) is first
+    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is second
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.6") is first
+    assert registry.admitted(at(own_uri("10.0.0.6")), "10.0.0.5") is second
 
 
 def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
     registry = make_registry()
-    one, holder, third = node(registry, 5), node(registry, 6), node(registry, 7)
-    places = {third: NodeLocation("10.0.0.5", False), one: NodeLocation("10.0.0.6", False)}
+    first, holder, third = node(registry, 5), node(registry, 6), node(registry, 7)
+    places = {third: NodeLocation("10.0.0.5", False), first: NodeLocation("10.0.0.6", False)}
     assert registry.move(places) == []
-    assert [e.location.address for e in (one, holder, third)] == [
+    assert [e.location.address for e in (first, holder, third)] == [
         "10.0.0.5",
         "10.0.0.6",
         "10.0.0.7",
     ]
-    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is one
+    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is first
 
 
 def test_an_endpoint_has_so_many_registrations_at_most() -> None:
@@ -401,9 +401,9 @@ def test_an_endpoint_has_so_many_registrations_at_most() -> None:
         register(registry, endpoint, PUB, f"/t{number}")
     assert len(endpoint.registrations) == endpoint.callers["/node"] == MOST_REGISTRATIONS
     assert "10000 registrations, at most 10000" in (endpoint.reason_full or "")
-    held = Registration(PUB, "/t0", "/node", "std_msgs/String")
-    registry.register(endpoint, held)
-    assert endpoint.registrations[held.key] is held
+    registration = Registration(PUB, "/t0", "/node", "std_msgs/String")
+    registry.register(endpoint, registration)
+    assert endpoint.registrations[registration.key] is registration
     registry.unregister(PUB, "/t0", "/node")
     assert endpoint.reason_full is None
 
@@ -450,11 +450,11 @@ def failing(
 
 def given_up(registry: Registry) -> list[str]:
     """Who is given up for nodes that live, one after the other."""
-    found = []
+    hosts = []
     while (endpoint := registry.dead_endpoint()) is not None:
-        found.append(endpoint.location.address.removeprefix("10.0.0."))
+        hosts.append(endpoint.location.address.removeprefix("10.0.0."))
         registry.remove(endpoint)
-    return found
+    return hosts
 
 
 def test_the_dead_give_way_in_order() -> None:
@@ -476,11 +476,11 @@ def test_the_dead_give_way_in_order() -> None:
 
 def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> None:
     registry = make_registry()
-    where, place = (
+    address, place = (
         HostPort("10.0.0.5", 40001),
         NodeLocation("10.0.0.5", named=True, confirmed=False),
     )
-    claim = registry.restore(own_uri("10.0.0.5"), where, place, 45000)
+    claim = registry.restore(own_uri("10.0.0.5"), address, place, 45000)
     assert claim
     register(registry, claim, PUB, "/a")
     assert registry.dead_endpoint() is None  # it is being asked
@@ -497,12 +497,12 @@ def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> 
 
 def test_nodes_of_a_source_that_never_answered() -> None:
     registry = make_registry(8)
-    one = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", "10.0.0.9")
-    other = admit(registry, own_uri("10.0.0.6"), "10.0.0.6", "10.0.0.9")
+    first = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", "10.0.0.9")
+    second = admit(registry, own_uri("10.0.0.6"), "10.0.0.6", "10.0.0.9")
     node(registry, 7)
-    assert registry.unproven("10.0.0.9") == [one, other]
-    one.health.answered_at = 1.0
-    assert registry.unproven("10.0.0.9") == [other]
+    assert registry.unproven("10.0.0.9") == [first, second]
+    first.health.answered_at = 1.0
+    assert registry.unproven("10.0.0.9") == [second]
     assert [make_registry(size).most_unproven for size in (1, 4, 8, 100)] == [1, 1, 2, 25]
 
 
@@ -511,8 +511,8 @@ def test_few_uris_are_remembered_for_one_endpoint_and_the_oldest_go() -> None:
     uris = [f"http://name{number}:40001/" for number in range(MOST_ADMISSIONS + 2)]
     endpoints = {admit(registry, uri, "10.0.0.5") for uri in uris}
     (endpoint,) = endpoints
-    known = [uri for uri in uris if registry.admitted(at(uri), "10.0.0.5") is endpoint]
-    assert known == uris[2:]
+    remembered = [uri for uri in uris if registry.admitted(at(uri), "10.0.0.5") is endpoint]
+    assert remembered == uris[2:]
     assert len(endpoint.admissions) == MOST_ADMISSIONS
     admit(registry, uris[2], "10.0.0.5")  # used again: it is the newest now
     admit(registry, uris[0], "10.0.0.5")

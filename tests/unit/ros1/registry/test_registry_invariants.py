@@ -45,28 +45,28 @@ class Registries(RuleBasedStateMachine):
     def admit(
         self, address: str, port: int, name: str | None, source: str, confirmed: bool
     ) -> None:
-        where = HostPort(name or address, port)
+        node = HostPort(name or address, port)
         place = NodeLocation(address, name is None, confirmed)
         before = {endpoint.slave for endpoint in self.registry}
         try:
-            endpoint = self.registry.admit(slave_uri(where), where, place, source)
+            endpoint = self.registry.admit(slave_uri(node), node, place, source)
         except RangeExhausted:
             assert self.registry.pool.free == 0
             assert HostPort(address, port) not in before
         else:
             assert endpoint.slave == HostPort(address, port)
-            assert self.registry.admitted(where, source) is endpoint
+            assert self.registry.admitted(node, source) is endpoint
 
     @rule(address=ADDRESSES, slave=SLAVE_PORTS, port=st.integers(44999, 45006))
     def restore(self, address: str, slave: int, port: int) -> None:
-        where = HostPort(address, slave)
-        known = any(endpoint.slave == where for endpoint in self.registry)
+        node = HostPort(address, slave)
+        is_known = any(endpoint.slave == node for endpoint in self.registry)
         usable = port in PORTS and port not in self.registry.by_port and port not in self.blocked
-        found = self.registry.restore(
-            slave_uri(where), where, NodeLocation(address, True, False), port
+        restored = self.registry.restore(
+            slave_uri(node), node, NodeLocation(address, True, False), port
         )
-        assert (found is not None) == (usable and not known)
-        assert found is None or found.port == port
+        assert (restored is not None) == (usable and not is_known)
+        assert restored is None or restored.port == port
 
     @rule(data=st.data(), addresses=st.lists(ADDRESSES, min_size=1, max_size=4))
     def move(self, data: st.DataObject, addresses: list[str]) -> None:
@@ -146,10 +146,10 @@ class Registries(RuleBasedStateMachine):
 
     @invariant()
     def every_port_is_free_held_or_blocked(self) -> None:
-        pool, held = self.registry.pool, set(self.registry.by_port)
-        assert pool.free + len(held) + len(pool.blocked) == len(PORTS)
-        assert not held & self.blocked
-        assert all(port in PORTS for port in held)
+        pool, leased = self.registry.pool, set(self.registry.by_port)
+        assert pool.free + len(leased) + len(pool.blocked) == len(PORTS)
+        assert not leased & self.blocked
+        assert all(port in PORTS for port in leased)
 
     @invariant()
     def every_endpoint_is_found_by_port_and_uri_and_admission(self) -> None:
@@ -169,30 +169,32 @@ class Registries(RuleBasedStateMachine):
         former = set(self.registry._former.values())
         by_node = self.registry._by_node.values()
         assert all(by_node)
-        assert sorted(e.port for found in by_node for e in found.values()) == sorted(
+        assert sorted(e.port for endpoints in by_node for e in endpoints.values()) == sorted(
             e.port for e in live | former
         )
         assert set(self.registry._admitted.values()) <= live
         assert not former & live
         assert not set(self.registry._former) & set(self.registry.by_port)
         for endpoint in live | former:
-            found = self.registry.by_node(endpoint.node)
-            assert [e in former for e in found] == sorted(e in former for e in found)
-            assert endpoint in found
+            namesakes = self.registry.by_node(endpoint.node)
+            assert [e in former for e in namesakes] == sorted(e in former for e in namesakes)
+            assert endpoint in namesakes
         last = self.registry._last_port
         assert all(last[endpoint.slave] == endpoint.port for endpoint in live)
         assert len(last) <= len(PORTS)
 
     @invariant()
     def registrations_are_the_expected_ones(self) -> None:
-        found = {held.key: endpoint for endpoint, held in self.registry.registrations()}
-        assert found == self.expected
+        registered = {
+            registration.key: endpoint for endpoint, registration in self.registry.registrations()
+        }
+        assert registered == self.expected
         for (kind, name, caller_id), endpoint in self.expected.items():
             assert self.registry.by_caller.get(caller_id) is endpoint
             if kind is Kind.SERVICE:
-                known = self.registry.services.get(name)
-                assert known
-                assert known[0] is endpoint
+                service = self.registry.services.get(name)
+                assert service
+                assert service[0] is endpoint
         assert set(self.registry.by_caller) == {key[2] for key in self.expected}
         for endpoint in self.registry:
             assert endpoint.callers == Counter(key[2] for key in endpoint.registrations)

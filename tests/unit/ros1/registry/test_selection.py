@@ -11,7 +11,7 @@ ADMITTED, OUTSIDE, UNSELECTED = ClientKind.ADMITTED, ClientKind.OUTSIDE, ClientK
 
 
 @pytest.mark.parametrize(
-    ("address", "selected", "found"),
+    ("address", "selected", "expected"),
     [
         ("10.0.0.5", None, ADMITTED),
         ("fd00::5", None, ADMITTED),
@@ -24,15 +24,15 @@ ADMITTED, OUTSIDE, UNSELECTED = ClientKind.ADMITTED, ClientKind.OUTSIDE, ClientK
         ("10.0.1.5", {"10.0.1.5"}, ADMITTED),
     ],
 )
-def test_standing(address: str, selected: set[str] | None, found: ClientKind) -> None:
-    assert client_kind(address, NETWORKS, selected) is found
+def test_standing(address: str, selected: set[str] | None, expected: ClientKind) -> None:
+    assert client_kind(address, NETWORKS, selected) is expected
 
 
 def test_a_refusal_is_one_line_that_says_what_to_do() -> None:
     outside = refusal("10.0.1.5", OUTSIDE, NETWORKS)
-    for part in ("10.0.1.5", "10.0.0.0/24, fd00::/64", "--inside-network"):
-        assert part in outside
+    for text in ("10.0.1.5", "10.0.0.0/24, fd00::/64", "--inside-network"):
+        assert text in outside
     unselected = refusal("10.0.0.5", UNSELECTED, NETWORKS)
-    for part in ("10.0.0.5", "rosproxy.enable=true", "rosproxy.io/inject"):
-        assert part in unselected
+    for text in ("10.0.0.5", "rosproxy.enable=true", "rosproxy.io/inject"):
+        assert text in unselected
     assert "\n" not in outside + unselected

@@ -9,39 +9,43 @@ from tests.unit.builders import make_stand_ins
 NEAR = "172.30.1.2"
 
 
-def stand_in(number: int) -> StandIn:
-    where = HostPort("robot", number)
-    return StandIn(HostPort(NEAR, 20_000 + number), f"http://{where}/", where, is_uri_kept=False)
+def make_stand_in(number: int) -> StandIn:
+    address = HostPort("robot", number)
+    return StandIn(
+        HostPort(NEAR, 20_000 + number), f"http://{address}/", address, is_uri_kept=False
+    )
 
 
-def opened(all_of: StandIns, one: StandIn) -> HostPort:
-    there = all_of.choose_fast_candidate(one)
-    assert there is not None
-    all_of.note_fast_port(one, there.port)
-    return there
+def open_fast_port(stand_ins: StandIns, stand_in: StandIn) -> HostPort:
+    candidate = stand_ins.choose_fast_candidate(stand_in)
+    assert candidate is not None
+    stand_ins.note_fast_port(stand_in, candidate.port)
+    return candidate
 
 
 def test_two_whose_ports_would_be_the_same_get_one_each() -> None:
     """Their URIs give the same number; of a hundred nodes outside, two do in one case of two."""
-    all_of, first = make_stand_ins(direction="both"), stand_in(1)
-    second = next(one for one in map(stand_in, count(2)) if one.port == first.port)
+    stand_ins, first = make_stand_ins(direction="both"), make_stand_in(1)
+    second = next(
+        stand_in for stand_in in map(make_stand_in, count(2)) if stand_in.port == first.port
+    )
 
-    ports = [opened(all_of, one).port for one in (first, second)]
+    ports = [open_fast_port(stand_ins, stand_in).port for stand_in in (first, second)]
 
-    assert ports == [one.port for one in (first, second)]
+    assert ports == [stand_in.port for stand_in in (first, second)]
     assert ports[0] != ports[1]
-    assert all_of.choose_fast_candidate(second) is None
-    assert all_of.by_port == dict(zip(ports, (first, second), strict=True))
+    assert stand_ins.choose_fast_candidate(second) is None
+    assert stand_ins.by_port == dict(zip(ports, (first, second), strict=True))
 
 
 def test_who_finds_all_taken_has_none() -> None:
-    all_of, one = make_stand_ins(direction="both"), stand_in(1)
-    for one.fast_attempts in range(TRIES):
-        all_of.by_port[one.port] = stand_in(2)
-    assert all_of.choose_fast_candidate(one) is None
+    stand_ins, stand_in = make_stand_ins(direction="both"), make_stand_in(1)
+    for stand_in.fast_attempts in range(TRIES):
+        stand_ins.by_port[stand_in.port] = make_stand_in(2)
+    assert stand_ins.choose_fast_candidate(stand_in) is None
 
 
 def test_a_service_has_none() -> None:
-    where = HostPort("robot", 4000)
-    one = StandIn(HostPort(NEAR, 20_000), f"rosrpc://{where}", where, is_uri_kept=False)
-    assert make_stand_ins(direction="both").choose_fast_candidate(one) is None
+    address = HostPort("robot", 4000)
+    stand_in = StandIn(HostPort(NEAR, 20_000), f"rosrpc://{address}", address, is_uri_kept=False)
+    assert make_stand_ins(direction="both").choose_fast_candidate(stand_in) is None

@@ -54,8 +54,8 @@ def test_an_advertised_uri_tells_the_port_alone(uri: str, address: str | None) -
 def test_a_uri_of_a_former_version_means_the_node_that_it_names(path: str, stands: bool) -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    found = addressing.endpoint_of(f"http://robot-host:45000{path}")
-    assert found is (endpoint if stands else None)
+    resolved = addressing.endpoint_of(f"http://robot-host:45000{path}")
+    assert resolved is (endpoint if stands else None)
 
 
 def test_advertised_ports_have_an_offset() -> None:
@@ -124,7 +124,7 @@ def test_a_name_that_leads_to_the_node_is_given_to_neighbours() -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "networks", "neighbours"),
+    ("caller_address", "node_address", "networks", "neighbours"),
     [
         ("10.0.0.6", "10.0.0.5", ["10.0.0.0/24"], True),
         ("10.0.1.6", "10.0.0.5", ["10.0.0.0/24"], False),
@@ -136,12 +136,12 @@ def test_a_name_that_leads_to_the_node_is_given_to_neighbours() -> None:
     ],
 )
 def test_neighbours_share_a_network(
-    one: str, other: str, networks: list[str], neighbours: bool
+    caller_address: str, node_address: str, networks: list[str], neighbours: bool
 ) -> None:
     addressing = make_addressing(networks=networks)
-    uri = f"http://{other}:40001/"
+    uri = f"http://{node_address}:40001/"
     outside = addressing.advertised_uri(add_node(addressing, uri))
-    assert (addressing.import_slave(outside, make_caller(one)) == uri) is neighbours
+    assert (addressing.import_slave(outside, make_caller(caller_address)) == uri) is neighbours
 
 
 UNTOUCHED = [
@@ -170,8 +170,8 @@ def test_what_is_no_endpoint_of_ours_is_imported_and_exported_as_it_is(uri: str)
 
 def two_with_the_same_uri() -> tuple[Addressing, str, str]:
     addressing, uri = make_addressing(), "http://node:40001/"
-    one, other = add_node(addressing, uri, "10.0.0.5"), add_node(addressing, uri, "10.0.0.6")
-    return addressing, addressing.advertised_uri(one), addressing.advertised_uri(other)
+    first, second = add_node(addressing, uri, "10.0.0.5"), add_node(addressing, uri, "10.0.0.6")
+    return addressing, addressing.advertised_uri(first), addressing.advertised_uri(second)
 
 
 @pytest.mark.parametrize(
@@ -189,10 +189,16 @@ def two_with_the_same_uri() -> tuple[Addressing, str, str]:
 def test_two_containers_with_the_same_uri_each_mean_their_own(
     caller: str, first: str, second: str
 ) -> None:
-    addressing, one, other = two_with_the_same_uri()
+    addressing, first_advertised, second_advertised = two_with_the_same_uri()
     who = make_caller(caller)
-    assert [addressing.import_slave(uri, who) for uri in (one, other)] == [first, second]
-    assert [addressing.export_slave(uri, who) for uri in (first, second)] == [one, other]
+    assert [addressing.import_slave(uri, who) for uri in (first_advertised, second_advertised)] == [
+        first,
+        second,
+    ]
+    assert [addressing.export_slave(uri, who) for uri in (first, second)] == [
+        first_advertised,
+        second_advertised,
+    ]
 
 
 def test_a_uri_that_a_caller_would_take_for_its_own_is_not_given_to_it() -> None:
@@ -210,9 +216,9 @@ def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
     """It registers from the gateway's address and is found at its own."""
     addressing, uri = make_addressing(), "http://node:40001/"
     add_node(addressing, uri, "10.0.0.6")
-    where = HostPort("node", 40001)
+    node = HostPort("node", 40001)
     place = add_node(addressing, uri, "10.0.0.5", confirmed=False).location
-    endpoint = addressing.registry.admit(uri, where, place, "10.0.0.254")
+    endpoint = addressing.registry.admit(uri, node, place, "10.0.0.254")
     exported = addressing.export_slave(uri, make_caller("10.0.0.254"))
     assert exported == addressing.advertised_uri(endpoint)
 
@@ -287,8 +293,8 @@ def test_a_service_that_was_rebuilt_from_the_master(caller) -> None:
     """Its own URI is not known until the node has answered for it."""
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    held = add_registration(addressing, endpoint, Kind.SERVICE, "/s")
-    object.__setattr__(held, "service_api", None)
+    registration = add_registration(addressing, endpoint, Kind.SERVICE, "/s")
+    object.__setattr__(registration, "service_api", None)
     outside = "rosrpc://robot-host:45000"
     assert addressing.import_service(outside, "/s", caller) == f"rosrpc://{PROXY}:45000"
     addressing.registry.note_service_port(endpoint, "/s", 50001)

@@ -38,17 +38,17 @@ class Member:
     service_host: str | None
 
     def join(self, addressing: Addressing) -> Endpoint:
-        where = HostPort(self.name or self.address, self.port)
-        named = self.named or where.host == self.address
+        node = HostPort(self.name or self.address, self.port)
+        named = self.named or node.host == self.address
         place = NodeLocation(self.address, named)
-        endpoint = addressing.registry.admit(slave_uri(where), where, place, self.address)
+        endpoint = addressing.registry.admit(slave_uri(node), node, place, self.address)
         caller_id = f"/n{len(addressing.registry)}"
-        api = service_uri(HostPort(self.service_host or where.host, 50000 + endpoint.port % 100))
-        for held in (
+        api = service_uri(HostPort(self.service_host or node.host, 50000 + endpoint.port % 100))
+        for registration in (
             Registration(Kind.PUBLISHER, "/topic", caller_id),
             Registration(Kind.SERVICE, f"/s{endpoint.port}", caller_id, service_api=api),
         ):
-            addressing.registry.register(endpoint, held)
+            addressing.registry.register(endpoint, registration)
         return endpoint
 
 

@@ -250,15 +250,20 @@ def test_registrations_are_noted_if_the_master_accepts_them(
     facts = exchange(addressing, NODE, py_call(method, *params), py_reply([status, "", []])).facts
     assert len(facts) == accepted
     for fact in facts:
-        held = fact.registration
-        assert (held.kind, held.name, held.type, held.service_api) == expected
-        assert (held.caller_id, held.since) == (ID, 7.0)
+        registration = fact.registration
+        assert (
+            registration.kind,
+            registration.name,
+            registration.type,
+            registration.service_api,
+        ) == expected
+        assert (registration.caller_id, registration.since) == (ID, 7.0)
         assert fact.endpoint is addressing.registry.by_port[45000]
 
 
-def held(addressing: Addressing, name: str) -> list[Kind]:
+def registered_kinds(addressing: Addressing, name: str) -> list[Kind]:
     endpoint: Endpoint | None = addressing.registry.by_caller.get(name)
-    return [one.kind for one in endpoint.registrations.values()] if endpoint else []
+    return [r.kind for r in endpoint.registrations.values()] if endpoint else []
 
 
 UNREGISTERING = [
@@ -276,15 +281,15 @@ def test_a_registration_ends_whether_or_not_the_master_still_had_it(
 ) -> None:
     addressing = world()
     exchange(addressing, NODE, py_call(method, *params), py_reply([1, "", removed]))
-    assert set(held(addressing, ID)) == set(Kind) - {kind}
-    assert len(held(addressing, "/other")) == 4
+    assert set(registered_kinds(addressing, ID)) == set(Kind) - {kind}
+    assert len(registered_kinds(addressing, "/other")) == 4
 
 
 def test_a_tool_inside_ends_the_registration_of_another_node() -> None:
     addressing = world()
     body = py_call("unregisterPublisher", "/far", "/far/held", FAR_RELAYED)
     exchange(addressing, NODE, body, py_reply([1, "", 1]))
-    assert Kind.PUBLISHER not in held(addressing, "/far")
+    assert Kind.PUBLISHER not in registered_kinds(addressing, "/far")
 
 
 @pytest.mark.parametrize(
@@ -309,7 +314,7 @@ def test_a_node_that_makes_room_for_its_successor_ends_none_of_its_registrations
     addressing = world()
     done = exchange(addressing, NODE, py_call(method, *params), py_reply([1, "not known", 0]))
     assert not done.facts
-    assert len(held(addressing, ID)) == 4
+    assert len(registered_kinds(addressing, ID)) == 4
 
 
 def test_a_registration_with_a_uri_that_the_proxy_handed_out_ends_none() -> None:

@@ -23,14 +23,14 @@ PORTS = PortRange(11000, 11009)
 OUTSIDE = "http://robot:40001/"
 
 
-def make(*held: tuple[str, Kind, str, bool]) -> Addressing:
+def make(*registrations: tuple[str, Kind, str, bool]) -> Addressing:
     """A registry of nodes at 10.0.0.1, 10.0.0.2, …, each with what it holds and whether hidden."""
     registry = Registry(PORTS)
-    for number, (name, kind, what, is_hidden) in enumerate(held, 1):
+    for number, (name, kind, resource, is_hidden) in enumerate(registrations, 1):
         address = f"10.0.0.{number}"
         uri, node = f"http://{address}:1/", HostPort(address, 1)
         endpoint = registry.admit(uri, node, NodeLocation(address, named=True), address)
-        registry.register(endpoint, Registration(kind, what, name, "T", hidden=is_hidden))
+        registry.register(endpoint, Registration(kind, resource, name, "T", hidden=is_hidden))
     ports = PortMap(PORTS, PORTS)
     return Addressing(registry, "host", ports, make_stand_ins(ports))
 
@@ -78,8 +78,8 @@ def test_a_subscriber_hears_of_hidden_publishers_besides_the_masters() -> None:
     registry = addressing.registry
     shown, concealed, _, listener = registry
     at_master = [OUTSIDE, addressing.advertised_uri(shown)]
-    found = policing.publishers_for(listener, "/t", at_master, addressing)
-    assert found == [*at_master, addressing.advertised_uri(concealed)]
+    uris = policing.publishers_for(listener, "/t", at_master, addressing)
+    assert uris == [*at_master, addressing.advertised_uri(concealed)]
     assert policing.publishers_for(None, "/t", at_master, addressing) == at_master
 
 
@@ -129,15 +129,15 @@ def test_the_index_of_hidden_names_is_that_of_the_registrations(
         address = f"10.0.0.{ord(caller[1]) - 96}"
         node = HostPort(address, 1)
         endpoint = registry.admit(f"http://{node}/", node, NodeLocation(address, True), address)
-        held = Registration(Kind.PUBLISHER, topic, caller, hidden=is_hidden)
-        registry.register(endpoint, held)
+        registration = Registration(Kind.PUBLISHER, topic, caller, hidden=is_hidden)
+        registry.register(endpoint, registration)
     wanted = {
-        (held.kind, held.name, held.caller_id)
-        for _, held in registry.registrations()
-        if held.hidden
+        (registration.kind, registration.name, registration.caller_id)
+        for _, registration in registry.registrations()
+        if registration.hidden
     }
-    found = {(*key, caller) for key, holders in registry.hidden.items() for caller in holders}
-    assert found == wanted
+    indexed = {(*key, caller) for key, holders in registry.hidden.items() for caller in holders}
+    assert indexed == wanted
 
 
 def test_the_graph_is_completed_once() -> None:

@@ -26,24 +26,27 @@ def asked(*offers: list[Any]) -> bytes:
     return xmlrpc.client.dumps(("/n", "/t", list(offers)), "requestTopic").encode()
 
 
-def led(body: bytes, where: HostPort | None) -> Any:
+def redirected(body: bytes, receiver: HostPort | None) -> Any:
     """The offers of a call, each led to somewhere."""
     call = document.parse_call(body)
-    edits = [edit for one in read_offers(call) for edit in redirect_offer(one, where)]
+    edits = [edit for o in read_offers(call) for edit in redirect_offer(o, receiver)]
     return xmlrpc.client.loads(document.apply(body, edits).decode())[0][2]
 
 
 def test_an_offer_is_read() -> None:
-    (found,) = read_offers(document.parse_call(asked(["TCPROS"], offer("/other"))))
-    assert (found.topic, found.receiver) == ("/other", HostPort("laptop", 40000))
+    (parsed_offer,) = read_offers(document.parse_call(asked(["TCPROS"], offer("/other"))))
+    assert (parsed_offer.topic, parsed_offer.receiver) == ("/other", HostPort("laptop", 40000))
 
 
 def test_an_offer_leads_elsewhere_and_all_else_stays() -> None:
-    assert led(asked(["TCPROS"], offer()), HERE) == [["TCPROS"], offer(host=HERE.host, port=25000)]
+    assert redirected(asked(["TCPROS"], offer()), HERE) == [
+        ["TCPROS"],
+        offer(host=HERE.host, port=25000),
+    ]
 
 
 def test_an_offer_is_taken_out() -> None:
-    assert led(asked(offer(), ["TCPROS"]), None) == [["TCPROS"]]
+    assert redirected(asked(offer(), ["TCPROS"]), None) == [["TCPROS"]]
 
 
 @pytest.mark.parametrize(
@@ -60,10 +63,10 @@ def test_an_offer_is_taken_out() -> None:
     ],
 )
 def test_what_can_not_be_read_is_taken_out(odd: list[Any]) -> None:
-    (found,) = read_offers(document.parse_call(asked(odd)))
-    assert found.receiver is None or found.topic == ""
-    if found.receiver is None:
-        assert led(asked(odd, ["TCPROS"]), HERE) == [["TCPROS"]]
+    (parsed_offer,) = read_offers(document.parse_call(asked(odd)))
+    assert parsed_offer.receiver is None or parsed_offer.topic == ""
+    if parsed_offer.receiver is None:
+        assert redirected(asked(odd, ["TCPROS"]), HERE) == [["TCPROS"]]
 
 
 def test_other_calls_have_none() -> None:

@@ -20,12 +20,14 @@ C2 = ("10.0.0.6", {"c2", "twin"})
 C3 = ("10.0.0.7", {"c3", "twin"})
 
 
-def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
+def make_registration(
+    name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0
+) -> Registration:
     return Registration(kind, name, caller_id, since=since)
 
 
-def places(*found: str) -> tuple[HostPort, ...]:
-    return tuple(HostPort(host, int(port)) for host, port in (f.split(":") for f in found))
+def places(*addresses: str) -> tuple[HostPort, ...]:
+    return tuple(HostPort(host, int(port)) for host, port in (f.split(":") for f in addresses))
 
 
 FOUND = [
@@ -48,28 +50,30 @@ FOUND = [
 
 @pytest.mark.parametrize(("uri", "expected"), FOUND)
 def test_whose_uri_may_mean_a_container(uri: str, expected: tuple[HostPort, ...]) -> None:
-    graph = Graph({"/n": [held("/a")]}, {"/n": uri})
-    found = policy.find_direct(graph, [C1, C2, C3], make_addressing())
-    assert found == ([DirectNode("/n", uri, expected, (held("/a"),))] if expected else [])
+    graph = Graph({"/n": [make_registration("/a")]}, {"/n": uri})
+    nodes = policy.find_direct(graph, [C1, C2, C3], make_addressing())
+    assert nodes == (
+        [DirectNode("/n", uri, expected, (make_registration("/a"),))] if expected else []
+    )
 
 
 def test_a_container_named_as_the_advertised_host_is_no_way_to_the_proxys_own_nodes() -> None:
     uris = {"/ours": "http://robot-host:45003/10.0.0.5:40001/", "/its": "http://robot-host:50000/"}
-    graph = Graph({name: [held("/a", name)] for name in uris}, uris)
-    found = policy.find_direct(graph, [("10.0.0.5", {"robot-host"})], make_addressing())
-    assert [node.caller_id for node in found] == ["/its"]
+    graph = Graph({name: [make_registration("/a", name)] for name in uris}, uris)
+    nodes = policy.find_direct(graph, [("10.0.0.5", {"robot-host"})], make_addressing())
+    assert [node.caller_id for node in nodes] == ["/its"]
 
 
 def test_a_container_on_two_networks_is_looked_for_on_both() -> None:
-    graph = Graph({"/n": [held("/a")]}, {"/n": "http://c1:40001/"})
+    graph = Graph({"/n": [make_registration("/a")]}, {"/n": "http://c1:40001/"})
     both = [C1, ("10.1.0.5", C1[1]), C1]
-    (found,) = policy.find_direct(graph, both, make_addressing())
-    assert found.slaves == places("10.0.0.5:40001", "10.1.0.5:40001")
+    (node,) = policy.find_direct(graph, both, make_addressing())
+    assert node.slaves == places("10.0.0.5:40001", "10.1.0.5:40001")
 
 
-def direct(caller_id: str, topics: Sequence[str], *where: str, kind: Kind = PUB) -> DirectNode:
-    registrations = tuple(held(topic, caller_id, kind) for topic in topics)
-    return DirectNode(caller_id, "http://twin:40001/", places(*where), registrations)
+def direct(caller_id: str, topics: Sequence[str], *addresses: str, kind: Kind = PUB) -> DirectNode:
+    registrations = tuple(make_registration(topic, caller_id, kind) for topic in topics)
+    return DirectNode(caller_id, "http://twin:40001/", places(*addresses), registrations)
 
 
 SIX, SEVEN = "10.0.0.6:40001", "10.0.0.7:40001"
@@ -96,8 +100,8 @@ Located = tuple[dict[HostPort, list[DirectNode]], dict[str, str]]
 def locate(nodes: Sequence[DirectNode], said: Mapping[str, Sequence[str]]) -> Located:
     """Where nodes are, if those at places publish these topics."""
     infos = {
-        places(where)[0]: NodeInfo(7, dict.fromkeys(topics, "t"), {})
-        for where, topics in said.items()
+        places(address)[0]: NodeInfo(7, dict.fromkeys(topics, "t"), {})
+        for address, topics in said.items()
     }
     sure = {
         (node.caller_id, place)
@@ -109,45 +113,45 @@ def locate(nodes: Sequence[DirectNode], said: Mapping[str, Sequence[str]]) -> Lo
 
 
 def test_who_tells_no_topics_is_where_it_has_answered_for_them() -> None:
-    one = direct("/n", ["/a"], SIX, SEVEN)
+    node = direct("/n", ["/a"], SIX, SEVEN)
     six, seven = places(SIX, SEVEN)
     silent = {place: NodeInfo(7, None, None) for place in (six, seven)}
-    assert policy.locate([one], silent, {("/n", seven)}) == ({seven: [one]}, {})
-    assert list(policy.locate([one], silent)[1]) == ["/n"]
+    assert policy.locate([node], silent, {("/n", seven)}) == ({seven: [node]}, {})
+    assert list(policy.locate([node], silent)[1]) == ["/n"]
 
 
 @pytest.mark.parametrize(("topics", "said", "expected"), LOCATED)
 def test_where_a_node_is(
     topics: list[str], said: Mapping[str, list[str]], expected: str | None
 ) -> None:
-    one = direct("/n", topics, SIX, SEVEN)
-    found, doubts = locate([one], said)
+    node = direct("/n", topics, SIX, SEVEN)
+    located, doubts = locate([node], said)
     if expected is None:
-        assert found == {}
+        assert located == {}
         assert list(doubts) == ["/n"]
         assert "http://twin:40001/" in doubts["/n"]
     else:
-        assert (found, doubts) == ({places(expected)[0]: [one]}, {})
+        assert (located, doubts) == ({places(expected)[0]: [node]}, {})
 
 
 def test_a_service_is_no_topic() -> None:
-    one = direct("/n", ["/add"], SIX, kind=SRV)
-    assert locate([one], {SIX: ["/add"]})[0] == {}
+    node = direct("/n", ["/add"], SIX, kind=SRV)
+    assert locate([node], {SIX: ["/add"]})[0] == {}
 
 
 def test_doubts_tell_what_was_found() -> None:
-    one = direct("/n", ["/a"], SIX, SEVEN)
-    assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in locate([one], {})[1]["/n"]
-    assert "does not show that it is this one" in locate([one], {SIX: ["/b"]})[1]["/n"]
-    either = locate([one], {SIX: ["/a"], SEVEN: ["/a"]})[1]["/n"]
+    node = direct("/n", ["/a"], SIX, SEVEN)
+    assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in locate([node], {})[1]["/n"]
+    assert "does not show that it is this one" in locate([node], {SIX: ["/b"]})[1]["/n"]
+    either = locate([node], {SIX: ["/a"], SEVEN: ["/a"]})[1]["/n"]
     assert "could be at 10.0.0.6:40001 or 10.0.0.7:40001; not adopted" in either
 
 
 def test_two_containers_with_the_same_names_and_ports() -> None:
     first, second = direct("/n1", ["/a"], SIX, SEVEN), direct("/n2", ["/b"], SIX, SEVEN)
     six, seven = places(SIX, SEVEN)
-    found, doubts = locate([first, second], {SIX: ["/b", "/rosout"], SEVEN: ["/a"]})
-    assert found == {seven: [first], six: [second]}
+    located, doubts = locate([first, second], {SIX: ["/b", "/rosout"], SEVEN: ["/a"]})
+    assert located == {seven: [first], six: [second]}
     assert not doubts
 
 

@@ -16,9 +16,9 @@ from tests.unit.builders import add_node, add_registration, make_addressing
 
 def test_only_who_answers_is_alive() -> None:
     addressing = make_addressing()
-    found = [add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(3)]
+    endpoints = [add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(3)]
     probes = [ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT]
-    assert liveness.dead_endpoints(dict(zip(found, probes, strict=True)), 0.0) == found[1:]
+    assert liveness.dead_endpoints(dict(zip(endpoints, probes, strict=True)), 0.0) == endpoints[1:]
 
 
 def test_restarted_container_keeps_its_new_node() -> None:
@@ -28,8 +28,10 @@ def test_restarted_container_keeps_its_new_node() -> None:
         add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(4)
     )
     for endpoint, since in ((fresh, 7.0), (old, 6.9), (ended, 8.0)):
-        held = add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter", f"/at{since}")
-        addressing.registry.register(endpoint, replace(held, since=since))
+        registration = add_registration(
+            addressing, endpoint, Kind.PUBLISHER, "/chatter", f"/at{since}"
+        )
+        addressing.registry.register(endpoint, replace(registration, since=since))
     calling.pending = 1
     answers = dict.fromkeys((fresh, old, calling), ProbeResult.SILENT) | {
         ended: ProbeResult.REFUSED
@@ -49,8 +51,8 @@ def test_who_may_have_moved() -> None:
         same.location.address: same.location.address,
         "10.0.0.99": "10.0.0.100",
     }
-    found = liveness.movable(addressing.registry, news, addressing.networks)
-    assert found == {moved: "10.0.0.9"}
+    moves = liveness.movable(addressing.registry, news, addressing.networks)
+    assert moves == {moved: "10.0.0.9"}
 
 
 @pytest.mark.parametrize(
@@ -88,11 +90,11 @@ SAME = [
 ]
 
 
-@pytest.mark.parametrize(("known", "pid", "borne_out", "same"), SAME)
+@pytest.mark.parametrize(("former_pid", "pid", "borne_out", "same"), SAME)
 def test_whether_it_is_the_same_process(
-    known: int | None, pid: int | None, borne_out: bool | None, same: bool
+    former_pid: int | None, pid: int | None, borne_out: bool | None, same: bool
 ) -> None:
-    assert liveness.is_same_process(known, pid, borne_out) is same
+    assert liveness.is_same_process(former_pid, pid, borne_out) is same
 
 
 TIMES = st.none() | st.integers(0, 12).map(float)

@@ -19,12 +19,12 @@ from tests.unit.builders import add_node, add_registration, make_addressing
 PUB, SRV = Kind.PUBLISHER, Kind.SERVICE
 
 
-def held(name: str, caller_id: str = "/n") -> Registration:
+def make_registration(name: str, caller_id: str = "/n") -> Registration:
     return Registration(PUB, name, caller_id)
 
 
 def graph(uris: dict[str, str]) -> Graph:
-    return Graph({node: [held("/a", node)] for node in uris}, uris)
+    return Graph({node: [make_registration("/a", node)] for node in uris}, uris)
 
 
 MEMORY = memory.read_leases(
@@ -60,8 +60,10 @@ URIS = [
 def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
     uri: str, expected: tuple[int, str, str] | None
 ) -> None:
-    found, forgotten = recovery_claims.find_claims(graph({"/n": uri}), make_addressing(), MEMORY)
-    claims = [(one.port, one.uri, str(one.slave), one.topics) for one in found]
+    found_claims, forgotten = recovery_claims.find_claims(
+        graph({"/n": uri}), make_addressing(), MEMORY
+    )
+    claims = [(claim.port, claim.uri, str(claim.slave), claim.topics) for claim in found_claims]
     assert forgotten == {}
     if expected is None:
         assert claims == []
@@ -72,17 +74,17 @@ def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
 
 def test_the_ports_of_services_are_remembered() -> None:
     uris = {"/n": "http://robot-host:45004/", "/m": "http://robot-host:45003/"}
-    found, _ = recovery_claims.find_claims(graph(uris), make_addressing(), MEMORY)
-    assert [claim.service_ports for claim in found] == [(41234, 41235), ()]
+    claims, _ = recovery_claims.find_claims(graph(uris), make_addressing(), MEMORY)
+    assert [claim.service_ports for claim in claims] == [(41234, 41235), ()]
 
 
 def test_of_some_nothing_is_remembered() -> None:
     uri = "http://robot-host:45008/"
-    found, forgotten = recovery_claims.find_claims(
+    claims, forgotten = recovery_claims.find_claims(
         graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY
     )
-    assert found == []
-    assert {one.caller_id for one in forgotten[uri]} == {"/n", "/m"}
+    assert claims == []
+    assert {registration.caller_id for registration in forgotten[uri]} == {"/n", "/m"}
 
 
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
@@ -99,7 +101,7 @@ def test_names_that_share_a_uri_are_one_claim() -> None:
     (claim,), _ = recovery_claims.find_claims(
         graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY
     )
-    assert {one.caller_id for one in claim.registrations} == {"/n", "/m"}
+    assert {registration.caller_id for registration in claim.registrations} == {"/n", "/m"}
 
 
 def test_a_node_without_registrations_or_without_a_uri() -> None:
@@ -107,7 +109,9 @@ def test_a_node_without_registrations_or_without_a_uri() -> None:
     uri = "http://robot-host:45003/"
     (claim,), _ = recovery_claims.find_claims(Graph({}, {"/n": uri}), addressing, MEMORY)
     assert claim.registrations == []
-    assert recovery_claims.find_claims(Graph({"/n": [held("/a")]}, {}), addressing, MEMORY) == (
+    assert recovery_claims.find_claims(
+        Graph({"/n": [make_registration("/a")]}, {}), addressing, MEMORY
+    ) == (
         [],
         {},
     )
@@ -121,8 +125,8 @@ def claim(
     slave: int = 40001,
 ) -> Claim:
     named = None if said is None else NodeInfo(7, dict.fromkeys(said, "t"), {})
-    where = HostPort(address, slave)
-    return Claim(port, where, where, list(map(held, topics)), named)
+    node = HostPort(address, slave)
+    return Claim(port, node, node, list(map(make_registration, topics)), named)
 
 
 A, B = "10.0.0.5", "10.0.0.6"
@@ -145,17 +149,18 @@ SETTLED = [
 ]
 
 
-@pytest.mark.parametrize(("found", "kept"), SETTLED)
+@pytest.mark.parametrize(("claims", "kept"), SETTLED)
 def test_one_claim_is_kept_for_each_port_and_each_node(
-    found: list[Claim], kept: list[tuple[int, str]]
+    claims: list[Claim], kept: list[tuple[int, str]]
 ) -> None:
     assert (
-        sorted((one.port, one.slave.host) for one in recovery_claims.choose_claims(found)) == kept
+        sorted((claim.port, claim.slave.host) for claim in recovery_claims.choose_claims(claims))
+        == kept
     )
 
 
 @pytest.mark.parametrize(
-    ("found", "ports"),
+    ("claims", "ports"),
     [
         ([], []),
         ([claim(1, A), claim(2, B)], []),
@@ -165,9 +170,9 @@ def test_one_claim_is_kept_for_each_port_and_each_node(
     ],
 )
 def test_claims_to_the_same_port_or_node_are_contested(
-    found: list[Claim], ports: list[int]
+    claims: list[Claim], ports: list[int]
 ) -> None:
-    assert [one.port for one in recovery_claims.contested_claims(found)] == ports
+    assert [claim.port for claim in recovery_claims.contested_claims(claims)] == ports
 
 
 TOPICS = st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True)
@@ -176,11 +181,11 @@ CLAIMS = st.builds(claim, st.integers(1, 4), ADDRESSES, TOPICS, st.none() | TOPI
 
 
 @given(st.lists(CLAIMS, max_size=6))
-def test_settling_leaves_no_contest_and_forgets_nobody_without_one(found: list[Claim]) -> None:
-    settled = recovery_claims.choose_claims(found)
+def test_settling_leaves_no_contest_and_forgets_nobody_without_one(claims: list[Claim]) -> None:
+    settled = recovery_claims.choose_claims(claims)
     assert recovery_claims.contested_claims(settled) == []
-    rivals = recovery_claims.contested_claims(found)
-    assert all(one in settled for one in found if one not in rivals)
+    rivals = recovery_claims.contested_claims(claims)
+    assert all(claim in settled for claim in claims if claim not in rivals)
 
 
 @pytest.mark.parametrize(
@@ -242,9 +247,15 @@ def test_a_node_bears_out_what_the_master_says_of_it(
 
 
 def test_names_that_are_not_the_node_s_are_told_apart() -> None:
-    own, former = held("/a", "/own"), held("/b", "/former")
+    own, former = make_registration("/a", "/own"), make_registration("/b", "/former")
     service = Registration(SRV, "/s", "/former")
-    everything = [own, former, service, Registration(SRV, "/t", "/untold"), held("/c", "/own")]
+    everything = [
+        own,
+        former,
+        service,
+        Registration(SRV, "/t", "/untold"),
+        make_registration("/c", "/own"),
+    ]
     assert recovery_claims.unconfirmed_registrations(everything, NodeInfo(7, {"/a": "t"}, {})) == [
         former,
         service,
@@ -255,7 +266,7 @@ def test_names_that_are_not_the_node_s_are_told_apart() -> None:
 
 
 def test_a_node_is_asked_for_a_few_of_its_topics_and_services() -> None:
-    topics = [held(name) for name in ("/rosout", "/d", "/c", "/b", "/a")]
+    topics = [make_registration(name) for name in ("/rosout", "/d", "/c", "/b", "/a")]
     services = [Registration(SRV, name, "/n") for name in ("/y", "/x")]
     heard = [Registration(Kind.SUBSCRIBER, "/heard", "/n")]
     asked = recovery_claims.topics_and_services_to_ask([*topics, *services, *heard])

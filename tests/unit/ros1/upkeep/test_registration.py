@@ -21,7 +21,9 @@ from tests.unit.builders import (
 PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
 
 
-def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
+def make_registration(
+    name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0
+) -> Registration:
     return Registration(kind, name, caller_id, since=since)
 
 
@@ -60,11 +62,11 @@ def test_the_proxy_calls_the_master_exactly_as_the_node_did(
     addressing, node = make_addressing(), make_caller("10.0.0.5")
     done = exchange(addressing, node, register, py_reply([1, "", []]))
     endpoint = addressing.registry.by_port[45000]
-    (held,) = endpoint.registrations.values()
+    (registration,) = endpoint.registrations.values()
     uris = addressing.advertised_uri(endpoint), addressing.advertised_service(endpoint)
-    method, params = decisions.register_call(held, *uris)
+    method, params = decisions.register_call(registration, *uris)
     assert py_call(method, *params) == done.sent
-    method, params = decisions.unregister_call(held, *uris)
+    method, params = decisions.unregister_call(registration, *uris)
     assert py_call(method, *params) == exchange(addressing, node, unregister, py_reply([])).sent
 
 
@@ -97,8 +99,8 @@ def test_what_still_holds_of_a_node_that_is_back(
     endpoint = add_node(addressing)
     for kind, name in HELD:
         add_registration(addressing, endpoint, kind, name)
-    found = decisions.valid_registrations(endpoint, said(published, subscribed), same_process)
-    assert [(held.kind, held.name) for held in found] == kept
+    valid = decisions.valid_registrations(endpoint, said(published, subscribed), same_process)
+    assert [(registration.kind, registration.name) for registration in valid] == kept
 
 
 def test_a_service_alone_holds_if_the_process_is_the_same() -> None:
@@ -140,8 +142,10 @@ def test_what_a_process_that_is_gone_has_left_behind(
     endpoint = add_node(addressing)
     for kind, name, caller_id, since in registered:
         addressing.registry.register(endpoint, Registration(kind, name, caller_id, since=since))
-    found = decisions.left_over_registrations(endpoint, said(published, subscribed), before=10.0)
-    assert [held.key for held in found] == [row[:3] for row in left]
+    left_over = decisions.left_over_registrations(
+        endpoint, said(published, subscribed), before=10.0
+    )
+    assert [registration.key for registration in left_over] == [row[:3] for row in left]
 
 
 def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
@@ -149,8 +153,8 @@ def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
     endpoint = add_node(addressing)
     assert decisions.unregistered_topics(endpoint, said({"/a"})) == []  # whose would they be?
     add_registration(addressing, endpoint, PUB, "/a", "/n")
-    found = decisions.unregistered_topics(endpoint, said({"/a", "/b"}, {"/a"}))
-    assert found == [Registration(PUB, "/b", "/n", "t/b"), Registration(SUB, "/a", "/n", "t/a")]
+    topics = decisions.unregistered_topics(endpoint, said({"/a", "/b"}, {"/a"}))
+    assert topics == [Registration(PUB, "/b", "/n", "t/b"), Registration(SUB, "/a", "/n", "t/a")]
     add_registration(addressing, endpoint, SUB, "/c", "/m")
     assert decisions.unregistered_topics(endpoint, said({"/b"})) == []
 
@@ -158,8 +162,13 @@ def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
 def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
     uris = {"/n": "http://c1:40001/", "/m": "http://c1:40001"}
     services = {"/add": "rosrpc://c1:50001"}
-    mine = [held("/a"), held("/add", kind=SRV), held("/b", kind=SUB), held("/c", "/m", SUB)]
-    mine.append(held("/lost", kind=SRV))
+    mine = [
+        make_registration("/a"),
+        make_registration("/add", kind=SRV),
+        make_registration("/b", kind=SUB),
+        make_registration("/c", "/m", SUB),
+    ]
+    mine.append(make_registration("/lost", kind=SRV))
     assert decisions.free_calls(mine, uris, services) == [
         ("unregisterSubscriber", ["/n", "/b", "http://c1:40001/"]),
         ("unregisterSubscriber", ["/m", "/c", "http://c1:40001"]),
@@ -188,9 +197,9 @@ def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
 def test_who_was_subscribed_to_it_and_who_is_known_still() -> None:
     uris = dict.fromkeys(("/unknown", "/common", "/another", "/taken"), "U")
     before, after = [None, "U", "U", "other"], [None, None, "U", "other"]
-    ended, known = decisions.read_release(uris, [*before, 1, 1, 1, 1, *after])
+    ended, remaining = decisions.read_release(uris, [*before, 1, 1, 1, 1, *after])
     assert ended == [Registration(PARAM, decisions.COMMON_PARAMETER, "/common")]
-    assert known == {"/another": "U", "/taken": "other"}
+    assert remaining == {"/another": "U", "/taken": "other"}
 
 
 def test_what_has_not_ended_meanwhile_is_registered_subscribers_last() -> None:
@@ -198,10 +207,10 @@ def test_what_has_not_ended_meanwhile_is_registered_subscribers_last() -> None:
     endpoint = add_node(addressing)
     kinds = (SUB, PUB, PARAM, SRV)
     wanted = [(endpoint, add_registration(addressing, endpoint, kind, "/a")) for kind in kinds]
-    ended = endpoint, held("/gone")
-    replaced = endpoint, held("/a", "/talker")
-    found = decisions.to_register([ended, replaced, *wanted])
-    assert found == [*wanted[1:], wanted[0]]
+    ended = endpoint, make_registration("/gone")
+    replaced = endpoint, make_registration("/a", "/talker")
+    registrations = decisions.to_register([ended, replaced, *wanted])
+    assert registrations == [*wanted[1:], wanted[0]]
 
 
 def test_topics_that_a_node_no_longer_has() -> None:
@@ -216,28 +225,44 @@ def test_topics_that_a_node_no_longer_has() -> None:
         (SRV, "/add", 1.0),
         (PARAM, "/rate", 1.0),
     ]:
-        addressing.registry.register(endpoint, held(name, kind=kind, since=since))
+        addressing.registry.register(endpoint, make_registration(name, kind=kind, since=since))
     gone = decisions.vanished_topics(endpoint, said(["/kept"], ["/kept"]), before=5.0)
-    assert [(one.kind, one.name) for one in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
+    assert [(r.kind, r.name) for r in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
 
 
 LOST = [
     # ours, the master's, what is lost
     ([], [], []),
-    ([held("/a")], [held("/a")], []),
-    ([held("/a")], [], [held("/a")]),
-    ([held("/a")], [held("/a", "/other")], [held("/a")]),
-    ([held("/a")], [held("/a", kind=SUB)], [held("/a")]),
-    ([held("/a"), held("/b")], [held("/a")], [held("/b")]),
-    ([held("/a", since=9.9)], [], [held("/a", since=9.9)]),
-    ([held("/a", since=10.0)], [], []),  # made while the master was being asked
-    ([held("/a", since=11.0)], [], []),
+    ([make_registration("/a")], [make_registration("/a")], []),
+    ([make_registration("/a")], [], [make_registration("/a")]),
+    ([make_registration("/a")], [make_registration("/a", "/other")], [make_registration("/a")]),
+    ([make_registration("/a")], [make_registration("/a", kind=SUB)], [make_registration("/a")]),
+    (
+        [make_registration("/a"), make_registration("/b")],
+        [make_registration("/a")],
+        [make_registration("/b")],
+    ),
+    ([make_registration("/a", since=9.9)], [], [make_registration("/a", since=9.9)]),
+    ([make_registration("/a", since=10.0)], [], []),  # made while the master was being asked
+    ([make_registration("/a", since=11.0)], [], []),
     # parameters are not in the master's state: lost if their node is
-    ([held("/p", kind=PARAM)], [], []),
-    ([held("/a"), held("/p", kind=PARAM)], [held("/a")], []),
-    ([held("/a"), held("/p", kind=PARAM)], [], [held("/a"), held("/p", kind=PARAM)]),
-    ([held("/a"), held("/b"), held("/p", kind=PARAM)], [held("/b")], [held("/a")]),
-    ([held("/a"), held("/p", "/m", PARAM)], [], [held("/a")]),
+    ([make_registration("/p", kind=PARAM)], [], []),
+    ([make_registration("/a"), make_registration("/p", kind=PARAM)], [make_registration("/a")], []),
+    (
+        [make_registration("/a"), make_registration("/p", kind=PARAM)],
+        [],
+        [make_registration("/a"), make_registration("/p", kind=PARAM)],
+    ),
+    (
+        [make_registration("/a"), make_registration("/b"), make_registration("/p", kind=PARAM)],
+        [make_registration("/b")],
+        [make_registration("/a")],
+    ),
+    (
+        [make_registration("/a"), make_registration("/p", "/m", PARAM)],
+        [],
+        [make_registration("/a")],
+    ),
 ]
 
 
@@ -246,6 +271,6 @@ def test_what_the_master_has_lost(
     ours: list[Registration], masters: list[Registration], lost: list[Registration]
 ) -> None:
     state: dict[str, list[Registration]] = {}
-    for one in masters:
-        state.setdefault(one.caller_id, []).append(one)
+    for registration in masters:
+        state.setdefault(registration.caller_id, []).append(registration)
     assert decisions.lost_registrations(ours, state, before=10.0) == lost

@@ -28,8 +28,8 @@ def subscribed(endpoint: Endpoint, *names: str, topic: str = "/t") -> list[Topic
     return [TopicSubscription(endpoint, topic, name) for name in names]
 
 
-def names(found: Iterable[TopicSubscription]) -> list[str]:
-    return [one.caller_id for one in found]
+def names(subscriptions: Iterable[TopicSubscription]) -> list[str]:
+    return [subscription.caller_id for subscription in subscriptions]
 
 
 def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
@@ -39,17 +39,17 @@ def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
     add_registration(addressing, first, SUB, "/in")
     for topic in ("/t", "/u"):
         add_registration(addressing, second, PUB, topic, "/other")
-    held = {
+    registrations = {
         "/a": [Registration(SUB, "/t", "/a"), Registration(SUB, "/in", "/a")],
         "/b": [Registration(PUB, "/t", "/b"), Registration(SUB, "/u", "/b")],
         "/c": [Registration(SRV, "/t", "/c")],
     }
-    assert decisions.subscriptions(held, [first, second], addressing) == [
+    assert decisions.subscriptions(registrations, [first, second], addressing) == [
         TopicSubscription(first, "/t", "/a"),
         TopicSubscription(second, "/t", "/a"),
         TopicSubscription(second, "/u", "/b"),
     ]
-    assert decisions.subscriptions(held, [first], addressing) == [
+    assert decisions.subscriptions(registrations, [first], addressing) == [
         TopicSubscription(first, "/t", "/a")
     ]
     assert decisions.subscriptions({}, [first], addressing) == []
@@ -60,8 +60,8 @@ def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
     endpoint = add_node(addressing)
     for name in ("/one", "/two"):
         add_registration(addressing, endpoint, PUB, "/t", name)
-    held = {"/a": [Registration(SUB, "/t", "/a")]}
-    assert decisions.subscriptions(held, [endpoint], addressing) == [
+    registrations = {"/a": [Registration(SUB, "/t", "/a")]}
+    assert decisions.subscriptions(registrations, [endpoint], addressing) == [
         TopicSubscription(endpoint, "/t", "/a")
     ]
 
@@ -83,12 +83,12 @@ def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
     add_registration(addressing, speaker, PUB, "/t", "/speaker")
     add_registration(addressing, speaker, SUB, "/t", "/speaker")
     ear = add_node(addressing)
-    held = {
+    registrations = {
         "/ear": [add_registration(addressing, ear, SUB, "/t", "/ear")],
         "/speaker": [Registration(SUB, "/t", "/speaker")],
     }
-    found = decisions.subscriptions(held, [speaker], addressing)
-    assert found == subscribed(speaker, "/ear")[:count]
+    subscriptions = decisions.subscriptions(registrations, [speaker], addressing)
+    assert subscriptions == subscribed(speaker, "/ear")[:count]
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ ROWS = [
 ]
 
 
-@pytest.mark.parametrize(("row", "found"), ROWS)
-def test_a_row_of_bus_info_is_read(row: Any, found: BusRow | None) -> None:
-    assert decisions.read_bus([row]) == ([found] if found else [])
+@pytest.mark.parametrize(("row", "expected"), ROWS)
+def test_a_row_of_bus_info_is_read(row: Any, expected: BusRow | None) -> None:
+    assert decisions.read_bus([row]) == ([expected] if expected else [])
 
 
 @pytest.mark.parametrize("value", [None, 0, "text", {}, []])
@@ -156,15 +156,15 @@ FORWARDED = [
 ]
 
 
-@pytest.mark.parametrize(("peers", "named", "found"), FORWARDED)
+@pytest.mark.parametrize(("peers", "named", "silent"), FORWARDED)
 def test_a_host_with_as_many_connections_in_the_kernel_as_subscriptions_has_no_silent_one(
-    peers: dict[str, int], named: list[str], found: list[str]
+    peers: dict[str, int], named: list[str], silent: list[str]
 ) -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = peers
     bus = {endpoint: [("/t", name, "TCPROS") for name in named]}
     left = subscribed(endpoint, "/a", "/b", "/c")
-    assert names(decisions.unconnected(left, bus, HOSTS)) == found
+    assert names(decisions.unconnected(left, bus, HOSTS)) == silent
 
 
 def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:

@@ -26,7 +26,7 @@ def everything(*_: object) -> bool:
     return True
 
 
-def domain(
+def make_domain(
     peers: Sequence[str] = (ROBOT,),
     ear: HostPort | None = EAR,
     judge: Judge = everything,
@@ -48,13 +48,13 @@ def domain(
 
 
 def spdp(prefix: bytes, address: str, port: int = 7410, lease: float = 20) -> bytes:
-    held = [
+    parameters = [
         (Pid.PARTICIPANT_GUID, prefix + bytes([0, 0, 1, 0xC1])),
         (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(address, port), "<")),
         (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(address, port + 1), "<")),
         (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
     ]
-    return message(data(payload(held)), prefix=prefix)
+    return message(data(payload(parameters)), prefix=prefix)
 
 
 def farewell(prefix: bytes) -> bytes:
@@ -63,23 +63,23 @@ def farewell(prefix: bytes) -> bytes:
 
 
 def sedp(prefix: bytes, address: str, port: int, to: bytes = b"") -> bytes:
-    held = [
+    parameters = [
         (Pid.ENDPOINT_GUID, prefix + bytes([0, 0, 1, 3])),
         (Pid.TOPIC_NAME, struct.pack("<I", 11) + b"rt/chatter\0\0"),
         (Pid.TYPE_NAME, struct.pack("<I", 4) + b"Str\0"),
         (Pid.UNICAST_LOCATOR, pack_locator(HostPort(address, port), "<")),
     ]
     meant = [submessage(0x0E, 0, to)] if to else []
-    return message(*meant, data(payload(held), writer=SEDP_WRITERS), prefix=prefix)
+    return message(*meant, data(payload(parameters), writer=SEDP_WRITERS), prefix=prefix)
 
 
 def reached_at(datagram: bytes) -> list[HostPort]:
-    (found,) = read_discovery(datagram).announcements
-    return [where for _, where in found.reached_at(datagram)]
+    (announcement,) = read_discovery(datagram).announcements
+    return [locator for _, locator in announcement.reached_at(datagram)]
 
 
-def meet(one: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgoing]:
-    return one.heard_inside(spdp(prefix, address), address, NOW)
+def meet(domain: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgoing]:
+    return domain.heard_inside(spdp(prefix, address), address, NOW)
 
 
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:

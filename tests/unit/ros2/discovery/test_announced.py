@@ -58,8 +58,8 @@ def said(datagram: bytes, address: str) -> ParticipantTraits:
     return traits(told, datagram, address)
 
 
-def spdp(held: Sequence[tuple[int, bytes]]) -> bytes:
-    return message(data(payload(held)))
+def spdp(parameters: Sequence[tuple[int, bytes]]) -> bytes:
+    return message(data(payload(parameters)))
 
 
 def udp(address: str, pid: int = Pid.METATRAFFIC_UNICAST_LOCATOR) -> tuple[int, bytes]:
@@ -81,7 +81,7 @@ def test_real_ones_with_dds_security() -> None:
 
 
 @pytest.mark.parametrize(
-    ("held", "fault"),
+    ("parameters", "fault"),
     [
         ([udp(INSIDE)], LocatorFault.NO),
         ([udp("127.0.0.1"), udp(INSIDE), of_kind(4)], LocatorFault.NO),
@@ -96,8 +96,8 @@ def test_real_ones_with_dds_security() -> None:
         ([(Pid.METATRAFFIC_UNICAST_LOCATOR, bytes(8))], LocatorFault.MISSING),
     ],
 )
-def test_where_it_can_be_reached(held: list[tuple[int, bytes]], fault: LocatorFault) -> None:
-    assert said(spdp(held), INSIDE).locator_fault is fault
+def test_where_it_can_be_reached(parameters: list[tuple[int, bytes]], fault: LocatorFault) -> None:
+    assert said(spdp(parameters), INSIDE).locator_fault is fault
 
 
 def info(attributes: int) -> tuple[int, bytes]:
@@ -108,7 +108,7 @@ TOKEN = Pid.IDENTITY_TOKEN, struct.pack("<I", 20) + b"DDS:Auth:PKI-DH:1.0\0" + b
 
 
 @pytest.mark.parametrize(
-    ("held", "security"),
+    ("parameters", "security"),
     [
         ([], DdsSecurity.NONE),
         ([TOKEN], DdsSecurity.AUTHENTICATED),
@@ -121,14 +121,16 @@ TOKEN = Pid.IDENTITY_TOKEN, struct.pack("<I", 20) + b"DDS:Auth:PKI-DH:1.0\0" + b
         ([info(0)], DdsSecurity.NONE),
     ],
 )
-def test_what_it_says_of_dds_security(held: list[tuple[int, bytes]], security: DdsSecurity) -> None:
-    assert said(spdp([*held, udp(INSIDE)]), INSIDE).security is security
+def test_what_it_says_of_dds_security(
+    parameters: list[tuple[int, bytes]], security: DdsSecurity
+) -> None:
+    assert said(spdp([*parameters, udp(INSIDE)]), INSIDE).security is security
 
 
 @pytest.mark.parametrize(("number", "domain"), [(0, 0), (7, 7), (2**32 - 1, None)])
 def test_its_domain(number: int, domain: int | None) -> None:
-    held = [udp(INSIDE), (Pid.DOMAIN_ID, struct.pack("<I", number))]
-    assert said(spdp(held), INSIDE).domain == domain
+    parameters = [udp(INSIDE), (Pid.DOMAIN_ID, struct.pack("<I", number))]
+    assert said(spdp(parameters), INSIDE).domain == domain
     assert said(spdp([udp(INSIDE)]), INSIDE).domain is None
 
 
@@ -140,5 +142,5 @@ def test_its_domain(number: int, domain: int | None) -> None:
         max_size=12,
     )
 )
-def test_whatever_it_says_is_read(held: list[tuple[int, bytes]]) -> None:
-    said(spdp(held), INSIDE)
+def test_whatever_it_says_is_read(parameters: list[tuple[int, bytes]]) -> None:
+    said(spdp(parameters), INSIDE)

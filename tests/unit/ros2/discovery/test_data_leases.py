@@ -6,14 +6,14 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.registry.participants import LeaseKind
-from tests.unit.ros2.discovery.domains import INSIDE, OTHER, A, B, domain, farewell, meet, spdp
+from tests.unit.ros2.discovery.domains import INSIDE, OTHER, A, B, farewell, make_domain, meet, spdp
 
 LOCATOR = HostPort(INSIDE, 7411)
 
 
-def both(one: Domain) -> DataLeases:
-    leases = DataLeases(PortPool(one.settings.ports.listen))
-    leases.domains.append(one.inside)
+def data_leases_of(domain: Domain) -> DataLeases:
+    leases = DataLeases(PortPool(domain.settings.ports.listen))
+    leases.domains.append(domain.inside)
     return leases
 
 
@@ -22,54 +22,54 @@ def led(leases: DataLeases) -> dict[int, HostPort]:
 
 
 def test_only_user_data_is_forwarded() -> None:
-    one = domain()
-    leases = both(one)
+    domain = make_domain()
+    leases = data_leases_of(domain)
     assert led(leases) == {}
-    meet(one)
-    ((port, where),) = led(leases).items()
-    assert where == LOCATOR
-    assert one.inside.leases[port][1].kind is LeaseKind.DATA
+    meet(domain)
+    ((port, target),) = led(leases).items()
+    assert target == LOCATOR
+    assert domain.inside.leases[port][1].kind is LeaseKind.DATA
     (lease,) = leases
     assert destination(lease, HostForwarding()) == LOCATOR
     assert destination(lease, HostForwarding(own_addresses=(INSIDE,))) != LOCATOR
 
 
 def test_a_locator_that_turns_out_to_be_of_metatraffic_is_not_forwarded() -> None:
-    one = domain()
-    leases = both(one)
-    meet(one)
+    domain = make_domain()
+    leases = data_leases_of(domain)
+    meet(domain)
     (lease,) = leases
-    one.heard_inside(spdp(A, INSIDE, LOCATOR.port), INSIDE, 100)
+    domain.heard_inside(spdp(A, INSIDE, LOCATOR.port), INSIDE, 100)
     assert lease.port not in led(leases)
 
 
 def test_who_keeps_a_lease_is_the_same_and_who_comes_after_is_not() -> None:
-    one = domain()
-    leases = both(one)
-    meet(one)
+    domain = make_domain()
+    leases = data_leases_of(domain)
+    meet(domain)
     (first,) = leases
-    meet(one, B, OTHER)
+    meet(domain, B, OTHER)
     assert [lease for lease in leases if lease is first]
-    one.heard_inside(farewell(A), INSIDE, 100)
+    domain.heard_inside(farewell(A), INSIDE, 100)
     assert set(led(leases).values()) == {HostPort(OTHER, 7411)}
-    meet(one)
+    meet(domain)
     (again,) = (lease for lease in leases if lease.target == LOCATOR)
     assert again.port == first.port
 
 
 def test_what_was_forwarded_before_goes_on_until_its_port_is_given_to_somebody() -> None:
-    one = domain()
-    leases = both(one)
-    meet(one)
-    ((port, where),) = led(leases).items()
-    one.heard_inside(farewell(A), INSIDE, 100)
+    domain = make_domain()
+    leases = data_leases_of(domain)
+    meet(domain)
+    ((port, target),) = led(leases).items()
+    domain.heard_inside(farewell(A), INSIDE, 100)
     elsewhere = HostPort(OTHER, 7413)
-    free = next(p for p in one.settings.ports.listen.ports() if p not in (port, 45000))
+    free = next(p for p in domain.settings.ports.listen.ports() if p not in (port, 45000))
     leases.note_former({port: elsewhere, free: elsewhere})
     assert led(leases) == {port: elsewhere, free: elsewhere}
-    meet(one)
-    assert led(leases)[port] == where
-    one.heard_inside(farewell(A), INSIDE, 100)
+    meet(domain)
+    assert led(leases)[port] == target
+    domain.heard_inside(farewell(A), INSIDE, 100)
     assert port not in led(leases)
     leases.note_former({})
     assert led(leases) == {}

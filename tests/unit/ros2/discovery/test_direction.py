@@ -27,50 +27,56 @@ USER = message(submessage(0x07, 0, bytes(28)), prefix=A)
 
 
 def both_ways() -> Domain:
-    one = domains.domain(both_ways=True)
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    return one
+    domain = domains.make_domain(both_ways=True)
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    return domain
 
 
-def stand_in(one: Domain, kind: LeaseKind) -> int:
-    (found,) = [lease for lease in one.outside.by_prefix[B].leases.values() if lease.kind is kind]
-    return found.port
+def stand_in(domain: Domain, kind: LeaseKind) -> int:
+    (lease,) = [
+        lease for lease in domain.outside.by_prefix[B].leases.values() if lease.kind is kind
+    ]
+    return lease.port
 
 
 def test_inside_is_told_of_stand_ins_alone() -> None:
-    one = both_ways()
-    (told,) = to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    domain = both_ways()
+    (told,) = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     meta, user = reached_at(told)
-    assert meta == HostPort(NEAR, stand_in(one, LeaseKind.METATRAFFIC))
-    assert user == HostPort(NEAR, stand_in(one, LeaseKind.DATA))
+    assert meta == HostPort(NEAR, stand_in(domain, LeaseKind.METATRAFFIC))
+    assert user == HostPort(NEAR, stand_in(domain, LeaseKind.DATA))
 
 
 def test_locators_of_readers_and_writers_get_one_too() -> None:
-    one = both_ways()
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    (sent,) = one.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
-    (where,) = reached_at(sent.datagram)
-    assert where.host == NEAR
-    (passed,) = one.at_stand_in(where.port, USER, INSIDE, NOW)
+    domain = both_ways()
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    (sent,) = domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    (locator,) = reached_at(sent.datagram)
+    assert locator.host == NEAR
+    (passed,) = domain.at_stand_in(locator.port, USER, INSIDE, NOW)
     assert passed.target == HostPort(ROBOT, 7000)
 
 
 def test_what_inside_sends_goes_on_as_it_is() -> None:
-    one = both_ways()
-    (sent,) = one.at_stand_in(stand_in(one, LeaseKind.DATA), USER, INSIDE, NOW)
+    domain = both_ways()
+    (sent,) = domain.at_stand_in(stand_in(domain, LeaseKind.DATA), USER, INSIDE, NOW)
     assert (sent.target, sent.datagram) == (HostPort(ROBOT, 7411), USER)
-    assert one.at_stand_in(stand_in(one, LeaseKind.DATA), USER, OTHER, NOW) == []
+    assert domain.at_stand_in(stand_in(domain, LeaseKind.DATA), USER, OTHER, NOW) == []
 
 
 def test_no_locator_leads_to_another_host() -> None:
-    one = domains.domain(both_ways=True)
-    meet(one)
+    domain = domains.make_domain(both_ways=True)
+    meet(domain)
     datagram = spdp(B, ROBOT).replace(bytes([10, 0, 0, 9]), bytes([10, 0, 0, 8]))
-    one.heard_outside(datagram, ROBOT, NOW)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (sent,) = one.at_lease(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
+    domain.heard_outside(datagram, ROBOT, NOW)
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (sent,) = domain.at_lease(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
     assert reached_at(sent.datagram) == []
 
 
@@ -85,31 +91,33 @@ def test_after_a_restart_the_observer_learns_which_ones_there_are() -> None:
 
 
 def test_ports_are_given_back() -> None:
-    one = both_ways()
-    one.expire(NOW + 21)
-    assert not one.outside.stand_ins
+    domain = both_ways()
+    domain.expire(NOW + 21)
+    assert not domain.outside.stand_ins
 
 
 def test_a_port_that_is_taken_is_left_alone() -> None:
-    one = both_ways()
-    port = stand_in(one, LeaseKind.DATA)
-    one.outside.block(port)
-    (told,) = to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    domain = both_ways()
+    port = stand_in(domain, LeaseKind.DATA)
+    domain.outside.block(port)
+    (told,) = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     _, user = reached_at(told)
     assert user.port not in (port, 0)
-    assert port not in one.outside.stand_ins
+    assert port not in domain.outside.stand_ins
 
 
 def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
     )
-    one = domains.domain(both_ways=True)
-    meet(one)
+    domain = domains.make_domain(both_ways=True)
+    meet(domain)
     for number in range(MOST_SHARING + 1):
-        one.heard_outside(spdp(bytes([9, number]) + B[2:], ROBOT, 7410 + 10 * number), ROBOT, NOW)
+        domain.heard_outside(
+            spdp(bytes([9, number]) + B[2:], ROBOT, 7410 + 10 * number), ROBOT, NOW
+        )
     assert {
-        sent.target.port for sent in one.at_stand_in(20_000, sedp(A, INSIDE, 7000), INSIDE, NOW)
+        sent.target.port for sent in domain.at_stand_in(20_000, sedp(A, INSIDE, 7000), INSIDE, NOW)
     } == {
         7410,
         7411,
@@ -120,9 +128,9 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:
     """Where there were no more sockets, the ports of that moment were never used again."""
-    one = both_ways()
-    port = stand_in(one, LeaseKind.DATA)
-    one.outside.block(port, for_good=False)
-    assert port not in one.outside.stand_ins
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    assert port in one.outside.stand_ins
+    domain = both_ways()
+    port = stand_in(domain, LeaseKind.DATA)
+    domain.outside.block(port, for_good=False)
+    assert port not in domain.outside.stand_ins
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    assert port in domain.outside.stand_ins

@@ -33,8 +33,8 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
-    domain,
     farewell,
+    make_domain,
     meet,
     reached_at,
     sedp,
@@ -45,102 +45,106 @@ from tests.unit.ros2.protocol.messages import message, parameter, submessage
 
 
 def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
-    one = domain()
-    sent = meet(one)
+    domain = make_domain()
+    sent = meet(domain)
     (told,) = to(sent, ROBOT)
     (carried,) = to(sent, EAR.host)
     assert told == carried
     meta, user = reached_at(told)
     assert {meta.host, user.host} == {HOST}
-    leases = {lease.target.port: lease for _, lease in one.inside.leases.values()}
+    leases = {lease.target.port: lease for _, lease in domain.inside.leases.values()}
     assert (meta.port - 1000, user.port - 1000) == (leases[7410].port, leases[7411].port)
     assert [leases[7410].kind, leases[7411].kind] == [LeaseKind.METATRAFFIC, LeaseKind.DATA]
 
 
 def test_participants_that_share_a_datagram_are_all_taken_in() -> None:
     """Cyclone DDS has those of a program share; all that they said was dropped as malformed."""
-    one = domain()
+    domain = make_domain()
     source = submessage(0x0C, 0, bytes(4) + b"\x02\x03\x01\x0f" + B)
-    sent = one.heard_inside(spdp(A, INSIDE) + source + spdp(B, INSIDE, 7412)[20:], INSIDE, NOW)
-    assert one.inside.by_prefix.keys() == {A, B}
+    sent = domain.heard_inside(spdp(A, INSIDE) + source + spdp(B, INSIDE, 7412)[20:], INSIDE, NOW)
+    assert domain.inside.by_prefix.keys() == {A, B}
     assert [source_prefix(told) for told in to(sent, ROBOT)] == [A, B]
 
 
 def test_the_same_is_told_outside_once_in_a_while() -> None:
     """A crowd that meets repeats itself, and each time goes to all ports of all peers."""
-    one = domain()
-    assert to(meet(one), ROBOT)
+    domain = make_domain()
+    assert to(meet(domain), ROBOT)
     again = spdp(A, INSIDE)
-    assert not to(one.heard_inside(again, INSIDE, NOW + ANNOUNCED_AGAIN / 2), ROBOT)
-    assert to(one.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW), ROBOT)  # something new
-    assert to(one.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW + ANNOUNCED_AGAIN), ROBOT)
+    assert not to(domain.heard_inside(again, INSIDE, NOW + ANNOUNCED_AGAIN / 2), ROBOT)
+    assert to(domain.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW), ROBOT)  # something new
+    assert to(domain.heard_inside(spdp(A, INSIDE, lease=30), INSIDE, NOW + ANNOUNCED_AGAIN), ROBOT)
 
 
 @pytest.mark.parametrize("inside", ["fd30::11", "172.30.0.5"])
 def test_a_locator_leads_to_the_host_by_its_own_family(inside: str) -> None:
-    one = domain()
-    one.settings.hosts = (HOST, "fd77::1")
-    (told, *_) = to(one.heard_inside(spdp(A, inside), inside, NOW), ROBOT)
-    assert {":" in where.host for where in reached_at(told)} == {":" in inside}
+    domain = make_domain()
+    domain.settings.hosts = (HOST, "fd77::1")
+    (told, *_) = to(domain.heard_inside(spdp(A, inside), inside, NOW), ROBOT)
+    assert {":" in locator.host for locator in reached_at(told)} == {":" in inside}
 
 
 def test_a_locator_leads_to_the_only_address_of_the_host() -> None:
-    one = domain()
-    (told, *_) = to(one.heard_inside(spdp(A, "fd30::11"), "fd30::11", NOW), ROBOT)
-    assert {where.host for where in reached_at(told)} == {HOST}
+    domain = make_domain()
+    (told, *_) = to(domain.heard_inside(spdp(A, "fd30::11"), "fd30::11", NOW), ROBOT)
+    assert {locator.host for locator in reached_at(told)} == {HOST}
 
 
 def test_an_address_of_a_link_outside_is_not_told_inside() -> None:
-    one = domain(peers=["fd77::2"])
-    meet(one)
+    domain = make_domain(peers=["fd77::2"])
+    meet(domain)
     link = (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort("fe80::1", 7411), "<"))
-    there = spdp(B, "fd77::2")
-    padded = there[:-4] + parameter(*link) + there[-4:]
+    announcement = spdp(B, "fd77::2")
+    padded = announcement[:-4] + parameter(*link) + announcement[-4:]
     length = struct.pack("<H", len(padded) - 24)
-    sent = one.heard_outside(padded[:22] + length + padded[24:], "fd77::2", NOW)
+    sent = domain.heard_outside(padded[:22] + length + padded[24:], "fd77::2", NOW)
     (told,) = to(sent, INSIDE)
-    assert {where.host for where in reached_at(told)} == {NEAR, "fd77::2"}
+    assert {locator.host for locator in reached_at(told)} == {NEAR, "fd77::2"}
 
 
 def test_the_observer_is_reached_by_either_family() -> None:
-    one = domain()
-    one.settings.hosts = (HOST, "fd77::1")
-    (told, *_) = one.own.announced_outside()
-    assert {where.host for where in reached_at(told.datagram)} == {HOST, "fd77::1"}
+    domain = make_domain()
+    domain.settings.hosts = (HOST, "fd77::1")
+    (told, *_) = domain.own.announced_outside()
+    assert {locator.host for locator in reached_at(told.datagram)} == {HOST, "fd77::1"}
 
 
 def test_a_participant_at_two_networks_is_served_at_the_first() -> None:
-    one = domain()
-    meet(one)
-    assert one.heard_inside(spdp(A, OTHER), OTHER, NOW) == []
-    assert {lease.target.host for _, lease in one.inside.leases.values()} == {INSIDE}
+    domain = make_domain()
+    meet(domain)
+    assert domain.heard_inside(spdp(A, OTHER), OTHER, NOW) == []
+    assert {lease.target.host for _, lease in domain.inside.leases.values()} == {INSIDE}
 
 
 def test_nobody_gets_a_way_to_somebody_elses_address() -> None:
-    one = domain()
-    sent = one.heard_inside(spdp(A, OTHER), INSIDE, NOW)
-    assert not one.inside.leases
+    domain = make_domain()
+    sent = domain.heard_inside(spdp(A, OTHER), INSIDE, NOW)
+    assert not domain.inside.leases
     assert reached_at(to(sent, ROBOT)[0]) == []
 
 
 def test_what_outside_sends_goes_to_the_locator() -> None:
-    one = domain()
-    meet(one)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7411]
+    domain = make_domain()
+    meet(domain)
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7411
+    ]
     datagram = message(submessage(0x07, 0, bytes(28)), prefix=B)
-    assert one.at_lease(port, datagram, STRANGER, NOW) == [
+    assert domain.at_lease(port, datagram, STRANGER, NOW) == [
         Outgoing(HostPort(INSIDE, 7411), datagram)
     ]
 
 
 def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
-    one = domain()
-    meet(one)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    (sent,) = one.at_lease(port, spdp(B, ROBOT), ROBOT, NOW)
+    domain = make_domain()
+    meet(domain)
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    (sent,) = domain.at_lease(port, spdp(B, ROBOT), ROBOT, NOW)
     assert sent.target == HostPort(INSIDE, 7410)
     meta, user = reached_at(sent.datagram)
-    (stand_in,) = one.outside.stand_ins
+    (stand_in,) = domain.outside.stand_ins
     assert (meta, user) == (HostPort(NEAR, stand_in), HostPort(ROBOT, 7411))
 
 
@@ -154,269 +158,279 @@ def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
     ],
 )
 def test_loopback_is_for_those_on_this_machine(near: str, robot: str, told: list[HostPort]) -> None:
-    one = domain(peers=[robot])
-    one.settings.proxy_address_for = lambda _: near
-    meet(one)
-    one.heard_outside(spdp(B, robot), robot, NOW)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    (sent,) = one.at_lease(port, sedp(B, "127.0.1.10", 7000), robot, NOW)
+    domain = make_domain(peers=[robot])
+    domain.settings.proxy_address_for = lambda _: near
+    meet(domain)
+    domain.heard_outside(spdp(B, robot), robot, NOW)
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    (sent,) = domain.at_lease(port, sedp(B, "127.0.1.10", 7000), robot, NOW)
     assert reached_at(sent.datagram) == told
 
 
 def test_who_comes_later_is_told_of_those_outside() -> None:
-    one = domain()
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (told,) = to(meet(one), INSIDE)[:1]
+    domain = make_domain()
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (told,) = to(meet(domain), INSIDE)[:1]
     assert reached_at(told)[0].host == NEAR
 
 
 def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
-    one = domain()
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    meet(one)
-    (stand_in,) = one.outside.stand_ins
-    *reminders, sent = one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
+    domain = make_domain()
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    meet(domain)
+    (stand_in,) = domain.outside.stand_ins
+    *reminders, sent = domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
     assert sent.target == HostPort(ROBOT, 7410)
     assert {reminder.target for reminder in reminders} == {HostPort(INSIDE, 7410)}
-    (where,) = reached_at(sent.datagram)
-    assert where.host == HOST
-    assert one.inside.leases[where.port - 1000][1].target.port == 7000
-    (endpoint,) = one.inside.by_prefix[A].endpoints.values()
+    (locator,) = reached_at(sent.datagram)
+    assert locator.host == HOST
+    assert domain.inside.leases[locator.port - 1000][1].target.port == 7000
+    (endpoint,) = domain.inside.by_prefix[A].endpoints.values()
     assert (endpoint.topic, endpoint.type_name) == ("rt/chatter", "Str")
 
 
 def test_a_stranger_is_not_answered() -> None:
-    one = domain()
-    meet(one)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    assert one.at_lease(port, spdp(B, STRANGER), STRANGER, NOW) == []
-    assert one.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
-    assert not one.outside.by_prefix
+    domain = make_domain()
+    meet(domain)
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    assert domain.at_lease(port, spdp(B, STRANGER), STRANGER, NOW) == []
+    assert domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
+    assert not domain.outside.by_prefix
 
 
 def test_an_announcement_for_another_address_is_refused() -> None:
-    one = domain()
-    meet(one)
-    assert one.heard_outside(wrapped(ROBOT, spdp(B, STRANGER)), EAR.host, NOW) == []
-    assert not one.outside.by_prefix
+    domain = make_domain()
+    meet(domain)
+    assert domain.heard_outside(wrapped(ROBOT, spdp(B, STRANGER)), EAR.host, NOW) == []
+    assert not domain.outside.by_prefix
 
 
 def test_nobody_takes_the_prefix_of_another() -> None:
-    one = domain()
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    before = dict(one.inside.leases)
-    assert one.heard_outside(spdp(A, ROBOT), ROBOT, NOW) == []
-    assert one.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
-    assert one.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
-    assert one.heard_inside(farewell(A), OTHER, NOW) == []
-    assert one.heard_outside(wrapped(STRANGER, farewell(B)), EAR.host, NOW) == []
-    assert one.inside.leases == before
-    assert one.outside.by_prefix.keys() == {B}
+    domain = make_domain()
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    before = dict(domain.inside.leases)
+    assert domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW) == []
+    assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
+    assert domain.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
+    assert domain.heard_inside(farewell(A), OTHER, NOW) == []
+    assert domain.heard_outside(wrapped(STRANGER, farewell(B)), EAR.host, NOW) == []
+    assert domain.inside.leases == before
+    assert domain.outside.by_prefix.keys() == {B}
 
 
 def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
-    one = domain(peers=())
-    meet(one)
+    domain = make_domain(peers=())
+    meet(domain)
     heard = spdp(B, ROBOT)
-    one.heard_outside(wrapped(ROBOT, heard), EAR.host, NOW)
-    (stand_in,) = one.outside.stand_ins
+    domain.heard_outside(wrapped(ROBOT, heard), EAR.host, NOW)
+    (stand_in,) = domain.outside.stand_ins
     sent = 0
     for _ in range(20):
-        for outgoing in one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW):
+        for outgoing in domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW):
             sent += len(outgoing.datagram) if outgoing.target.host == ROBOT else 0
     assert 0 < sent <= len(heard)
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    one.at_lease(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
-    assert one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    domain.at_lease(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
+    assert domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
 
 
 def test_an_address_has_so_many_participants_and_no_more() -> None:
-    one = domain()
+    domain = make_domain()
     for number in range(MOST_PER_ADDRESS + 10):
-        one.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, NOW)
-    assert len(one.inside.by_prefix) == MOST_PER_ADDRESS
+        domain.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, NOW)
+    assert len(domain.inside.by_prefix) == MOST_PER_ADDRESS
 
 
 def test_a_range_that_is_too_short_is_told() -> None:
-    one = domain()
+    domain = make_domain()
     for number in range(1, 10):
-        one.heard_inside(
+        domain.heard_inside(
             spdp(number.to_bytes(12, "big"), f"172.30.0.{number}"), f"172.30.0.{number}", NOW
         )
-    assert len(one.inside.leases) == 15  # of sixteen, one is for discovery
-    assert all("--port-range" in text for text in one.inside.port_shortages.values())
-    assert one.inside.port_shortages
+    assert len(domain.inside.leases) == 15  # of sixteen, one is for discovery
+    assert all("--port-range" in text for text in domain.inside.port_shortages.values())
+    assert domain.inside.port_shortages
 
 
 def test_who_has_gone_gives_everything_back() -> None:
-    one = domain()
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    free = one.ports.pool.free
-    one.expire(NOW + 21)
-    assert not one.inside.by_prefix
-    assert not one.outside.by_prefix
-    assert not one.inside.leases
-    assert not one.outside.stand_ins
-    assert one.ports.pool.free == free + 2
-    meet(one)
-    assert to(one.heard_inside(farewell(A), INSIDE, NOW), ROBOT)
-    assert not one.inside.by_prefix
-    assert one.ports.pool.free == free + 2
+    domain = make_domain()
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    free = domain.ports.pool.free
+    domain.expire(NOW + 21)
+    assert not domain.inside.by_prefix
+    assert not domain.outside.by_prefix
+    assert not domain.inside.leases
+    assert not domain.outside.stand_ins
+    assert domain.ports.pool.free == free + 2
+    meet(domain)
+    assert to(domain.heard_inside(farewell(A), INSIDE, NOW), ROBOT)
+    assert not domain.inside.by_prefix
+    assert domain.ports.pool.free == free + 2
 
 
 def test_ports_are_given_once_it_is_known_who_had_which() -> None:
-    one = domain()
-    told, asked = one.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
+    domain = make_domain()
+    told, asked = domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     assert {told.target, asked.target} == {HostPort(INSIDE, 7410)}
-    assert len(to(one.settle(0.5), INSIDE)) == 2  # asked again
-    assert not one.inside.leases
-    assert to(one.settle(0.1 + ANSWER_TIME), ROBOT)
-    assert one.inside.leases
+    assert len(to(domain.settle(0.5), INSIDE)) == 2  # asked again
+    assert not domain.inside.leases
+    assert to(domain.settle(0.1 + ANSWER_TIME), ROBOT)
+    assert domain.inside.leases
 
 
 def test_a_participant_says_which_ports_it_had() -> None:
-    one = domain()
-    one.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    number = one.own.keeper.number([45009, 45004])
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
+    number = domain.own.keeper.number([45009, 45004])
     body = struct.pack(">II", 0x000003C7, SEDP_WRITERS) + struct.pack("<iIIi", 0, number, 0, 1)
-    meant = submessage(0x0E, 0, one.own.keeper.prefix)
+    meant = submessage(0x0E, 0, domain.own.keeper.prefix)
     answer = message(meant, submessage(0x06, 2, body), prefix=A)
-    one.heard_inside(answer, OTHER, 0.2)
-    assert not one.own.keeper.number_by_prefix  # from somewhere else it is nobody's word
-    one.heard_inside(answer, INSIDE, 0.2)
-    one.settle(SETTLING)
-    ports = {lease.target.port: port for port, (_, lease) in one.inside.leases.items()}
+    domain.heard_inside(answer, OTHER, 0.2)
+    assert not domain.own.keeper.number_by_prefix  # from somewhere else it is nobody's word
+    domain.heard_inside(answer, INSIDE, 0.2)
+    domain.settle(SETTLING)
+    ports = {lease.target.port: port for port, (_, lease) in domain.inside.leases.items()}
     assert ports == {7410: 45009, 7411: 45004}
 
 
 def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
     """The proxy may be killed at any time."""
-    one = domain()
+    domain = make_domain()
 
     def reminded() -> list[int]:
-        told = [sent for sent in to(meet(one), INSIDE) if source_prefix(sent) == keeper.prefix]
+        told = [sent for sent in to(meet(domain), INSIDE) if source_prefix(sent) == keeper.prefix]
         return [beat.first for sent in told for beat in heartbeats(sent)]
 
-    keeper = one.own.keeper
+    keeper = domain.own.keeper
     numbers = reminded()
-    assert numbers == [keeper.number(one.inside.by_prefix[A].ports)]
+    assert numbers == [keeper.number(domain.inside.by_prefix[A].ports)]
     assert reminded() == []  # not by each announcement
 
 
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
-    one = domain()
-    meet(one)
-    told, reminder = one.own.port_reminders()
+    domain = make_domain()
+    meet(domain)
+    told, reminder = domain.own.port_reminders()
     assert {told.target, reminder.target} == {HostPort(INSIDE, 7410)}
-    assert one.own.port_reminders()
-    ports = [lease.port for lease in one.inside.by_prefix[A].leases.values()]
-    one.own.keeper.number_by_prefix[A] = one.own.keeper.number(ports)
-    assert one.own.port_reminders() == []
+    assert domain.own.port_reminders()
+    ports = [lease.port for lease in domain.inside.by_prefix[A].leases.values()]
+    domain.own.keeper.number_by_prefix[A] = domain.own.keeper.number(ports)
+    assert domain.own.port_reminders() == []
 
 
 @given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, EAR.host]))
 @pytest.mark.parametrize("start", [b"", b"RTPS\x02\x03\x01\x0f" + A, spdp(A, INSIDE)[:120]])
 def test_nothing_that_is_sent_breaks_it(start: bytes, rest: bytes, source: str) -> None:
-    one, datagram = domain(), start + rest
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = one.outside.stand_ins
-    one.heard_inside(datagram, source, NOW)
-    one.heard_outside(datagram, source, NOW)
-    one.at_stand_in(stand_in, datagram, source, NOW)
+    domain, datagram = make_domain(), start + rest
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = domain.outside.stand_ins
+    domain.heard_inside(datagram, source, NOW)
+    domain.heard_outside(datagram, source, NOW)
+    domain.at_stand_in(stand_in, datagram, source, NOW)
     for port in range(45000, 45016):
-        one.at_lease(port, datagram, source, NOW)
-    one.expire(NOW)
-    assert one.inside.by_prefix.keys() >= {A}
+        domain.at_lease(port, datagram, source, NOW)
+    domain.expire(NOW)
+    assert domain.inside.by_prefix.keys() >= {A}
 
 
 def test_one_source_may_make_so_much_discovery() -> None:
-    one = domain()
-    meet(one)
-    one.rates.charge(INSIDE, int(BURST))
-    assert one.heard_inside(spdp(A, INSIDE), INSIDE, NOW) == []
-    assert one.heard_inside(spdp(B, OTHER), OTHER, NOW)
-    assert one.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 1)
+    domain = make_domain()
+    meet(domain)
+    domain.rates.charge(INSIDE, int(BURST))
+    assert domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW) == []
+    assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW)
+    assert domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 1)
 
 
 def test_an_announcement_is_charged_with_what_it_leads_to() -> None:
-    one = domain()
+    domain = make_domain()
     for number in range(40):
-        one.heard_outside(spdp(bytes([9, number]) + B[2:], ROBOT), ROBOT, NOW)
-    meet(one)
-    left = sum(1 for _ in range(int(BURST)) if one.heard_inside(spdp(A, INSIDE), INSIDE, NOW))
+        domain.heard_outside(spdp(bytes([9, number]) + B[2:], ROBOT), ROBOT, NOW)
+    meet(domain)
+    left = sum(1 for _ in range(int(BURST)) if domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW))
     assert left < BURST / 2
 
 
 @pytest.mark.parametrize("outside", [False, True])
 def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
     """Cyclone DDS answers the observer's announcement with its own, which names the observer."""
-    one = domain()
-    meet(one)
+    domain = make_domain()
+    meet(domain)
     told = spdp(B, ROBOT if outside else OTHER)
-    answer = told[:20] + submessage(0x0E, 0, one.own.observer.prefix) + told[20:]
+    answer = told[:20] + submessage(0x0E, 0, domain.own.observer.prefix) + told[20:]
     if outside:
-        sent = to(one.heard_outside(answer, ROBOT, NOW), INSIDE)
+        sent = to(domain.heard_outside(answer, ROBOT, NOW), INSIDE)
     else:
-        sent = to(one.heard_inside(answer, OTHER, NOW), ROBOT)
+        sent = to(domain.heard_inside(answer, OTHER, NOW), ROBOT)
     assert [destination(datagram) for datagram in sent] == [None]
 
 
 def test_who_has_heard_the_observer_may_announce_itself() -> None:
     """On a LAN, whose participants are nobody's peers, they answer it directly, where one of the
     same host was heard by the ear."""
-    one = domain(peers=())
-    meet(one)
+    domain = make_domain(peers=())
+    meet(domain)
     neighbour = b"\x01\x10" + bytes(10)
-    one.heard_outside(wrapped(ROBOT, spdp(neighbour, ROBOT)), EAR.host, NOW)
+    domain.heard_outside(wrapped(ROBOT, spdp(neighbour, ROBOT)), EAR.host, NOW)
     answer = spdp(B, ROBOT)
-    named = answer[:20] + submessage(0x0E, 0, one.own.observer.prefix) + answer[20:]
-    assert one.heard_outside(answer, ROBOT, NOW) == []
-    assert to(one.heard_outside(named, ROBOT, NOW), INSIDE)
-    assert to(one.heard_outside(answer, ROBOT, NOW), INSIDE)
-    assert one.heard_outside(answer, STRANGER, NOW) == []
+    named = answer[:20] + submessage(0x0E, 0, domain.own.observer.prefix) + answer[20:]
+    assert domain.heard_outside(answer, ROBOT, NOW) == []
+    assert to(domain.heard_outside(named, ROBOT, NOW), INSIDE)
+    assert to(domain.heard_outside(answer, ROBOT, NOW), INSIDE)
+    assert domain.heard_outside(answer, STRANGER, NOW) == []
 
 
 def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
-    one = domain()
-    meet(one), meet(one, B, OTHER)
-    taken = one.ports.pool.free
+    domain = make_domain()
+    meet(domain), meet(domain, B, OTHER)
+    taken = domain.ports.pool.free
 
-    sent = one.gone({INSIDE})
+    sent = domain.gone({INSIDE})
 
-    assert [outgoing.target for outgoing in sent] == one.settings.announcement_targets()
-    (found,) = read_discovery(sent[0].datagram).announcements
-    assert (found.ended, found.sample.prefix, found.sample.sequence) == (True, A, LAST_SEQUENCE)
+    assert [outgoing.target for outgoing in sent] == domain.settings.announcement_targets()
+    (announcement,) = read_discovery(sent[0].datagram).announcements
+    assert (announcement.ended, announcement.sample.prefix, announcement.sample.sequence) == (
+        True,
+        A,
+        LAST_SEQUENCE,
+    )
     assert source_vendor(sent[0].datagram) == A[:2]
-    assert [*one.inside.by_prefix] == [B]
-    assert one.ports.pool.free == taken + 2
-    assert one.gone({INSIDE}) == []
+    assert [*domain.inside.by_prefix] == [B]
+    assert domain.ports.pool.free == taken + 2
+    assert domain.gone({INSIDE}) == []
 
 
 def test_who_is_gone_gets_no_port_any_more() -> None:
-    one = domain()
-    one.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    assert one.returning.waiting
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
+    assert domain.returning.waiting
 
-    one.gone({INSIDE})
-    one.settle(SETTLING + ANSWER_TIME + 1)
+    domain.gone({INSIDE})
+    domain.settle(SETTLING + ANSWER_TIME + 1)
 
-    assert not one.inside.by_prefix
+    assert not domain.inside.by_prefix
 
 
 def test_no_port_of_the_range_stands_in() -> None:
     """Wherever the range lies, for the proxy listens there."""
-    one = domain()
-    one.heard_outside(spdp(A, ROBOT), ROBOT, NOW)
-    meet(one, B)
-    (free,) = one.outside.stand_ins
+    domain = make_domain()
+    domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW)
+    meet(domain, B)
+    (free,) = domain.outside.stand_ins
 
     ports = PortRange(free - 8, free + 7)
-    one = domain(ports=PortMap(ports, ports))
-    one.heard_outside(spdp(A, ROBOT), ROBOT, NOW)
-    meet(one, B)
+    domain = make_domain(ports=PortMap(ports, ports))
+    domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW)
+    meet(domain, B)
 
-    (port,) = one.outside.stand_ins
+    (port,) = domain.outside.stand_ins
     assert port not in ports

@@ -16,7 +16,7 @@ from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, destination, su
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
 from tests.unit.ros2.protocol.messages import PREFIX, data, fragment, message, payload, submessage
 
-HERE, THERE = HostPort("172.30.0.5", 7411), HostPort("10.0.0.1", 45001)
+LOCATOR, LEASED = HostPort("172.30.0.5", 7411), HostPort("10.0.0.1", 45001)
 PORT, READER = 45000, b"reader's pre"
 HEARTBEAT = submessage(0x07, 0, bytes(28))
 
@@ -25,28 +25,28 @@ def described(padding: int) -> bytes:
     """The payload of an announcement: a locator in front, one at the end, and much between."""
     return payload(
         [
-            (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HERE, "<")),
+            (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(LOCATOR, "<")),
             (0x8000, bytes(range(4)) * padding),
-            (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HERE, "<")),
+            (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(LOCATOR, "<")),
         ]
     )
 
 
 def cut(whole: bytes, size: int, sequence: int = 1) -> list[bytes]:
     """A datagram for each fragment, each with something else behind it."""
-    parts = [whole[at : at + size] for at in range(0, len(whole), size)]
+    chunks = [whole[at : at + size] for at in range(0, len(whole), size)]
     return [
-        message(fragment(part, number, size, len(whole), sequence=sequence), HEARTBEAT)
-        for number, part in enumerate(parts, 1)
+        message(fragment(chunk, number, size, len(whole), sequence=sequence), HEARTBEAT)
+        for number, chunk in enumerate(chunks, 1)
     ]
 
 
 def led(told: DiscoveryMessage) -> bytes:
-    return rewritten(told, lambda pid, where: THERE, lambda _: False)
+    return rewritten(told, lambda pid, locator: LEASED, lambda _: False)
 
 
 def hidden(told: DiscoveryMessage) -> bytes:
-    return rewritten(told, lambda pid, where: THERE, lambda _: True)
+    return rewritten(told, lambda pid, locator: LEASED, lambda _: True)
 
 
 def through(
@@ -72,7 +72,7 @@ def test_fragments_carry_what_the_whole_would(
     order = sent * (1 + twice)
     dice.shuffle(order)
     store = FragmentStores()
-    got = [one for datagram in order for one in through(store, datagram)]
+    got = [forwarded for datagram in order for forwarded in through(store, datagram)]
     assert sorted(got) == sorted(cut(after, size) * (1 + twice))
     again = dice.choice(range(len(sent)))
     assert through(store, sent[again]) == [cut(after, size)[again]]
@@ -86,7 +86,7 @@ def test_nothing_goes_on_before_all_is_there() -> None:
 
 def test_what_is_hidden_is_a_gap_in_each_datagram() -> None:
     store, sent = FragmentStores(), cut(described(300), 128)
-    got = [one for datagram in sent for one in through(store, datagram, hidden)]
+    got = [forwarded for datagram in sent for forwarded in through(store, datagram, hidden)]
     for before, after in zip(sent, got, strict=True):
         kinds = [kind for kind, _, _ in submessages(after)]
         assert kinds == [SubmessageId.GAP, SubmessageId.PAD, SubmessageId.HEARTBEAT]
@@ -150,7 +150,7 @@ def test_so_much_is_remembered_of_a_participant_and_no_more(
     stores = FragmentStores()
     for sequence in range(1, 30):
         through(stores, cut(described(100), 128, sequence)[0])
-    assert stores.size == sum(one.size for one in stores.by_prefix.values())
+    assert stores.size == sum(store.size for store in stores.by_prefix.values())
     (store,) = stores.by_prefix.values()
     assert len(store._samples) <= 3
     assert len(store._waiting_datagrams) <= 3
@@ -171,9 +171,9 @@ def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_datagram_has_so_many_fragments_and_no_more() -> None:
-    part = fragment(bytes(128), 1, 128, 300)
+    data_frag = fragment(bytes(128), 1, 128, 300)
     with pytest.raises(RtpsError):
-        through(FragmentStores(), message(*[part] * (fragments.MOST_FRAGMENTS + 1)))
+        through(FragmentStores(), message(*[data_frag] * (fragments.MOST_FRAGMENTS + 1)))
 
 
 @given(st.binary(max_size=200))

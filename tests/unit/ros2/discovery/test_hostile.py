@@ -33,8 +33,8 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
-    domain,
     farewell,
+    make_domain,
     meet,
     sedp,
     spdp,
@@ -54,56 +54,56 @@ def heartbeat(first: int, last: int) -> bytes:
 
 def test_a_number_that_has_no_next_one_is_malformed() -> None:
     """It broke the writing of a GAP, an answer or a farewell, and kept a policy from others."""
-    one = domain(judge=lambda kind, *_: kind is not RuleKind.PUBLISH)
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = one.outside.stand_ins
+    domain = make_domain(judge=lambda kind, *_: kind is not RuleKind.PUBLISH)
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = domain.outside.stand_ins
     last = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER)
     over = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER + 1)
     below = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=-1)
-    assert one.at_stand_in(stand_in, message(last, prefix=A), INSIDE, NOW)
+    assert domain.at_stand_in(stand_in, message(last, prefix=A), INSIDE, NOW)
     for bad in (over, below, heartbeat(1, LAST_NUMBER + 1)):
-        before = one.refused.count
-        assert one.heard_inside(message(bad, prefix=A), INSIDE, NOW) == []
-        assert one.refused.count == before + 1
-    assert one.heard_inside(message(heartbeat(1, LAST_NUMBER), prefix=A), INSIDE, NOW)
-    assert to(one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW), ROBOT)
+        before = domain.refused.count
+        assert domain.heard_inside(message(bad, prefix=A), INSIDE, NOW) == []
+        assert domain.refused.count == before + 1
+    assert domain.heard_inside(message(heartbeat(1, LAST_NUMBER), prefix=A), INSIDE, NOW)
+    assert to(domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW), ROBOT)
 
 
 def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
     """An end went on as it came, and what outside announced was not judged."""
-    one = domain(judge=lambda *_: False)
-    meet(one)
+    domain = make_domain(judge=lambda *_: False)
+    meet(domain)
     behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
-    (told,) = to(one.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW), INSIDE)
+    (told,) = to(domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW), INSIDE)
     assert len(told) == len(spdp(B, ROBOT) + behind)
-    (ended,) = to(one.heard_inside(farewell(A) + behind, INSIDE, NOW), ROBOT)
+    (ended,) = to(domain.heard_inside(farewell(A) + behind, INSIDE, NOW), ROBOT)
     for sent in (told, ended):
         assert b"chatter" not in sent
-    assert not one.inside.by_prefix
+    assert not domain.inside.by_prefix
 
 
 def test_fragments_are_judged_anew_by_another_policy() -> None:
     allowed = True
-    one = domain(judge=lambda *_: allowed)
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = one.outside.stand_ins
+    domain = make_domain(judge=lambda *_: allowed)
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = domain.outside.stand_ins
     whole = payload([TOPIC, (0x8000, bytes(100))])
-    part = fragment(whole, 1, 200, len(whole), writer=SEDP_WRITERS)
-    datagram = message(part, prefix=A)
-    (sent,) = one.at_stand_in(stand_in, datagram, INSIDE, NOW)
+    data_frag = fragment(whole, 1, 200, len(whole), writer=SEDP_WRITERS)
+    datagram = message(data_frag, prefix=A)
+    (sent,) = domain.at_stand_in(stand_in, datagram, INSIDE, NOW)
     assert b"chatter" in sent.datagram
     allowed = False
-    one.apply_policy(NOW)
-    one.settle(NOW + APART_TIME)
-    (sent,) = one.at_stand_in(stand_in, datagram, INSIDE, NOW)
+    domain.apply_policy(NOW)
+    domain.settle(NOW + APART_TIME)
+    (sent,) = domain.at_stand_in(stand_in, datagram, INSIDE, NOW)
     assert b"chatter" not in sent.datagram
 
 
 def test_an_exhausted_range_is_not_sorted_for_each_locator(monkeypatch: pytest.MonkeyPatch) -> None:
     """A datagram with two thousand locators took 140 ms, by which nobody else was served."""
-    one, ordered = domain(), list[str]()
+    domain, ordered = make_domain(), list[str]()
 
     def order_for(key: str, ports: PortRange) -> Iterator[int]:
         ordered.append(key)
@@ -114,98 +114,98 @@ def test_an_exhausted_range_is_not_sorted_for_each_locator(monkeypatch: pytest.M
         (Pid.UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 1000 + number), "<"))
         for number in range(400)
     ]
-    meet(one)
+    meet(domain)
     long = message(data(payload(locators), writer=SEDP_WRITERS), prefix=A)
-    one.heard_inside(long, INSIDE, NOW)
+    domain.heard_inside(long, INSIDE, NOW)
     assert len(ordered) == 15  # the ports that there are
 
 
 def test_announcements_and_topics_have_a_length() -> None:
     """They are kept: of 64 kB each, those of one address could take gigabytes."""
-    one = domain()
-    meet(one)
+    domain = make_domain()
+    meet(domain)
     long = message(data(payload([(Pid.TOPIC_NAME, bytes(2000))])), prefix=B)
     filled = message(submessage(0x01, 0, bytes(9000)), prefix=B) + spdp(B, INSIDE)[20:]
     named = payload([(Pid.TOPIC_NAME, struct.pack("<I", 2000) + b"a" * 2000)])
     for bad in (long, filled, message(data(named, writer=SEDP_WRITERS), prefix=A)):
-        before = one.refused.count
-        assert one.heard_inside(bad, INSIDE, NOW) == []
-        assert one.refused.count == before + 1
-    assert one.inside.by_prefix.keys() == {A}
+        before = domain.refused.count
+        assert domain.heard_inside(bad, INSIDE, NOW) == []
+        assert domain.refused.count == before + 1
+    assert domain.inside.by_prefix.keys() == {A}
 
 
 def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(participants, "MOST_ENDPOINTS_PER_ADDRESS", 5)
     notes, many = EndpointNotes(), [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
     end = DdsEndpoint(EndpointKind.READER, "t", "T")
-    for one in many:
-        notes.note(one, b"0001", end)
-        notes.note(one, b"0001", end)
-    assert [len(one.endpoints) for one in many] == [1] * 5 + [0] * 4
+    for participant in many:
+        notes.note(participant, b"0001", end)
+        notes.note(participant, b"0001", end)
+    assert [len(participant.endpoints) for participant in many] == [1] * 5 + [0] * 4
     notes.note(many[0], b"0001", None)
     notes.note(many[8], b"0001", end)
     assert (
         notes.total
         == notes.count_by_address[INSIDE]
-        == sum(len(one.endpoints) for one in many)
+        == sum(len(participant.endpoints) for participant in many)
         == 5
     )
-    for one in many:
-        notes.forget(one)
+    for participant in many:
+        notes.forget(participant)
     assert (notes.total, notes.count_by_address) == (0, {})
 
 
 def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
-    one = domain()
+    domain = make_domain()
     for number in range(MOST_INSIDE + 1):
-        one.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, 0.1)
-    assert len(one.returning.waiting) == MOST_PER_ADDRESS
-    assert one.heard_inside(spdp(A, OTHER), OTHER, 0.2)
-    assert A in one.returning.waiting
-    one.settle(0.2 + ANSWER_TIME)
-    assert not one.returning.waiting
-    assert one.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
+        domain.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, 0.1)
+    assert len(domain.returning.waiting) == MOST_PER_ADDRESS
+    assert domain.heard_inside(spdp(A, OTHER), OTHER, 0.2)
+    assert A in domain.returning.waiting
+    domain.settle(0.2 + ANSWER_TIME)
+    assert not domain.returning.waiting
+    assert domain.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
 
 
 def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
-    one = domain(peers=(ROBOT, STRANGER))
+    domain = make_domain(peers=(ROBOT, STRANGER))
     for number in range(MOST_PER_HOST + 9):
-        one.heard_outside(spdp(number.to_bytes(12, "big"), ROBOT), ROBOT, NOW)
-    assert len(one.outside.by_prefix) == MOST_PER_HOST
-    one.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
-    assert B in one.outside.by_prefix
-    one.expire(NOW + 21)
-    assert not one.outside.count_by_address
+        domain.heard_outside(spdp(number.to_bytes(12, "big"), ROBOT), ROBOT, NOW)
+    assert len(domain.outside.by_prefix) == MOST_PER_HOST
+    domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
+    assert B in domain.outside.by_prefix
+    domain.expire(NOW + 21)
+    assert not domain.outside.count_by_address
 
 
 def test_nobody_proves_anything_by_the_ear() -> None:
     """Whoever can send as the ear's host could have the proxy send to any address."""
-    one = domain(peers=())
-    one.own.observer.prefix = bytes([7]) * 12
-    meet(one)
-    one.heard_outside(wrapped(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
-    answer = sedp(B, ROBOT, 7411, to=one.own.observer.prefix)
-    one.heard_outside(wrapped(ROBOT, answer), EAR.host, NOW)
-    assert not one.outside.by_prefix[B].proven
-    one.heard_outside(answer, ROBOT, NOW)
-    assert one.outside.by_prefix[B].proven
+    domain = make_domain(peers=())
+    domain.own.observer.prefix = bytes([7]) * 12
+    meet(domain)
+    domain.heard_outside(wrapped(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
+    answer = sedp(B, ROBOT, 7411, to=domain.own.observer.prefix)
+    domain.heard_outside(wrapped(ROBOT, answer), EAR.host, NOW)
+    assert not domain.outside.by_prefix[B].proven
+    domain.heard_outside(answer, ROBOT, NOW)
+    assert domain.outside.by_prefix[B].proven
 
 
 def test_who_waits_does_not_take_the_prefix_of_somebody_met_meanwhile() -> None:
-    one = domain()
-    one.heard_inside(spdp(B, INSIDE), INSIDE, 0.1)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, 0.2)
-    one.settle(0.1 + ANSWER_TIME)
-    assert B in one.outside.by_prefix
-    assert B not in one.inside.by_prefix
+    domain = make_domain()
+    domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.1)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.2)
+    domain.settle(0.1 + ANSWER_TIME)
+    assert B in domain.outside.by_prefix
+    assert B not in domain.inside.by_prefix
 
 
 def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> None:
     """It was kept without its message, and every later look at all participants failed by it."""
     denied: list[str] = []
-    d = domain(judge=lambda _kind, name, _address: name not in denied)
-    d.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
-    d.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     evil = b"\x01\x0f" + bytes([0x5A] * 10)
     told = payload(
         [
@@ -215,19 +215,19 @@ def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> No
     )
     for size in (0, 4, 11):
         half = message(submessage(0x0E, 0, bytes(size)), data(told), prefix=evil)
-        d.heard_outside(wrapped(STRANGER, half), EAR.host, NOW)
-        d.heard_inside(half, OTHER, NOW)
-    assert evil not in {*d.outside.by_prefix, *d.inside.by_prefix}
+        domain.heard_outside(wrapped(STRANGER, half), EAR.host, NOW)
+        domain.heard_inside(half, OTHER, NOW)
+    assert evil not in {*domain.outside.by_prefix, *domain.inside.by_prefix}
     denied.append("/chatter")
-    d.apply_policy(NOW)
+    domain.apply_policy(NOW)
 
 
 def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forged sources have an allowance each."""
-    one = domain()
-    meet(one)
+    domain = make_domain()
+    meet(domain)
     monkeypatch.setattr(discovery_domain, "read_discovery", None)
-    one.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
-    for port in one.inside.leases:
-        one.at_lease(port, message(prefix=B), STRANGER, NOW)
-    assert STRANGER not in one.rates._remaining
+    domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
+    for port in domain.inside.leases:
+        domain.at_lease(port, message(prefix=B), STRANGER, NOW)
+    assert STRANGER not in domain.rates._remaining

@@ -19,8 +19,8 @@ from tests.unit.ros2.discovery.domains import (
     ROBOT,
     A,
     B,
-    domain,
     farewell,
+    make_domain,
     meet,
     sedp,
     spdp,
@@ -32,7 +32,7 @@ PORTS = (RANGE.listen.last, RANGE.listen.last - 1)
 
 
 def by(prefix: bytes, datagrams: list[bytes]) -> list[bytes]:
-    return [one for one in datagrams if source_prefix(one) == prefix]
+    return [datagram for datagram in datagrams if source_prefix(datagram) == prefix]
 
 
 def is_farewell(datagram: bytes) -> bool:
@@ -41,120 +41,120 @@ def is_farewell(datagram: bytes) -> bool:
 
 
 def test_those_inside_are_introduced_to_each_other_as_they_are() -> None:
-    one = domain()
-    meet(one, A, INSIDE)
+    domain = make_domain()
+    meet(domain, A, INSIDE)
 
-    sent = one.heard_inside(spdp(B, OTHER), OTHER, NOW)
+    sent = domain.heard_inside(spdp(B, OTHER), OTHER, NOW)
 
     assert by(B, to(sent, INSIDE)) == [spdp(B, OTHER)]
-    again = one.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    again = domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
     assert by(A, to(again, OTHER)) == [spdp(A, INSIDE)]
 
 
 def test_who_is_heard_by_multicast_needs_no_introduction() -> None:
-    one = domain()
-    meet(one, A, INSIDE)
-    meet(one, B, OTHER)
-    one.inside.note_in_group(spdp(B, OTHER), OTHER)
+    domain = make_domain()
+    meet(domain, A, INSIDE)
+    meet(domain, B, OTHER)
+    domain.inside.note_in_group(spdp(B, OTHER), OTHER)
 
-    assert by(B, to(one.heard_inside(spdp(B, OTHER), OTHER, NOW), INSIDE)) == []
-    one.inside.note_in_group(b"no RTPS message", OTHER)
+    assert by(B, to(domain.heard_inside(spdp(B, OTHER), OTHER, NOW), INSIDE)) == []
+    domain.inside.note_in_group(b"no RTPS message", OTHER)
 
 
 def test_those_on_other_networks_are_not_introduced() -> None:
-    one = domain()
-    one.settings.proxy_address_for = lambda address: address
-    meet(one, A, INSIDE)
-    assert by(B, to(meet(one, B, OTHER), INSIDE)) == []
+    domain = make_domain()
+    domain.settings.proxy_address_for = lambda address: address
+    meet(domain, A, INSIDE)
+    assert by(B, to(meet(domain, B, OTHER), INSIDE)) == []
 
 
 def moved(ear: HostPort | None = None) -> Domain:
     """One whose participant has known the proxy at another address; the robot is there."""
-    one = domain(peers=(ROBOT,), ear=ear)
-    one.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
-    one.returning.note_former({A: PORTS}, one.inside.by_prefix)
-    return one
+    domain = make_domain(peers=(ROBOT,), ear=ear)
+    domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
+    domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
+    return domain
 
 
 def test_ports_are_those_at_the_proxy_before() -> None:
-    one = moved()
-    meet(one)
-    assert tuple(one.inside.by_prefix[A].ports) == PORTS
+    domain = moved()
+    meet(domain)
+    assert tuple(domain.inside.by_prefix[A].ports) == PORTS
 
 
 def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
-    one = moved()
+    domain = moved()
 
-    sent = meet(one)
-    assert is_farewell(by(one.own.keeper.prefix, to(sent, INSIDE))[0])
+    sent = meet(domain)
+    assert is_farewell(by(domain.own.keeper.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
-    parting, meeting = one.settle(NOW), one.settle(NOW + APART_TIME)
+    parting, meeting = domain.settle(NOW), domain.settle(NOW + APART_TIME)
 
     for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
-        assert [is_farewell(each) for each in told] == [True]
+        assert [is_farewell(datagram) for datagram in told] == [True]
     for told in (by(C, to(meeting, INSIDE)), by(A, to(meeting, ROBOT))):
-        assert [is_farewell(each) for each in told] == [False]
-    assert not one.is_kept(one.inside.by_prefix[A])
-    again = one.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
-    assert [is_farewell(each) for each in by(C, to(again, INSIDE))] == [False]
+        assert [is_farewell(datagram) for datagram in told] == [False]
+    assert not domain.is_kept(domain.inside.by_prefix[A])
+    again = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
+    assert [is_farewell(datagram) for datagram in by(C, to(again, INSIDE))] == [False]
 
 
 def test_they_meet_anew_once_the_ear_is_heard() -> None:
     """It starts after the proxy. What outside is not told it does not forget."""
-    one = moved(EAR)
-    meet(one)
-    assert one.settle(NOW) == one.settle(NOW + 1) == []
+    domain = moved(EAR)
+    meet(domain)
+    assert domain.settle(NOW) == domain.settle(NOW + 1) == []
 
     carried = wrapped(ROBOT, spdp(C, ROBOT))
-    assert by(C, to(one.heard_outside(carried, EAR.host, NOW + 1), INSIDE)) == []
+    assert by(C, to(domain.heard_outside(carried, EAR.host, NOW + 1), INSIDE)) == []
 
-    parting = one.settle(NOW + 1)
-    assert [is_farewell(each) for each in by(A, to(parting, EAR.host))] == [True]
-    assert [is_farewell(each) for each in by(C, to(parting, INSIDE))] == [True]
+    parting = domain.settle(NOW + 1)
+    assert [is_farewell(datagram) for datagram in by(A, to(parting, EAR.host))] == [True]
+    assert [is_farewell(datagram) for datagram in by(C, to(parting, INSIDE))] == [True]
 
 
 def test_they_meet_anew_though_nobody_is_on_the_ears_lan() -> None:
-    one = moved(EAR)
-    meet(one)
-    assert by(A, to(one.settle(NOW + EAR_TIME), ROBOT))
+    domain = moved(EAR)
+    meet(domain)
+    assert by(A, to(domain.settle(NOW + EAR_TIME), ROBOT))
 
 
 def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
-    one = moved()
-    meet(one)
-    one.settle(NOW)
-    one.settle(NOW + APART_TIME)
-    later = by(B, to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
-    assert [is_farewell(each) for each in later] == [True, False]
-    one.heard_outside(farewell(B), ROBOT, NOW + 1)
-    assert one.inside.by_prefix[A].farewell_times == {C: NOW}
+    domain = moved()
+    meet(domain)
+    domain.settle(NOW)
+    domain.settle(NOW + APART_TIME)
+    later = by(B, to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
+    assert [is_farewell(datagram) for datagram in later] == [True, False]
+    domain.heard_outside(farewell(B), ROBOT, NOW + 1)
+    assert domain.inside.by_prefix[A].farewell_times == {C: NOW}
 
 
 def test_who_does_not_take_it_in_is_told_again() -> None:
     """Datagrams get lost where dozens meet at once."""
-    one = moved()
-    meet(one)
-    one.settle(NOW)
-    one.settle(NOW + APART_TIME)
+    domain = moved()
+    meet(domain)
+    domain.settle(NOW)
+    domain.settle(NOW + APART_TIME)
 
     def told(later: float) -> list[bool]:
-        sent = one.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
-        return [is_farewell(each) for each in by(C, to(sent, INSIDE))]
+        sent = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
+        return [is_farewell(datagram) for datagram in by(C, to(sent, INSIDE))]
 
     assert told(FAREWELL_INTERVAL - 0.1) == [False]
     assert told(FAREWELL_INTERVAL) == [True, False]
-    (stand_in,) = one.outside.stand_ins
-    one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + FAREWELL_INTERVAL)
+    (stand_in,) = domain.outside.stand_ins
+    domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + FAREWELL_INTERVAL)
     assert told(3 * FAREWELL_INTERVAL) == [False]
 
 
 def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
-    one, port = moved(), RANGE.listen.last - 2
-    one.returning.note_former({A: (*PORTS, port)}, {})
-    meet(one)
-    one.settle(NOW)
-    one.heard_inside(sedp(A, INSIDE, 7000, to=one.own.observer.prefix), INSIDE, NOW)
-    assert tuple(one.inside.by_prefix[A].ports) == (*PORTS, port)
+    domain, port = moved(), RANGE.listen.last - 2
+    domain.returning.note_former({A: (*PORTS, port)}, {})
+    meet(domain)
+    domain.settle(NOW)
+    domain.heard_inside(sedp(A, INSIDE, 7000, to=domain.own.observer.prefix), INSIDE, NOW)
+    assert tuple(domain.inside.by_prefix[A].ports) == (*PORTS, port)
 
 
 @pytest.mark.parametrize("ports", [(80,), (RANGE.listen.last + 1,), (*PORTS, 80)])
@@ -162,32 +162,32 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     ports: tuple[int, ...],
 ) -> None:
     """Outside heeds no other locators of whom it knows."""
-    one = domain(peers=(ROBOT,), ear=None)
-    one.returning.note_former({A: ports}, one.inside.by_prefix)
-    meet(one)
-    assert not set(one.inside.by_prefix[A].ports) & set(ports)
-    parting, meeting = one.settle(NOW), one.settle(NOW + APART_TIME)
-    assert [is_farewell(each) for each in by(A, to(parting, ROBOT))] == [True]
-    assert [is_farewell(each) for each in by(A, to(meeting, ROBOT))] == [False]
+    domain = make_domain(peers=(ROBOT,), ear=None)
+    domain.returning.note_former({A: ports}, domain.inside.by_prefix)
+    meet(domain)
+    assert not set(domain.inside.by_prefix[A].ports) & set(ports)
+    parting, meeting = domain.settle(NOW), domain.settle(NOW + APART_TIME)
+    assert [is_farewell(datagram) for datagram in by(A, to(parting, ROBOT))] == [True]
+    assert [is_farewell(datagram) for datagram in by(A, to(meeting, ROBOT))] == [False]
 
 
 def test_who_had_no_ports_was_not_there() -> None:
-    one = domain(ear=EAR)
-    one.returning.note_former({A: ()}, one.inside.by_prefix)
-    sent = meet(one)
-    assert one.inside.by_prefix[A].ports
-    told = by(one.own.keeper.prefix, to(sent, INSIDE))
+    domain = make_domain(ear=EAR)
+    domain.returning.note_former({A: ()}, domain.inside.by_prefix)
+    sent = meet(domain)
+    assert domain.inside.by_prefix[A].ports
+    told = by(domain.own.keeper.prefix, to(sent, INSIDE))
     assert told
     assert not any(map(is_farewell, told))
 
 
 def test_who_is_there_already_keeps_what_he_has() -> None:
-    one = domain()
-    meet(one)
-    before = one.inside.by_prefix[A].ports
-    one.returning.note_former({A: PORTS}, one.inside.by_prefix)
-    meet(one)
-    assert one.inside.by_prefix[A].ports == before
+    domain = make_domain()
+    meet(domain)
+    before = domain.inside.by_prefix[A].ports
+    domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
+    meet(domain)
+    assert domain.inside.by_prefix[A].ports == before
 
 
 def test_news_of_peers_and_former_ports_are_read() -> None:

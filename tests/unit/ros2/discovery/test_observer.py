@@ -25,13 +25,13 @@ def asked(answer: bytes) -> tuple[int, list[int], bool]:
     high, low, bits = struct.unpack_from("<iII", answer, body.start + 8)
     words = struct.unpack_from(f"<{-(-bits // 32)}I", answer, body.start + 20)
     base = (high << 32) + low
-    found = [base + bit for bit in range(bits) if words[bit // 32] >> (31 - bit % 32) & 1]
-    return base, found, bool(flags & 0x02)
+    numbers = [base + bit for bit in range(bits) if words[bit // 32] >> (31 - bit % 32) & 1]
+    return base, numbers, bool(flags & 0x02)
 
 
 def test_it_asks_first_what_there_is() -> None:
     observer = Observer(OWN)
-    assert [asked(one) for one in observer.first_question(PEER)] == [(1, [], False)] * 2
+    assert [asked(question) for question in observer.first_question(PEER)] == [(1, [], False)] * 2
 
 
 def test_who_has_nothing_gets_no_answer() -> None:

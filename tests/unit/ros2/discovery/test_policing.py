@@ -24,20 +24,22 @@ class Rules:
 
 
 def met(rules: Rules) -> Domain:
-    one = domains.domain(judge=rules)
-    meet(one)
-    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    return one
+    domain = domains.make_domain(judge=rules)
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    return domain
 
 
-def outwards(one: Domain) -> list[Outgoing]:
-    (stand_in,) = one.outside.stand_ins
-    return one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
+def outwards(domain: Domain) -> list[Outgoing]:
+    (stand_in,) = domain.outside.stand_ins
+    return domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
 
 
-def inwards(one: Domain) -> list[Outgoing]:
-    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.target.port == 7410]
-    return one.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+def inwards(domain: Domain) -> list[Outgoing]:
+    (port,) = [
+        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+    ]
+    return domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
 
 
 def kinds(sent: list[Outgoing]) -> list[int]:
@@ -45,19 +47,19 @@ def kinds(sent: list[Outgoing]) -> list[int]:
 
 
 def test_what_is_denied_goes_on_as_a_gap() -> None:
-    one = met(Rules(RuleKind.PUBLISH))
-    (sent,) = outwards(one)
+    domain = met(Rules(RuleKind.PUBLISH))
+    (sent,) = outwards(domain)
     assert kinds([sent]) == [SubmessageId.GAP, SubmessageId.PAD]
     assert b"chatter" not in sent.datagram
     assert len(sent.datagram) == len(sedp(A, INSIDE, 7000))
-    assert kinds(inwards(one)) == [SubmessageId.DATA]
+    assert kinds(inwards(domain)) == [SubmessageId.DATA]
 
 
 def test_it_holds_for_what_outside_announces() -> None:
     rules = Rules(RuleKind.SUBSCRIBE)
-    one = met(rules)
-    assert kinds(inwards(one)) == [SubmessageId.GAP, SubmessageId.PAD]
-    assert kinds(outwards(one)) == [SubmessageId.DATA]
+    domain = met(rules)
+    assert kinds(inwards(domain)) == [SubmessageId.GAP, SubmessageId.PAD]
+    assert kinds(outwards(domain)) == [SubmessageId.DATA]
     assert rules.asked == [
         (RuleKind.SUBSCRIBE, "/chatter", INSIDE),
         (RuleKind.PUBLISH, "/chatter", INSIDE),
@@ -66,22 +68,22 @@ def test_it_holds_for_what_outside_announces() -> None:
 
 def test_the_policy_is_asked_once() -> None:
     rules = Rules()
-    one = met(rules)
-    outwards(one)
-    outwards(one)
+    domain = met(rules)
+    outwards(domain)
+    outwards(domain)
     assert len(rules.asked) == 1
 
 
 def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
     rules = Rules()
-    one = met(rules)
-    outwards(one)
-    assert one.apply_policy(NOW) == []
+    domain = met(rules)
+    outwards(domain)
+    assert domain.apply_policy(NOW) == []
     rules.denied = {RuleKind.PUBLISH}
-    parting = one.apply_policy(NOW)
-    assert outwards(one) == inwards(one) == []
-    assert one.settle(NOW + APART_TIME / 2) == []
-    meeting = one.settle(NOW + APART_TIME)
+    parting = domain.apply_policy(NOW)
+    assert outwards(domain) == inwards(domain) == []
+    assert domain.settle(NOW + APART_TIME / 2) == []
+    meeting = domain.settle(NOW + APART_TIME)
     for host in (ROBOT, INSIDE):
         told = [
             (announced.ended, announced.sample.sequence)
@@ -90,14 +92,14 @@ def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
             for announced in read_discovery(datagram).announcements
         ]
         assert told == [(True, 2), (False, 1)]
-    assert kinds(outwards(one)) == [SubmessageId.GAP, SubmessageId.PAD]
-    assert one.apply_policy(NOW) == []
+    assert kinds(outwards(domain)) == [SubmessageId.GAP, SubmessageId.PAD]
+    assert domain.apply_policy(NOW) == []
 
 
 def test_the_proxy_itself_is_told_of_what_is_denied() -> None:
     """Its observer would ask for it again and again."""
-    one = met(Rules(RuleKind.PUBLISH))
-    told = sedp(A, INSIDE, 7000, to=one.own.observer.prefix)
-    one.heard_inside(told, INSIDE, NOW)
-    assert len(one.inside.by_prefix[A].endpoints) == 1
-    assert HostPort(INSIDE, 7000) in one.inside.by_prefix[A].leases
+    domain = met(Rules(RuleKind.PUBLISH))
+    told = sedp(A, INSIDE, 7000, to=domain.own.observer.prefix)
+    domain.heard_inside(told, INSIDE, NOW)
+    assert len(domain.inside.by_prefix[A].endpoints) == 1
+    assert HostPort(INSIDE, 7000) in domain.inside.by_prefix[A].leases

@@ -29,8 +29,8 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
-    domain,
     farewell,
+    make_domain,
     sedp,
     spdp,
 )
@@ -57,9 +57,11 @@ def heartbeat(prefix: bytes, meant: bytes, number: int) -> bytes:
 
 
 def fragmented(prefix: bytes, number: int, sequence: int, size: int) -> bytes:
-    part = DESCRIBED[(number - 1) * size : number * size]
-    cut = fragment(part, number, size, len(DESCRIBED), writer=SEDP_WRITERS, sequence=sequence)
-    return message(cut, prefix=prefix)
+    chunk = DESCRIBED[(number - 1) * size : number * size]
+    data_frag = fragment(
+        chunk, number, size, len(DESCRIBED), writer=SEDP_WRITERS, sequence=sequence
+    )
+    return message(data_frag, prefix=prefix)
 
 
 def told(prefix: bytes, sequence: int) -> bytes:
@@ -71,7 +73,11 @@ SAID = st.one_of(
     st.builds(spdp, PREFIX, ADDRESS),
     st.builds(farewell, PREFIX),
     st.builds(sedp, PREFIX, ADDRESS, PORT, MEANT),
-    st.builds(lambda one, other: one + other[20:], st.builds(spdp, PREFIX, ADDRESS), TOLD_BEHIND),
+    st.builds(
+        lambda announcement, behind: announcement + behind[20:],
+        st.builds(spdp, PREFIX, ADDRESS),
+        TOLD_BEHIND,
+    ),
     st.builds(heartbeat, PREFIX, MEANT, NUMBER),
     st.builds(fragmented, PREFIX, st.integers(1, 4), NUMBER, st.sampled_from([100, 128, 300])),
     st.builds(told, PREFIX, NUMBER),
@@ -82,10 +88,10 @@ SAID = st.one_of(
 @st.composite
 def datagrams(draw: st.DrawFn) -> bytes:
     """The same, damaged now and then."""
-    found = bytearray(draw(SAID))
+    datagram = bytearray(draw(SAID))
     for _ in range(draw(st.sampled_from([0, 0, 0, 1, 3]))):
-        found[draw(st.integers(0, len(found) - 1))] = draw(st.integers(0, 255))
-    return bytes(found[: draw(st.sampled_from([len(found)] * 4 + [len(found) // 2]))])
+        datagram[draw(st.integers(0, len(datagram) - 1))] = draw(st.integers(0, 255))
+    return bytes(datagram[: draw(st.sampled_from([len(datagram)] * 4 + [len(datagram) // 2]))])
 
 
 class Neighbours(RuleBasedStateMachine):
@@ -94,10 +100,10 @@ class Neighbours(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.denied = set[RuleKind]()
-        self.one = domain(
+        self.domain = make_domain(
             peers=(ROBOT,), judge=lambda kind, *_: kind not in self.denied, both_ways=True
         )
-        self.one.own.observer.prefix = OWN
+        self.domain.own.observer.prefix = OWN
         self.now = 0.0
         self.came, self.went = Counter[str](), Counter[str]()
         self.proven = {ROBOT}
@@ -108,32 +114,32 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(datagram=datagrams(), source=st.sampled_from(NEAR_BY))
     def inside_announces(self, datagram: bytes, source: str) -> None:
-        self.check(self.one.heard_inside(datagram, source, self.now))
+        self.check(self.domain.heard_inside(datagram, source, self.now))
 
     @rule(datagram=datagrams(), source=ADDRESS)
     def outside_announces(self, datagram: bytes, source: str) -> None:
         self.came[source] += len(datagram)
-        self.check(self.one.heard_outside(datagram, source, self.now))
+        self.check(self.domain.heard_outside(datagram, source, self.now))
 
     @rule(datagram=datagrams(), source=ADDRESS)
     def the_ear_tells(self, datagram: bytes, source: str) -> None:
         self.came[source] += len(datagram)
-        self.check(self.one.heard_outside(wrapped(source, datagram), EAR.host, self.now))
+        self.check(self.domain.heard_outside(wrapped(source, datagram), EAR.host, self.now))
 
     @rule(datagram=datagrams(), source=ADDRESS, port=st.integers(45001, 45015))
     def a_port_gets_something(self, datagram: bytes, source: str, port: int) -> None:
-        leased = self.one.inside.leases.get(port)
+        leased = self.domain.inside.leases.get(port)
         self.came[source] += len(datagram)
-        sent = self.one.at_lease(port, datagram, source, self.now)
-        where = leased[1].target if leased else None
-        assert {out.target for out in sent} <= {where}
-        assert not leased or len(sent) <= 1 or leased[0].prefix in self.one.inside.by_prefix
+        sent = self.domain.at_lease(port, datagram, source, self.now)
+        target = leased[1].target if leased else None
+        assert {out.target for out in sent} <= {target}
+        assert not leased or len(sent) <= 1 or leased[0].prefix in self.domain.inside.by_prefix
 
     @rule(datagram=datagrams(), source=ADDRESS, index=st.integers(0, 9))
     def a_stand_in_gets_something(self, datagram: bytes, source: str, index: int) -> None:
-        ports = sorted(self.one.outside.stand_ins) or [STAND_INS.first]
-        sent = self.one.at_stand_in(ports[index % len(ports)], datagram, source, self.now)
-        assert not sent or source in self.one.inside.count_by_address
+        ports = sorted(self.domain.outside.stand_ins) or [STAND_INS.first]
+        sent = self.domain.at_stand_in(ports[index % len(ports)], datagram, source, self.now)
+        assert not sent or source in self.domain.inside.count_by_address
         self.check(sent)
 
     @rule(prefix=PREFIX, address=ADDRESS)
@@ -145,36 +151,42 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(address=st.sampled_from(NEAR_BY), port=PORT)
     def somebody_speaks_to_all_outside(self, address: str, port: int) -> None:
-        own = [one for one in self.one.inside.by_prefix.values() if one.address == address]
-        for one in own:
-            for stand_in in 8 * list(self.one.outside.stand_ins):
-                said = sedp(one.prefix, address, port)
-                self.check(self.one.at_stand_in(stand_in, said, address, self.now))
+        speakers = [
+            participant
+            for participant in self.domain.inside.by_prefix.values()
+            if participant.address == address
+        ]
+        for participant in speakers:
+            for stand_in in 8 * list(self.domain.outside.stand_ins):
+                said = sedp(participant.prefix, address, port)
+                self.check(self.domain.at_stand_in(stand_in, said, address, self.now))
 
     @rule(seconds=st.sampled_from([0.3, 2.0, 5.0]))
     def time_passes(self, seconds: float) -> None:
         self.now += seconds
-        self.check(self.one.settle(self.now))
-        self.one.expire(self.now)
+        self.check(self.domain.settle(self.now))
+        self.domain.expire(self.now)
 
     @rule(denied=st.sets(st.sampled_from(RuleKind)))
     def the_policy_changes(self, denied: set[RuleKind]) -> None:
         self.denied = denied
-        self.check(self.one.apply_policy(self.now))
+        self.check(self.domain.apply_policy(self.now))
 
     @rule()
     def the_proxy_observes(self) -> None:
-        self.check(self.one.own.port_reminders() + self.one.own.announced_outside())
+        self.check(self.domain.own.port_reminders() + self.domain.own.announced_outside())
 
     @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
     def another_program_has_a_port(self, port: int, for_good: bool) -> None:
-        ports = sorted(self.one.outside.stand_ins)
-        self.one.outside.block(ports[0] if ports and port % 8 == 0 else port, for_good)
+        ports = sorted(self.domain.outside.stand_ins)
+        self.domain.outside.block(ports[0] if ports and port % 8 == 0 else port, for_good)
 
     def check(self, sent: list[Outgoing]) -> None:
         """Hold to whom something may go: no bytes to outside that did not come from there."""
         self.proven |= {
-            there.address for there in self.one.outside.by_prefix.values() if there.proven
+            participant.address
+            for participant in self.domain.outside.by_prefix.values()
+            if participant.proven
         }
         for out in sent:
             assert 0 < out.target.port < 65536
@@ -182,60 +194,68 @@ class Neighbours(RuleBasedStateMachine):
                 continue
             if (
                 out.target.host not in NEAR_BY
-                or out.target.host not in self.one.inside.count_by_address
+                or out.target.host not in self.domain.inside.count_by_address
             ):
                 self.went[out.target.host] += len(out.datagram)
-        waiting = {source for source, *_ in self.one.returning.waiting.values()}
+        waiting = {source for source, *_ in self.domain.returning.waiting.values()}
         for host, size in self.went.items():
             assert host in waiting | set(NEAR_BY) or size <= self.came[host]
 
     @invariant()
     def leases_are_of_those_inside(self) -> None:
-        inside, pool = self.one.inside, self.one.ports.pool
+        inside, pool = self.domain.inside, self.domain.ports.pool
         assert pool.free + len(inside.leases) + 1 == len(pool.range)
-        held = [lease for one in inside.by_prefix.values() for lease in one.leases.values()]
-        assert len(held) == len(inside.leases)
-        for port, (one, lease) in inside.leases.items():
-            assert inside.by_prefix[one.prefix] is one
-            assert one.leases[lease.target] is lease
-            assert (lease.port, lease.target.host) == (port, one.address)
+        leases = [
+            lease
+            for participant in inside.by_prefix.values()
+            for lease in participant.leases.values()
+        ]
+        assert len(leases) == len(inside.leases)
+        for port, (participant, lease) in inside.leases.items():
+            assert inside.by_prefix[participant.prefix] is participant
+            assert participant.leases[lease.target] is lease
+            assert (lease.port, lease.target.host) == (port, participant.address)
             assert not pool.is_free(port)
-        assert inside.count_by_address == Counter(one.address for one in inside.by_prefix.values())
+        assert inside.count_by_address == Counter(
+            participant.address for participant in inside.by_prefix.values()
+        )
         assert inside.port_shortages.keys() <= inside.by_prefix.keys()
 
     @invariant()
     def stand_ins_are_of_those_outside(self) -> None:
-        outside = self.one.outside
+        outside = self.domain.outside
         for port, users in outside.stand_ins.items():
             assert port not in outside.blocked
             assert 0 < len(users) <= MOST_SHARING
-            for there, lease in users:
-                assert outside.by_prefix[there.prefix] is there
-                assert there.leases[lease.target] is lease
-                assert (lease.port, lease.target.host) == (port, there.address)
-        held = sum(len(there.leases) for there in outside.by_prefix.values())
-        assert held == sum(map(len, outside.stand_ins.values()))
+            for participant, lease in users:
+                assert outside.by_prefix[participant.prefix] is participant
+                assert participant.leases[lease.target] is lease
+                assert (lease.port, lease.target.host) == (port, participant.address)
+        lease_count = sum(len(participant.leases) for participant in outside.by_prefix.values())
+        assert lease_count == sum(map(len, outside.stand_ins.values()))
         assert outside.count_by_address == Counter(
-            one.address for one in outside.by_prefix.values()
+            participant.address for participant in outside.by_prefix.values()
         )
-        assert not outside.by_prefix.keys() & self.one.inside.by_prefix.keys()
+        assert not outside.by_prefix.keys() & self.domain.inside.by_prefix.keys()
 
     @invariant()
     def what_is_kept_is_somebodys_and_bounded(self) -> None:
-        one = self.one
-        known = one.inside.by_prefix.keys() | one.outside.by_prefix.keys()
-        for side in (one.inside, one.outside):
+        domain = self.domain
+        prefixes = domain.inside.by_prefix.keys() | domain.outside.by_prefix.keys()
+        for side in (domain.inside, domain.outside):
             everybody = side.by_prefix.values()
-            assert all(len(there.leases) <= MOST_LEASES for there in everybody)
-            assert side.notes.total == sum(len(there.endpoints) for there in everybody)
+            assert all(len(participant.leases) <= MOST_LEASES for participant in everybody)
+            assert side.notes.total == sum(len(participant.endpoints) for participant in everybody)
             assert side.notes.total == side.notes.count_by_address.total()
-        assert {prefix for prefix, _ in one.own.observer._received} <= known
-        assert one.own.keeper.number_by_prefix.keys() <= known | one.returning.waiting.keys()
-        assert one.fragments.by_prefix.keys() <= known
-        sizes = [store.size for store in one.fragments.by_prefix.values()]
-        assert one.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL
-        assert len(one.rates._remaining) <= MOST_SOURCES
-        assert all(left <= BURST for left, _ in one.rates._remaining.values())
+        assert {prefix for prefix, _ in domain.own.observer._received} <= prefixes
+        assert (
+            domain.own.keeper.number_by_prefix.keys() <= prefixes | domain.returning.waiting.keys()
+        )
+        assert domain.fragments.by_prefix.keys() <= prefixes
+        sizes = [store.size for store in domain.fragments.by_prefix.values()]
+        assert domain.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL
+        assert len(domain.rates._remaining) <= MOST_SOURCES
+        assert all(left <= BURST for left, _ in domain.rates._remaining.values())
 
 
 TestNeighbours = Neighbours.TestCase

@@ -52,7 +52,7 @@ def data(
 
 
 def fragment(
-    part: bytes,
+    chunk: bytes,
     first: int,
     size: int,
     total: int,
@@ -65,5 +65,5 @@ def fragment(
     mark = order(little)
     body = struct.pack(mark + "HH", 0, 28) + bytes(4) + writer.to_bytes(4, "big")
     body += struct.pack(mark + "iI", sequence >> 32, sequence & 0xFFFFFFFF)
-    body += struct.pack(mark + "IHHI", first, -(-len(part) // size), size, total) + part
+    body += struct.pack(mark + "IHHI", first, -(-len(chunk) // size), size, total) + chunk
     return submessage(0x16, 0, body, little)

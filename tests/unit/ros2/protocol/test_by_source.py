@@ -32,12 +32,12 @@ def test_each_participant_gets_a_message_of_its_own() -> None:
     assert first == message(data(b"first"))
     assert other == b"RTPS\x02\x05\x01\x10" + OTHER + data(b"2nd!")
     assert source_vendor(other) == b"\x01\x10"
-    assert [one.prefix for one in samples(last)] == [PREFIX]
+    assert [sample.prefix for sample in samples(last)] == [PREFIX]
 
 
 def test_whom_it_is_meant_for_stays_so() -> None:
     whole = message(info_dst(), data(b"one"), info_src(), data(b"two"))
-    assert [destination(one) for one in by_source(whole)] == [FOR, FOR]
+    assert [destination(datagram) for datagram in by_source(whole)] == [FOR, FOR]
 
 
 def test_who_says_nothing_gets_none() -> None:
@@ -52,8 +52,12 @@ def test_a_length_that_leads_outside_is_refused(rest: bytes) -> None:
 
 
 @given(st.lists(st.sampled_from([data(b"some"), info_src(), info_dst(), info_src(PREFIX)])))
-def test_all_samples_stay_with_who_has_written_them(parts: list[bytes]) -> None:
-    whole = message(*parts)
-    before = [(one.prefix, one.sequence) for one in samples(whole)]
-    after = [(one.prefix, one.sequence) for part in by_source(whole) for one in samples(part)]
+def test_all_samples_stay_with_who_has_written_them(submessages: list[bytes]) -> None:
+    whole = message(*submessages)
+    before = [(sample.prefix, sample.sequence) for sample in samples(whole)]
+    after = [
+        (sample.prefix, sample.sequence)
+        for datagram in by_source(whole)
+        for sample in samples(datagram)
+    ]
     assert after == before

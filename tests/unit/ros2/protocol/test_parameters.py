@@ -26,33 +26,37 @@ LISTS = st.lists(st.tuples(st.integers(2, 0xFFFF), VALUES), max_size=10)
 
 def read(datagram: bytes) -> tuple[Sample, ParameterList]:
     (sample,) = samples(datagram)
-    held = payload_parameters(datagram, sample)
-    assert held is not None
-    return sample, held
+    parsed = payload_parameters(datagram, sample)
+    assert parsed is not None
+    return sample, parsed
 
 
 @given(LISTS, st.booleans())
-def test_a_list_is_read_as_it_was_written(held: list[tuple[int, bytes]], little: bool) -> None:
-    datagram = message(data(payload(held, little), little=not little))
-    _, found = read(datagram)
-    assert found.little is little
-    values = [(p.pid, datagram[p.value.start : p.value.end]) for p in found.parameters]
-    assert values == held
+def test_a_list_is_read_as_it_was_written(
+    parameters: list[tuple[int, bytes]], little: bool
+) -> None:
+    datagram = message(data(payload(parameters, little), little=not little))
+    _, parsed = read(datagram)
+    assert parsed.little is little
+    values = [(p.pid, datagram[p.value.start : p.value.end]) for p in parsed.parameters]
+    assert values == parameters
 
 
 @given(LISTS, ADDRESSES, PORTS, ADDRESSES, PORTS, st.booleans())
 def test_a_locator_is_replaced_and_nothing_else(
-    held: list[tuple[int, bytes]], before: str, port: int, host: str, lease: int, little: bool
+    parameters: list[tuple[int, bytes]], before: str, port: int, host: str, lease: int, little: bool
 ) -> None:
     own = (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(before, port), order(little)))
-    others = [one for one in held if one[0] != own[0]]
-    datagram = message(data(payload([*others, own, *others], little), little=little))
-    _, found = read(datagram)
-    (parameter,) = found.all(Pid.METATRAFFIC_UNICAST_LOCATOR)
-    locator = read_locator(datagram, found, parameter)
+    other_parameters = [parameter for parameter in parameters if parameter[0] != own[0]]
+    datagram = message(
+        data(payload([*other_parameters, own, *other_parameters], little), little=little)
+    )
+    _, parsed = read(datagram)
+    (parameter,) = parsed.all(Pid.METATRAFFIC_UNICAST_LOCATOR)
+    locator = read_locator(datagram, parsed, parameter)
     assert locator is not None
     assert locator.host_port == HostPort(before, port)
-    changed = apply(datagram, [replaced(found, parameter, HostPort(host, lease))])
+    changed = apply(datagram, [replaced(parsed, parameter, HostPort(host, lease))])
     span = parameter.value
     assert changed[: span.start] + changed[span.end :] == (
         datagram[: span.start] + datagram[span.end :]
@@ -65,11 +69,11 @@ def test_a_locator_is_replaced_and_nothing_else(
 @BOTH
 def test_a_parameter_that_is_taken_out_is_skipped_by_all(little: bool) -> None:
     shared_memory = struct.pack(order(little) + "iI", 16, 7411) + bytes(16)
-    held = [(0x31, shared_memory), (0x02, bytes(8))]
-    datagram = message(data(payload(held, little), little=little))
-    _, found = read(datagram)
-    changed = apply(datagram, [found.removed(found.all(0x31)[0])])
-    assert [one.pid for one in read(changed)[1].parameters] == [Pid.PAD, 0x02]
+    parameters = [(0x31, shared_memory), (0x02, bytes(8))]
+    datagram = message(data(payload(parameters, little), little=little))
+    _, parsed = read(datagram)
+    changed = apply(datagram, [parsed.removed(parsed.all(0x31)[0])])
+    assert [parameter.pid for parameter in read(changed)[1].parameters] == [Pid.PAD, 0x02]
     assert len(changed) == len(datagram)
 
 
@@ -79,12 +83,12 @@ def test_numbers_and_texts(little: bool) -> None:
     text = struct.pack(order(little) + "I", len(name)) + name + b"\0"
     number = struct.pack(order(little) + "I", 42)
     datagram = message(data(payload([(0x0F, number), (0x05, text), (0x07, b"")], little)))
-    _, found = read(datagram)
-    assert found.number(datagram, Pid.DOMAIN_ID) == 42
-    assert found.text(datagram, Pid.TOPIC_NAME) == "rt/chatter"
-    assert found.number(datagram, Pid.TYPE_NAME) is None
-    assert found.text(datagram, Pid.TYPE_NAME) is None
-    assert found.text(datagram, Pid.ENTITY_NAME) is None
+    _, parsed = read(datagram)
+    assert parsed.number(datagram, Pid.DOMAIN_ID) == 42
+    assert parsed.text(datagram, Pid.TOPIC_NAME) == "rt/chatter"
+    assert parsed.number(datagram, Pid.TYPE_NAME) is None
+    assert parsed.text(datagram, Pid.TYPE_NAME) is None
+    assert parsed.text(datagram, Pid.ENTITY_NAME) is None
 
 
 def test_a_text_that_leads_outside_is_none() -> None:
@@ -97,9 +101,9 @@ def test_inline_qos_has_the_byte_order_of_its_submessage(little: bool) -> None:
     qos = parameter_list([(0x71, b"\0\0\0\1")], little)
     datagram = message(data(payload([], not little), qos=qos, little=little))
     (sample,) = samples(datagram)
-    found = inline_parameters(datagram, sample)
-    assert found is not None
-    assert [one.pid for one in found.parameters] == [Pid.STATUS_INFO]
+    parsed = inline_parameters(datagram, sample)
+    assert parsed is not None
+    assert [parameter.pid for parameter in parsed.parameters] == [Pid.STATUS_INFO]
     (plain,) = samples(message(data(b"abcd")))
     assert inline_parameters(message(data(b"abcd")), plain) is None
 
@@ -132,19 +136,19 @@ def test_any_payload_is_read_or_refused(content: bytes, little: bool) -> None:
     datagram = message(data(bytes([0, 3 if little else 2, 0, 0]) + content, little=little))
     (sample,) = samples(datagram)
     try:
-        found = payload_parameters(datagram, sample)
+        parsed = payload_parameters(datagram, sample)
     except RtpsError:
         return
-    assert found is not None
-    for one in found.parameters:
+    assert parsed is not None
+    for parameter in parsed.parameters:
         assert sample.payload is not None
-        assert sample.payload.start <= one.offset < one.value.end <= sample.payload.end
-        read_locator(datagram, found, one)
-        found.text(datagram, one.pid)
+        assert sample.payload.start <= parameter.offset < parameter.value.end <= sample.payload.end
+        read_locator(datagram, parsed, parameter)
+        parsed.text(datagram, parameter.pid)
 
 
 @pytest.mark.parametrize(
-    ("locator", "where"),
+    ("locator", "host_port"),
     [
         (Locator(1, 7410, bytes(12) + b"\x0a\0\0\5"), HostPort("10.0.0.5", 7410)),
         (Locator(2, 7411, b"\xfd" + bytes(14) + b"\1"), HostPort("fd00::1", 7411)),
@@ -155,14 +159,14 @@ def test_any_payload_is_read_or_refused(content: bytes, little: bool) -> None:
         (Locator(1, 65536, bytes(12) + b"\x0a\0\0\5"), None),
     ],
 )
-def test_where_a_locator_leads(locator: Locator, where: HostPort | None) -> None:
-    assert locator.host_port == where
+def test_where_a_locator_leads(locator: Locator, host_port: HostPort | None) -> None:
+    assert locator.host_port == host_port
 
 
 def test_a_locator_that_is_too_short() -> None:
     datagram = message(data(payload([(0x31, bytes(20))])))
-    _, found = read(datagram)
-    assert read_locator(datagram, found, found.parameters[0]) is None
+    _, parsed = read(datagram)
+    assert read_locator(datagram, parsed, parsed.parameters[0]) is None
 
 
 def test_a_name_is_no_locator() -> None:

@@ -55,12 +55,14 @@ QOS = st.builds(
 )
 
 
-def read(held: Sequence[tuple[int, bytes]], of_writer: bool, little: bool = True) -> EndpointQos:
-    datagram = message(data(payload(held, little)))
+def read(
+    parameters: Sequence[tuple[int, bytes]], of_writer: bool, little: bool = True
+) -> EndpointQos:
+    datagram = message(data(payload(parameters, little)))
     (sample,) = samples(datagram)
-    found = payload_parameters(datagram, sample)
-    assert found is not None
-    return read_qos(datagram, found, of_writer)
+    parsed = payload_parameters(datagram, sample)
+    assert parsed is not None
+    return read_qos(datagram, parsed, of_writer)
 
 
 def duration(seconds: float, mark: str) -> bytes:
@@ -103,10 +105,10 @@ def test_what_is_left_out_has_its_default() -> None:
 
 
 def test_what_real_ones_announce() -> None:
-    held = [(pid, bytes.fromhex(value)) for pid, value in JAZZY]
-    assert read(held, of_writer=True) == EndpointQos(reliable=True, representations=(0,))
-    held = [(pid, bytes.fromhex(value)) for pid, value in CYCLONE]
-    assert read(held, of_writer=False) == EndpointQos(reliable=True, representations=(0, 2))
+    parameters = [(pid, bytes.fromhex(value)) for pid, value in JAZZY]
+    assert read(parameters, of_writer=True) == EndpointQos(reliable=True, representations=(0,))
+    parameters = [(pid, bytes.fromhex(value)) for pid, value in CYCLONE]
+    assert read(parameters, of_writer=False) == EndpointQos(reliable=True, representations=(0, 2))
 
 
 @pytest.mark.parametrize(
@@ -125,9 +127,9 @@ def test_partitions_that_can_t_be_read_are_unknown(value: bytes) -> None:
 
 
 def test_kinds_that_do_not_exist() -> None:
-    held = [(pid, struct.pack("<IiI", 99, 0, 0)) for pid in (Pid.DURABILITY, Pid.LIVELINESS)]
-    found = read([*held, (Pid.RELIABILITY, b"\3\0\0\0")], of_writer=True)
-    assert found == EndpointQos(
+    parameters = [(pid, struct.pack("<IiI", 99, 0, 0)) for pid in (Pid.DURABILITY, Pid.LIVELINESS)]
+    qos = read([*parameters, (Pid.RELIABILITY, b"\3\0\0\0")], of_writer=True)
+    assert qos == EndpointQos(
         reliable=True,
         durability=Durability.PERSISTENT,
         liveliness=Liveliness.MANUAL_BY_TOPIC,
@@ -146,8 +148,8 @@ def test_kinds_that_do_not_exist() -> None:
     st.booleans(),
 )
 def test_whatever_stands_there_is_read(
-    held: list[tuple[int, bytes]], of_writer: bool, little: bool
+    parameters: list[tuple[int, bytes]], of_writer: bool, little: bool
 ) -> None:
-    found = read(held, of_writer, little)
-    assert len(found.partitions or ()) <= MOST_PARTITIONS
-    assert all(len(name) <= LONGEST_PARTITION for name in found.partitions or ())
+    qos = read(parameters, of_writer, little)
+    assert len(qos.partitions or ()) <= MOST_PARTITIONS
+    assert all(len(name) <= LONGEST_PARTITION for name in qos.partitions or ())

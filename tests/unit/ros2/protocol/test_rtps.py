@@ -41,33 +41,33 @@ def test_a_sample_is_found_with_its_writer_and_its_place(little: bool) -> None:
         submessage(0x09, 0, bytes(8), little),  # INFO_TS
         data(content, sequence=2**33 + 5, little=little),
     )
-    (found,) = samples(whole)
-    assert (found.prefix, found.writer, found.sequence) == (PREFIX, SPDP_WRITER, 2**33 + 5)
-    assert (found.little, found.inline_qos, found.is_key_only) == (little, None, False)
-    assert found.payload is not None
-    assert whole[found.payload.start : found.payload.end] == content
+    (sample,) = samples(whole)
+    assert (sample.prefix, sample.writer, sample.sequence) == (PREFIX, SPDP_WRITER, 2**33 + 5)
+    assert (sample.little, sample.inline_qos, sample.is_key_only) == (little, None, False)
+    assert sample.payload is not None
+    assert whole[sample.payload.start : sample.payload.end] == content
 
 
 @BOTH
 def test_inline_qos_stands_before_the_payload(little: bool) -> None:
     qos, content = parameter_list([(0x71, b"\0\0\0\3")], little), payload([], little)
     whole = message(data(content, qos=qos, little=little, key=True))
-    (found,) = samples(whole)
-    assert found.is_key_only
-    assert found.inline_qos is not None
-    assert found.payload is not None
-    assert whole[found.inline_qos.start : found.inline_qos.end] == qos
-    assert whole[found.payload.start : found.payload.end] == content
+    (sample,) = samples(whole)
+    assert sample.is_key_only
+    assert sample.inline_qos is not None
+    assert sample.payload is not None
+    assert whole[sample.inline_qos.start : sample.inline_qos.end] == qos
+    assert whole[sample.payload.start : sample.payload.end] == content
 
 
 @BOTH
 def test_a_fragment_tells_which_part_it_is(little: bool) -> None:
     whole = message(fragment(b"x" * 250, 3, 100, 450, sequence=7, little=little))
-    (found,) = samples(whole)
-    assert found.fragments == Fragments(first=3, count=3, size=100, total=450)
-    assert found.sequence == 7
-    assert found.payload is not None
-    assert whole[found.payload.start : found.payload.end] == b"x" * 250
+    (sample,) = samples(whole)
+    assert sample.fragments == Fragments(first=3, count=3, size=100, total=450)
+    assert sample.sequence == 7
+    assert sample.payload is not None
+    assert whole[sample.payload.start : sample.payload.end] == b"x" * 250
 
 
 def test_another_participants_samples_are_known_as_its_own() -> None:
@@ -79,8 +79,8 @@ def test_another_participants_samples_are_known_as_its_own() -> None:
 
 def test_the_last_submessage_may_tell_no_length() -> None:
     body = data(b"abcd")
-    (found,) = samples(message(body[:2] + b"\0\0" + body[4:]))
-    assert found.payload is not None
+    (sample,) = samples(message(body[:2] + b"\0\0" + body[4:]))
+    assert sample.payload is not None
 
 
 def test_a_pad_of_no_length_is_no_last_submessage() -> None:
@@ -89,9 +89,9 @@ def test_a_pad_of_no_length_is_no_last_submessage() -> None:
 
 @given(st.lists(st.tuples(st.integers(0x80, 0xFF), st.binary(min_size=1, max_size=60)), max_size=9))
 def test_what_is_not_known_is_passed_over(unknown: list[tuple[int, bytes]]) -> None:
-    others = [submessage(kind, 0, body) for kind, body in unknown]
-    found = samples(message(*others, data(b"abcd"), *others))
-    assert [one.writer for one in found] == [SPDP_WRITER]
+    unknown_submessages = [submessage(kind, 0, body) for kind, body in unknown]
+    read_samples = samples(message(*unknown_submessages, data(b"abcd"), *unknown_submessages))
+    assert [sample.writer for sample in read_samples] == [SPDP_WRITER]
 
 
 @pytest.mark.parametrize(
@@ -121,28 +121,31 @@ def test_what_leads_outside_is_refused(datagram: bytes) -> None:
 def test_any_bytes_are_read_or_refused(tail: bytes) -> None:
     for datagram in (tail, message(tail), message(data(tail)), message(b"\x15\x07", tail)):
         try:
-            found = samples(datagram)
+            read_samples = samples(datagram)
         except RtpsError:
             continue
-        for one in found:
-            for span in (one.inline_qos, one.payload):
+        for sample in read_samples:
+            for span in (sample.inline_qos, sample.payload):
                 assert span is None or 0 <= span.start <= span.end <= len(datagram)
 
 
 @given(PARAMETERS, PARAMETERS, st.booleans(), st.data())
 def test_a_message_cut_short_or_changed_never_leads_outside(
-    qos: list[tuple[int, bytes]], held: list[tuple[int, bytes]], little: bool, more: st.DataObject
+    qos: list[tuple[int, bytes]],
+    parameters: list[tuple[int, bytes]],
+    little: bool,
+    more: st.DataObject,
 ) -> None:
-    content = data(payload(held, little), qos=parameter_list(qos, little), little=little)
+    content = data(payload(parameters, little), qos=parameter_list(qos, little), little=little)
     whole = bytearray(message(content, content))
     for _ in range(more.draw(st.integers(0, 3))):
         whole[more.draw(st.integers(20, len(whole) - 1))] = more.draw(st.integers(0, 255))
     cut = bytes(whole[: more.draw(st.integers(0, len(whole)))])
     try:
-        found = samples(cut)
+        read_samples = samples(cut)
     except RtpsError:
         return
-    assert all(one.payload is None or one.payload.end <= len(cut) for one in found)
+    assert all(sample.payload is None or sample.payload.end <= len(cut) for sample in read_samples)
 
 
 @given(st.binary(min_size=1, max_size=200), st.data())

@@ -27,15 +27,15 @@ def reader(
     return DdsEndpoint(EndpointKind.READER, topic, kind, qos)
 
 
-def participant(number: int, *ends: DdsEndpoint) -> Participant:
-    one = Participant(bytes([number] * 12), f"10.0.0.{number}", b"\x01\x0f", 0.0)
+def make_participant(number: int, *ends: DdsEndpoint) -> Participant:
+    participant = Participant(bytes([number] * 12), f"10.0.0.{number}", b"\x01\x0f", 0.0)
     for index, end in enumerate(ends):
-        one.endpoints[bytes([0, 0, index // 256, index % 256])] = end
-    return one
+        participant.endpoints[bytes([0, 0, index // 256, index % 256])] = end
+    return participant
 
 
 @pytest.mark.parametrize(
-    ("offered", "requested", "found"),
+    ("offered", "requested", "expected"),
     [
         (
             EndpointQos(),
@@ -79,8 +79,10 @@ def participant(number: int, *ends: DdsEndpoint) -> Participant:
         ),
     ],
 )
-def test_what_does_not_match(offered: EndpointQos, requested: EndpointQos, found: Mismatch) -> None:
-    assert mismatch(writer(offered), reader(requested)) == found
+def test_what_does_not_match(
+    offered: EndpointQos, requested: EndpointQos, expected: Mismatch
+) -> None:
+    assert mismatch(writer(offered), reader(requested)) == expected
 
 
 @pytest.mark.parametrize(
@@ -97,8 +99,8 @@ def test_what_does_not_match(offered: EndpointQos, requested: EndpointQos, found
 def test_partitions_that_match(
     mine: tuple[str, ...] | None, theirs: tuple[str, ...] | None
 ) -> None:
-    for one, other in ((mine, theirs), (theirs, mine)):
-        ends = writer(EndpointQos(partitions=one)), reader(EndpointQos(partitions=other))
+    for offered, requested in ((mine, theirs), (theirs, mine)):
+        ends = writer(EndpointQos(partitions=offered)), reader(EndpointQos(partitions=requested))
         assert mismatch(*ends) is None
 
 
@@ -108,8 +110,8 @@ def test_two_patterns_do_not_match() -> None:
 
 
 def test_the_type_comes_first() -> None:
-    found = mismatch(writer(EndpointQos(), kind=LOG), reader(kind=STRING))
-    assert found == Mismatch("type", "rcl_interfaces/msg/Log", "std_msgs/msg/String")
+    difference = mismatch(writer(EndpointQos(), kind=LOG), reader(kind=STRING))
+    assert difference == Mismatch("type", "rcl_interfaces/msg/Log", "std_msgs/msg/String")
 
 
 @given(QOS)
@@ -127,33 +129,39 @@ def test_more_offered_never_hurts(offered: EndpointQos, requested: EndpointQos) 
         liveliness=Liveliness.MANUAL_BY_TOPIC,
         liveliness_lease=0.0,
     )
-    found = mismatch(writer(more), reader(requested))
+    difference = mismatch(writer(more), reader(requested))
     policies = {"ownership", "partition", "data representation"}
-    assert found is None or found.policy in policies
+    assert difference is None or difference.policy in policies
     if mismatch(writer(offered), reader(requested)) is None:
-        assert found is None
+        assert difference is None
 
 
 def test_only_pairs_across_the_boundary_are_looked_at() -> None:
-    here = participant(1, writer(EndpointQos()), reader(RELIABLE))
-    assert mismatched_pairs([here], []) == []
-    there = participant(2, reader(RELIABLE), writer(RELIABLE), reader(RELIABLE, "rt/other"))
-    (found,) = mismatched_pairs([here], [there])
-    assert (found.writer, found.reader, found.mismatch.policy) == (here, there, "reliability")
-    (found,) = mismatched_pairs([there], [here])
-    assert (found.writer, found.reader) == (here, there)
+    publisher = make_participant(1, writer(EndpointQos()), reader(RELIABLE))
+    assert mismatched_pairs([publisher], []) == []
+    subscriber = make_participant(
+        2, reader(RELIABLE), writer(RELIABLE), reader(RELIABLE, "rt/other")
+    )
+    (pair,) = mismatched_pairs([publisher], [subscriber])
+    assert (pair.writer, pair.reader, pair.mismatch.policy) == (
+        publisher,
+        subscriber,
+        "reliability",
+    )
+    (pair,) = mismatched_pairs([subscriber], [publisher])
+    assert (pair.writer, pair.reader) == (publisher, subscriber)
 
 
 def test_a_service_is_told_once() -> None:
     latched = EndpointQos(reliable=True, durability=Durability.TRANSIENT_LOCAL)
-    server = participant(1, reader(RELIABLE, "rq/addRequest"), writer(RELIABLE, "rr/addReply"))
-    client = participant(
+    server = make_participant(1, reader(RELIABLE, "rq/addRequest"), writer(RELIABLE, "rr/addReply"))
+    client = make_participant(
         2, writer(EndpointQos(), "rq/addRequest"), reader(EndpointQos(), "rr/addReply")
     )
     assert len(mismatched_pairs([server], [client])) == 1
-    other = participant(3, writer(latched, "rq/addRequest"), reader(latched, "rr/addReply"))
-    (found,) = mismatched_pairs([server], [other])
-    assert (found.topic, found.mismatch.policy) == ("rr/addReply", "durability")
+    other = make_participant(3, writer(latched, "rq/addRequest"), reader(latched, "rr/addReply"))
+    (pair,) = mismatched_pairs([server], [other])
+    assert (pair.topic, pair.mismatch.policy) == ("rr/addReply", "durability")
 
 
 def test_so_many_are_compared_and_no_more() -> None:
@@ -161,9 +169,9 @@ def test_so_many_are_compared_and_no_more() -> None:
 
     def many(number: int, make: Callable[[EndpointQos], DdsEndpoint]) -> Participant:
         ends = (make(EndpointQos(deadline=float(index))) for index in range(200))
-        return participant(number, *ends)
+        return make_participant(number, *ends)
 
-    last = participant(3, writer(kind=LOG))
+    last = make_participant(3, writer(kind=LOG))
     assert len(mismatched_pairs([last], [many(2, reader)])) == 1
-    found = mismatched_pairs([many(1, writer), last], [many(2, reader)])
-    assert [one.writer.address for one in found] == ["10.0.0.1"]
+    pairs = mismatched_pairs([many(1, writer), last], [many(2, reader)])
+    assert [pair.writer.address for pair in pairs] == ["10.0.0.1"]

@@ -23,7 +23,7 @@ DATA, METATRAFFIC = LeaseKind.DATA, LeaseKind.METATRAFFIC
 prefixes = st.binary(min_size=12, max_size=12)
 
 
-def where(number: int) -> HostPort:
+def locator(number: int) -> HostPort:
     return HostPort("172.30.0.5", 7410 + number)
 
 
@@ -38,54 +38,54 @@ def test_each_port_is_tried_once(key: str) -> None:
 
 @given(prefixes)
 def test_a_new_process_gives_the_same_port(prefix: bytes) -> None:
-    assert ports().take(prefix, where(0), DATA, 2) == ports().take(prefix, where(0), DATA, 9)
+    assert ports().take(prefix, locator(0), DATA, 2) == ports().take(prefix, locator(0), DATA, 9)
 
 
 @given(st.lists(st.tuples(prefixes, st.integers(0, 9)), min_size=21, max_size=25, unique=True))
 def test_no_port_is_given_twice(wanted: list[tuple[bytes, int]]) -> None:
     pool = ports()
-    given = [pool.take(prefix, where(number), DATA, 2) for prefix, number in wanted]
+    given = [pool.take(prefix, locator(number), DATA, 2) for prefix, number in wanted]
     assert sorted(port for port in given if port) == list(RANGE.ports())
     assert given[len(RANGE) :] == [None] * (len(wanted) - len(RANGE))
 
 
 @given(prefixes, prefixes)
-def test_who_is_meant_at_a_port_gets_it(one: bytes, other: bytes) -> None:
+def test_who_is_meant_at_a_port_gets_it(prefix: bytes, other_prefix: bytes) -> None:
     pool = ports()
-    (first, *_) = order_for(f"{one.hex()} {where(0)}", RANGE)
-    pool.note_former_user(first, other, DATA, 0.5)
-    if one != other:
-        assert pool.take(one, where(0), DATA, SETTLING) != first
-    assert pool.take(other, where(3), DATA, SETTLING) == first
+    (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
+    pool.note_former_user(first, other_prefix, DATA, 0.5)
+    if prefix != other_prefix:
+        assert pool.take(prefix, locator(0), DATA, SETTLING) != first
+    assert pool.take(other_prefix, locator(3), DATA, SETTLING) == first
 
 
 @given(prefixes, st.integers(45000, 45019))
 def test_who_says_what_it_had_gets_it(prefix: bytes, had: int) -> None:
     pool = ports()
-    assert pool.take(prefix, where(0), DATA, SETTLING, had) == had
-    assert pool.take(prefix, where(1), DATA, SETTLING, had) != had
+    assert pool.take(prefix, locator(0), DATA, SETTLING, had) == had
+    assert pool.take(prefix, locator(1), DATA, SETTLING, had) != had
 
 
 def test_what_outside_says_counts_more_than_ones_own_word() -> None:
-    pool, one, other = ports(), bytes(12), bytes(range(12))
-    pool.note_former_user(45007, other, DATA, 0.5)
-    assert pool.take(one, where(0), DATA, SETTLING, 45007) != 45007
-    assert pool.take(other, where(0), DATA, SETTLING, 45003) == 45007
+    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    pool.note_former_user(45007, other_prefix, DATA, 0.5)
+    assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) != 45007
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45003) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
     pool, prefix = ports(), bytes(12)
     pool.note_former_user(45007, prefix, METATRAFFIC, 0.5)
-    assert pool.take(prefix, where(1), DATA, SETTLING) != 45007
-    assert pool.take(prefix, where(0), METATRAFFIC, SETTLING) == 45007
+    assert pool.take(prefix, locator(1), DATA, SETTLING) != 45007
+    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == 45007
 
 
 def test_what_was_heard_is_forgotten_after_a_time() -> None:
-    pool, one, other = ports(), bytes(12), bytes(range(12))
-    (first, *_) = order_for(f"{one.hex()} {where(0)}", RANGE)
-    pool.note_former_user(first, other, DATA, 0.5)
-    pool.note_former_user(45000, other, DATA, REMEMBERED + 1)
-    assert pool.take(one, where(0), DATA, REMEMBERED) == first
+    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
+    pool.note_former_user(first, other_prefix, DATA, 0.5)
+    pool.note_former_user(45000, other_prefix, DATA, REMEMBERED + 1)
+    assert pool.take(prefix, locator(0), DATA, REMEMBERED) == first
 
 
 @given(st.text(max_size=40))
@@ -99,7 +99,7 @@ def test_a_stand_in_follows_from_what_it_stands_for(key: str) -> None:
     assert port is not None
     assert port in STAND_INS
     assert chosen(lambda _: MOST_SHARING - 1) == port
-    assert chosen(lambda one: MOST_SHARING if one == port else 0) not in (None, port)
+    assert chosen(lambda candidate: MOST_SHARING if candidate == port else 0) not in (None, port)
     assert chosen(lambda _: MOST_SHARING) is None
 
 
@@ -108,27 +108,29 @@ def test_a_stand_in_is_found_behind_a_long_range_that_is_held(key: str, length: 
     """The proxy's own range may lie where stand-ins do, and be longer than it tries ports."""
     wanted = stand_in_port(key, lambda _: 0, lambda _: False)
     assert wanted is not None
-    port = stand_in_port(key, lambda _: 0, lambda one: wanted <= one < wanted + length)
+    port = stand_in_port(key, lambda _: 0, lambda candidate: wanted <= candidate < wanted + length)
     assert port is not None
     assert not wanted <= port < wanted + length
 
 
 @given(prefixes, prefixes, st.integers(45000, 45019))
-def test_what_the_kernel_forwarded_leads_there_again(one: bytes, other: bytes, port: int) -> None:
+def test_what_the_kernel_forwarded_leads_there_again(
+    prefix: bytes, other_prefix: bytes, port: int
+) -> None:
     pool = ports()
-    pool.note_forwarded({port: where(1), 9: where(1)})
-    pool.note_former_user(port, other, DATA, 0.5)
-    assert pool.take(other, where(0), DATA, SETTLING, had=port) != port
-    assert pool.take(one, where(1), METATRAFFIC, SETTLING, had=port) != port
-    assert pool.take(one, where(1), DATA, SETTLING) == port
+    pool.note_forwarded({port: locator(1), 9: locator(1)})
+    pool.note_former_user(port, other_prefix, DATA, 0.5)
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING, had=port) != port
+    assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING, had=port) != port
+    assert pool.take(prefix, locator(1), DATA, SETTLING) == port
     pool.give_back(port)
-    order = order_for(f"{other.hex()} {where(2)}", RANGE)
-    taken = [pool.take(other, where(2), DATA, SETTLING) for _ in range(18)]
+    order = order_for(f"{other_prefix.hex()} {locator(2)}", RANGE)
+    taken = [pool.take(other_prefix, locator(2), DATA, SETTLING) for _ in range(18)]
     assert taken == [number for number in order if number in taken]
 
 
 def test_what_the_kernel_forwarded_is_forgotten_in_time() -> None:
     pool = ports()
-    first, *_ = order_for(f"{bytes(12).hex()} {where(0)}", RANGE)
-    pool.note_forwarded({first: where(1)})
-    assert pool.take(bytes(12), where(0), DATA, REMEMBERED) == first
+    first, *_ = order_for(f"{bytes(12).hex()} {locator(0)}", RANGE)
+    pool.note_forwarded({first: locator(1)})
+    assert pool.take(bytes(12), locator(0), DATA, REMEMBERED) == first

@@ -11,7 +11,7 @@ from rosproxy.ros2.registry.selected import (
     SelectedAddresses,
 )
 
-HERE, THERE = "172.30.0.5", "172.30.0.6"
+ADDRESS, OTHER_ADDRESS = "172.30.0.5", "172.30.0.6"
 
 
 def said(number: int, text: bytes = b"") -> bytes:
@@ -19,41 +19,41 @@ def said(number: int, text: bytes = b"") -> bytes:
 
 
 def test_without_an_operator_all_are_let_in() -> None:
-    assert SelectedAddresses(0.0).admits(HERE, 0.0)
+    assert SelectedAddresses(0.0).admits(ADDRESS, 0.0)
 
 
 def test_an_operator_is_waited_for() -> None:
-    one = SelectedAddresses(NEWS_TIMEOUT)
-    one.hold(HERE, said(1))
-    assert not one.admits(HERE, 1.0)
-    assert one.released(1.0) == []
-    assert one.released(NEWS_TIMEOUT) == [(HERE, said(1))]
-    assert one.released(NEWS_TIMEOUT) == []
+    selected = SelectedAddresses(NEWS_TIMEOUT)
+    selected.hold(ADDRESS, said(1))
+    assert not selected.admits(ADDRESS, 1.0)
+    assert selected.released(1.0) == []
+    assert selected.released(NEWS_TIMEOUT) == [(ADDRESS, said(1))]
+    assert selected.released(NEWS_TIMEOUT) == []
 
 
 def test_who_is_selected_is_let_in_and_nobody_else() -> None:
-    one = SelectedAddresses(NEWS_TIMEOUT)
-    one.hold(HERE, said(1))
-    one.hold(THERE, said(2, b"at first"))
-    one.hold(THERE, said(2, b"at last"))
+    selected = SelectedAddresses(NEWS_TIMEOUT)
+    selected.hold(ADDRESS, said(1))
+    selected.hold(OTHER_ADDRESS, said(2, b"at first"))
+    selected.hold(OTHER_ADDRESS, said(2, b"at last"))
 
-    one.select([THERE])
+    selected.select([OTHER_ADDRESS])
 
-    assert (one.admits(HERE, 99.0), one.admits(THERE, 0.0)) == (False, True)
-    assert one.released(0.0) == [(THERE, said(2, b"at last"))]
-    one.select([HERE])
-    assert one.released(0.0) == [(HERE, said(1))]
+    assert (selected.admits(ADDRESS, 99.0), selected.admits(OTHER_ADDRESS, 0.0)) == (False, True)
+    assert selected.released(0.0) == [(OTHER_ADDRESS, said(2, b"at last"))]
+    selected.select([ADDRESS])
+    assert selected.released(0.0) == [(ADDRESS, said(1))]
 
 
 def test_what_is_held_is_bounded() -> None:
-    one = SelectedAddresses(NEWS_TIMEOUT)
-    one.hold(HERE, said(1, bytes(LONGEST_HELD)))
-    assert not one.held_announcements
+    selected = SelectedAddresses(NEWS_TIMEOUT)
+    selected.hold(ADDRESS, said(1, bytes(LONGEST_HELD)))
+    assert not selected.held_announcements
     for number in range(2 * MOST_HELD_EACH):
-        one.hold(HERE, said(number))
-    assert len(one.held_announcements[HERE]) == MOST_HELD_EACH
+        selected.hold(ADDRESS, said(number))
+    assert len(selected.held_announcements[ADDRESS]) == MOST_HELD_EACH
     for number in range(2 * MOST_HELD):
-        one.hold(f"172.31.{number // 256}.{number % 256}", said(1))
-    assert len(one.held_announcements) == MOST_HELD
+        selected.hold(f"172.31.{number // 256}.{number % 256}", said(1))
+    assert len(selected.held_announcements) == MOST_HELD
     with pytest.raises(RtpsError):
-        one.hold(HERE, b"nonsense")
+        selected.hold(ADDRESS, b"nonsense")

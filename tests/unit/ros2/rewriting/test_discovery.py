@@ -40,7 +40,7 @@ def participant(little: bool = True) -> bytes:
     """As Fast DDS announces one: two addresses, multicast, shared memory."""
     mark = order(little)
     shared_memory = struct.pack(mark + "iI", 16, 7412) + bytes(16)
-    held = [
+    parameters = [
         (Pid.PARTICIPANT_GUID, bytes(range(16))),
         (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 7412), mark)),
         (Pid.METATRAFFIC_MULTICAST_LOCATOR, pack_locator(HostPort("239.255.0.1", 7400), mark)),
@@ -50,16 +50,16 @@ def participant(little: bool = True) -> bytes:
         (0x8007, b"vendor's"),
     ]
     return message(
-        submessage(0x09, 0, bytes(8), little), data(payload(held, little), little=little)
+        submessage(0x09, 0, bytes(8), little), data(payload(parameters, little), little=little)
     )
 
 
 @BOTH
 def test_a_participant_announces_where_it_is_reached(little: bool) -> None:
     datagram = participant(little)
-    (found,) = read_discovery(datagram).announcements
-    assert (found.writer, found.ended) == (BuiltinWriter.PARTICIPANTS, False)
-    assert list(found.reached_at(datagram)) == [
+    (announcement,) = read_discovery(datagram).announcements
+    assert (announcement.writer, announcement.ended) == (BuiltinWriter.PARTICIPANTS, False)
+    assert list(announcement.reached_at(datagram)) == [
         (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(INSIDE, 7412)),
         (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(INSIDE, 7413)),
         (Pid.DEFAULT_UNICAST_LOCATOR, HostPort("127.0.0.1", 7413)),
@@ -70,21 +70,21 @@ def test_a_participant_announces_where_it_is_reached(little: bool) -> None:
 def test_each_locator_leads_to_a_lease_and_what_can_not_be_led_is_gone(little: bool) -> None:
     leases = {7412: 45000, 7413: 45001}
 
-    def lead(pid: int, where: HostPort) -> HostPort | None:
-        return HostPort(HOST, leases[where.port]) if where.host == INSIDE else None
+    def lead(pid: int, locator: HostPort) -> HostPort | None:
+        return HostPort(HOST, leases[locator.port]) if locator.host == INSIDE else None
 
     before = participant(little)
     after = rewritten(read_discovery(before), lead, nothing)
     assert len(after) == len(before)
-    (found,) = read_discovery(after).announcements
-    assert list(found.reached_at(after)) == [
+    (announcement,) = read_discovery(after).announcements
+    assert list(announcement.reached_at(after)) == [
         (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(HOST, 45000)),
         (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(HOST, 45001)),
     ]
-    pids = [one.pid for one in found.parameters.parameters]
+    pids = [parameter.pid for parameter in announcement.parameters.parameters]
     assert pids.count(Pid.PAD) == 3
     assert not set(MULTICAST) & set(pids)
-    (vendor,) = found.parameters.all(0x8007)
+    (vendor,) = announcement.parameters.all(0x8007)
     assert after[vendor.value.start : vendor.value.end] == b"vendor's"
 
 
@@ -108,10 +108,10 @@ def test_a_key_alone_tells_an_end_as_well() -> None:
 
 def test_user_data_and_fragments_are_left_alone() -> None:
     user = data(payload([(Pid.UNICAST_LOCATOR, bytes(24))]), writer=0x00001203)
-    part = fragment(payload([(Pid.UNICAST_LOCATOR, bytes(24))]), 1, 20, 90)
-    datagram = message(user, part)
+    data_frag = fragment(payload([(Pid.UNICAST_LOCATOR, bytes(24))]), 1, 20, 90)
+    datagram = message(user, data_frag)
     assert read_discovery(datagram).announcements == ()
-    assert rewritten(read_discovery(datagram), lambda pid, where: None, nothing) == datagram
+    assert rewritten(read_discovery(datagram), lambda pid, locator: None, nothing) == datagram
 
 
 def test_an_announcement_without_an_end_is_refused() -> None:
@@ -127,16 +127,18 @@ LOCATORS = st.tuples(
 
 @given(st.lists(LOCATORS, max_size=8), st.sampled_from(BuiltinWriter), st.booleans())
 def test_nothing_but_locators_changes(
-    held: list[tuple[Pid, bytes]], writer: BuiltinWriter, little: bool
+    parameters: list[tuple[Pid, bytes]], writer: BuiltinWriter, little: bool
 ) -> None:
     """Whatever they hold, all other bytes stay, and no locator leads where it led before."""
-    before = message(data(payload(held, little), writer=writer, little=little))
-    after = rewritten(read_discovery(before), lambda pid, where: HostPort(HOST, 45000), nothing)
-    (found,) = read_discovery(before).announcements
-    kept = bytearray(after)
-    for one in found.parameters.all(*UNICAST, *MULTICAST):
-        kept[one.offset : one.value.end] = before[one.offset : one.value.end]
-    assert bytes(kept) == before
+    before = message(data(payload(parameters, little), writer=writer, little=little))
+    after = rewritten(read_discovery(before), lambda pid, locator: HostPort(HOST, 45000), nothing)
+    (announcement,) = read_discovery(before).announcements
+    restored = bytearray(after)
+    for parameter in announcement.parameters.all(*UNICAST, *MULTICAST):
+        restored[parameter.offset : parameter.value.end] = before[
+            parameter.offset : parameter.value.end
+        ]
+    assert bytes(restored) == before
     (changed,) = read_discovery(after).announcements
-    assert {where for _, where in changed.reached_at(after)} <= {HostPort(HOST, 45000)}
+    assert {locator for _, locator in changed.reached_at(after)} <= {HostPort(HOST, 45000)}
     assert not changed.parameters.all(*MULTICAST)

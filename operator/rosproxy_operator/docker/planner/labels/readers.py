@@ -50,7 +50,7 @@ _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
 Labels = Mapping[str, str]
-_Word = TypeVar("_Word", bound=str)
+_Choice = TypeVar("_Choice", bound=str)
 
 
 class UnusableLabel(Exception):
@@ -168,7 +168,7 @@ def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
     return value == "true" if value else None
 
 
-def _choice(label: str, labels: Labels, choices: tuple[_Word, ...], fix: str) -> _Word | None:
+def _choice(label: str, labels: Labels, choices: tuple[_Choice, ...], fix: str) -> _Choice | None:
     """The choice that a label names, None without the label; ``fix`` begins with a choice."""
     if label not in labels:
         return None

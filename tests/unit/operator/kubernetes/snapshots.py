@@ -6,11 +6,11 @@ from rosproxy_operator.kubernetes.watch.store import ClusterStore
 from tests.unit.operator.kubernetes.api_server import ApiServer
 
 
-def known(server: ApiServer, key: bytes = b"") -> ClusterSnapshot:
+def snapshot_of(server: ApiServer, key: bytes = b"") -> ClusterSnapshot:
     store = ClusterStore([(kind, "") for kind in READERS], ("",), _nothing, _nothing)
     for kind, read in READERS.items():
-        found = {key_of(obj): read(obj) for obj in server.all(kind)}
-        store.listed(kind, "", {uid: one for uid, one in found.items() if one is not None})
+        records = {key_of(obj): read(obj) for obj in server.all(kind)}
+        store.listed(kind, "", {uid: r for uid, r in records.items() if r is not None})
     return store.snapshot(key)
 
 
