@@ -25,8 +25,8 @@ from rosproxy.cli.options import (
     unknown_variables,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy_operator.common.command_errors import exit_on_error, fail
 from rosproxy_operator.common.proxy_options import policy_options, proxy_bound_options
-from rosproxy_operator.common.words import exit_on_error, fail
 from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
 from rosproxy_operator.kubernetes import commands as kubernetes_commands

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Collection, Iterator, Sequence
 
 from rosproxy.leases.leases import RANGE_OPTION
-from rosproxy.net import signs
+from rosproxy.net import proxy_signs
 from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
 from rosproxy.telemetry.problems import Problems
@@ -42,7 +42,7 @@ def report_taken_ports(
     if not taken:
         return
     port_kind = "ports" if ros == "1" else "UDP ports"
-    proxies = signs.overlapping_proxies(ros, ports.first, ports.last, settings.admin)
+    proxies = proxy_signs.overlapping_proxies(ros, ports.first, ports.last, settings.admin)
     holders = "; ".join(map(str, proxies))
     cure = "give one of the two another range (ROSPROXY_PORT_RANGE), or end one"
     if len(taken) == len(ports):

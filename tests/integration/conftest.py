@@ -67,7 +67,7 @@ def machines_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """All hosts of a test are on one machine: here none of their addresses is another's."""
     for question in ("is_own", "is_loopback"):
         monkeypatch.setattr(
-            f"rosproxy.ros1.standins.outside_nodes.{question}", lambda address: False
+            f"rosproxy.ros1.stand_ins.outside_nodes.{question}", lambda address: False
         )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import click
 
 from rosproxy.cli.options import Command, Seconds
-from rosproxy_operator.common.words import exit_on_error
+from rosproxy_operator.common.command_errors import exit_on_error
 from rosproxy_operator.docker.settings import PlanSettings
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")

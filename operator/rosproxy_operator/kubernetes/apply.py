@@ -23,7 +23,7 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiNotFound,
     NotLeading,
 )
-from rosproxy_operator.kubernetes.confirm import Deletion, StateChanged, confirm
+from rosproxy_operator.kubernetes.confirm_deletion import Deletion, StateChanged, confirm
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateEar,

@@ -5,7 +5,7 @@ It imports what it needs when it runs: the Kubernetes client may not be installe
 
 import click
 
-from rosproxy_operator.common.words import exit_on_error
+from rosproxy_operator.common.command_errors import exit_on_error
 
 
 @click.command()

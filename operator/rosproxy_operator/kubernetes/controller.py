@@ -4,7 +4,7 @@ Data flows in one direction: watches deliver objects, which are kept (`watch`), 
 if they concern a RosProxy. A look takes the cluster from there, adds the proxies' reports
 (`proxies`), decides (`planner.plan`), and carries the decisions out (`apply`): Services and pods,
 then the RosProxies' statuses and the Events. Only the parts of the cluster that have changed are
-planned (`planner.parts`), and now and then all of them. Nothing is decided from an event alone,
+planned (`planner.partition`), and now and then all of them. Nothing is decided from an event alone,
 and nothing is decided in this file.
 
 Of several operators one acts, for a term (`leader`). The others keep up with the cluster and with
@@ -27,8 +27,8 @@ from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiError, ApiUnavailable
 from rosproxy_operator.kubernetes.apply import ClusterApplier
-from rosproxy_operator.kubernetes.due import PlanSchedule
-from rosproxy_operator.kubernetes.planner.parts import (
+from rosproxy_operator.kubernetes.plan_schedule import PlanSchedule
+from rosproxy_operator.kubernetes.planner.partition import (
     Partition,
     merge_state,
     partition_snapshot,

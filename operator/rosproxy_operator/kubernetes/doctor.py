@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import ADVERTISE_HOST
-from rosproxy_operator.kubernetes.status.conditions import cluster_findings
+from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""

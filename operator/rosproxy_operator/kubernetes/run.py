@@ -19,7 +19,7 @@ from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.leader import LeaderElection
+from rosproxy_operator.kubernetes.leader_election import LeaderElection
 from rosproxy_operator.kubernetes.serving import ClusterServing
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector

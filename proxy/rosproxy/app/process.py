@@ -18,7 +18,7 @@ from rosproxy.app.self_check import SelfCheck
 from rosproxy.app.signals import stop_event
 from rosproxy.app.stacks import make_stacks
 from rosproxy.binding import setting_error_if_taken
-from rosproxy.net import signs, sockets
+from rosproxy.net import proxy_signs, sockets
 from rosproxy.page.feed import Feed, PageWatch
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
@@ -81,7 +81,7 @@ class App:
         with setting_error_if_taken("--admin-bind", settings.admin):
             await self._admin.start(settings.admin)
         ports = settings.ports.listen
-        self._sign = signs.publish_sign(settings.ros, ports.first, ports.last, settings.admin)
+        self._sign = proxy_signs.publish_sign(settings.ros, ports.first, ports.last, settings.admin)
         await self._check.start()
         log.info("ready: %s", "; ".join(stack.greeting for stack in self.stacks))
 

@@ -32,7 +32,7 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
-from rosproxy.ros1.registry.memory import NAMESPACE, lease_at
+from rosproxy.ros1.registry.remembered_leases import NAMESPACE, lease_at
 from rosproxy.telemetry.metrics import Metrics
 
 PARALLEL = 32

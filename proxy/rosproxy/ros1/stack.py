@@ -42,7 +42,7 @@ from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
-from rosproxy.ros1.standins.stand_in_ports import TIDY_INTERVAL, StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import TIDY_INTERVAL, StandInPorts
 from rosproxy.ros1.status import Ros1State
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents

@@ -13,13 +13,13 @@ from rosproxy.admin.status_bounds import bounded
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
-from rosproxy.net import signs
+from rosproxy.net import proxy_signs
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import STATES, Endpoint
 from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
-from rosproxy.ros1.standins.stand_in_ports import StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 from rosproxy.telemetry.metrics import NamedNodes
 
@@ -177,7 +177,7 @@ class Ros1State(Collector):
         settings = self._context.settings
         ports = settings.ports.listen
         return tuple(
-            map(str, signs.overlapping_proxies("1", ports.first, ports.last, settings.admin))
+            map(str, proxy_signs.overlapping_proxies("1", ports.first, ports.last, settings.admin))
         )
 
     def _hidden(self) -> Iterator[document.HiddenStatus]:

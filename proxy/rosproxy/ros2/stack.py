@@ -25,7 +25,7 @@ from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
-from rosproxy.net import addresses, signs
+from rosproxy.net import addresses, proxy_signs
 from rosproxy.net.addresses import HostPort, Network
 from rosproxy.net.interfaces import address_into, address_towards, interface_networks
 from rosproxy.net.resolver import resolve
@@ -124,7 +124,7 @@ class Ros2:
             self.servers.append(server)
             self._leases.domains.append(server.domain.inside)
             # Any proxy for ROS 2: these ports follow from the domain, not from the range.
-            other_proxies = signs.overlapping_proxies("2", 1, 65535, settings.admin)
+            other_proxies = proxy_signs.overlapping_proxies("2", 1, 65535, settings.admin)
             with setting_error_if_taken(
                 "--ros2-domain", f"a port of domain {number}", other_proxies
             ):

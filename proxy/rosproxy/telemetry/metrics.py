@@ -1,7 +1,8 @@
-"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.common_status`.
+"""Prometheus metrics: the counters that the proxy keeps.
 
-Counters of few outcomes begin with 0: Prometheus sees no increase in a series that begins with 1,
-and no alert would tell of what happened once.
+Its state, with the bytes of connections, is in `ros1.status` and `ros2.status`. Counters of few
+outcomes begin with 0: Prometheus sees no increase in a series that begins with 1, and no alert
+would tell of what happened once.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping

@@ -378,7 +378,7 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
         await robot.stop()
         await proxy.ros1.stand_ins.tidy()
         assert set(problems(proxy)) == {robot.service_api}
-        monkeypatch.setattr("rosproxy.ros1.standins.stand_in_ports.SERVICE_PROBLEM", 0.0)
+        monkeypatch.setattr("rosproxy.ros1.stand_ins.stand_in_ports.SERVICE_PROBLEM", 0.0)
         await proxy.ros1.stand_ins.tidy()
         assert problems(proxy) == {}
 
@@ -458,7 +458,7 @@ async def test_an_address_that_leads_back_makes_no_loop(
 ) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
-    monkeypatch.setattr("rosproxy.ros1.standins.outside_nodes.is_own", lambda address: True)
+    monkeypatch.setattr("rosproxy.ros1.stand_ins.outside_nodes.is_own", lambda address: True)
     proxy.ros1.context.upstream.master_address = PROXY
     assert await knock(service(robot), service_header(), NODE) == "reset"
     assert await refuses(service(robot), NODE)

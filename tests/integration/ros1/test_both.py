@@ -231,7 +231,7 @@ async def test_nodes_of_outside_may_run_on_the_proxys_machine(
     proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "rosproxy.ros1.standins.outside_nodes.is_own", lambda address: address == MASTER
+        "rosproxy.ros1.stand_ins.outside_nodes.is_own", lambda address: address == MASTER
     )
     at = host_and_port(await look_up(proxy, robot))
     assert (await rpc(at, "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
@@ -243,7 +243,7 @@ async def test_nothing_leads_to_the_proxys_own_ports(
 ) -> None:
     """Whoever writes to the master chooses an address of the proxy's machine."""
     monkeypatch.setattr(
-        "rosproxy.ros1.standins.outside_nodes.is_own", lambda address: address == MASTER
+        "rosproxy.ros1.stand_ins.outside_nodes.is_own", lambda address: address == MASTER
     )
     await node.publish(proxy.master)
     own = {"master": proxy.settings.master_port, "lease": proxy.lease(node)[1]}
@@ -258,7 +258,7 @@ async def test_nothing_leads_to_the_proxys_own_ports(
 async def test_nothing_leads_to_loopback(
     proxy: Proxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch, host: str
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.standins.outside_nodes.is_loopback", is_loopback)
+    monkeypatch.setattr("rosproxy.ros1.stand_ins.outside_nodes.is_loopback", is_loopback)
     listening = await asyncio.start_server(lambda *_: None, "127.0.0.1")
     port = listening.sockets[0].getsockname()[1]
     uri = f"http://{host}:{port}/"
@@ -339,8 +339,8 @@ async def test_an_offer_that_can_not_be_had_is_taken_out(
 async def test_who_asks_for_many_takes_no_udpros_from_others(
     proxy: Proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.standins.udpros_relays.MOST_RELAYS", 4)
-    monkeypatch.setattr("rosproxy.ros1.standins.udpros_relays.MOST_RELAYS_EACH", 3)
+    monkeypatch.setattr("rosproxy.ros1.stand_ins.udpros_relays.MOST_RELAYS", 4)
+    monkeypatch.setattr("rosproxy.ros1.stand_ins.udpros_relays.MOST_RELAYS_EACH", 3)
     await node.publish(proxy.master)
     at = proxy.lease(node)
     for source, ports in ((OUTSIDE, [40000]), (MASTER, range(40001, 40010))):
@@ -385,7 +385,7 @@ async def test_a_name_that_changes_its_address_leads_nowhere_else(
         asked.append(host)
         return [MASTER] if len(asked) == 1 else [NODE]
 
-    for module in ("net.resolver", "ros1.standins.outside_nodes"):
+    for module in ("net.resolver", "ros1.stand_ins.outside_nodes"):
         monkeypatch.setattr(f"rosproxy.{module}.resolve", resolve)
     assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
     assert asked == ["robot.example"]

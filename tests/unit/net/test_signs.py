@@ -3,7 +3,7 @@
 from contextlib import ExitStack, closing
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.signs import MOST, Sign, overlapping_proxies, publish_sign
+from rosproxy.net.proxy_signs import MOST, Sign, overlapping_proxies, publish_sign
 
 
 def test_a_sign_is_read_while_it_stands_and_where_the_ports_overlap() -> None:

@@ -10,7 +10,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, ok
 from rosproxy.doctor.presentation import as_json
 from rosproxy_operator.common.proxy_doctor import read_findings
 from rosproxy_operator.docker.doctor import CURES, host_findings
-from rosproxy_operator.kubernetes.status.conditions import cluster_findings
+from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 
 
 def test_findings_carry_the_proxys_name_and_the_operators_cure() -> None:

@@ -20,15 +20,15 @@ from rosproxy_operator.docker.planner.actions import (
     Rename,
     Start,
 )
-from rosproxy_operator.docker.planner.duplicates import free_name
-from rosproxy_operator.docker.planner.model import HostState, Key
-from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
-from rosproxy_operator.docker.planner.steps import (
+from rosproxy_operator.docker.planner.container_steps import (
     PlanContext,
     creation_steps,
     former_name,
     keep_running_steps,
 )
+from rosproxy_operator.docker.planner.duplicates import free_name
+from rosproxy_operator.docker.planner.model import HostState, Key
+from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
 
 

@@ -12,6 +12,12 @@ from rosproxy_operator.docker.planner.actions import (
     CreateSandbox,
 )
 from rosproxy_operator.docker.planner.allocation import after_refusals, allocate
+from rosproxy_operator.docker.planner.container_steps import (
+    PlanContext,
+    disconnect_steps,
+    removal_steps,
+    wanted_steps,
+)
 from rosproxy_operator.docker.planner.desired import assign_aliases, desire
 from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
 from rosproxy_operator.docker.planner.label_policy import within_bounds
@@ -20,12 +26,6 @@ from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Memb
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.specs import master, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
-from rosproxy_operator.docker.planner.steps import (
-    PlanContext,
-    disconnect_steps,
-    removal_steps,
-    wanted_steps,
-)
 from rosproxy_operator.docker.settings import PlanSettings
 
 SOON = 1.0

@@ -21,8 +21,7 @@ from rosproxy_operator.common.port_negotiation import (
     within,
 )
 from rosproxy_operator.common.ros2 import well_known_ports
-from rosproxy_operator.kubernetes.planner.state import ClusterState, host_ports_of
-from rosproxy_operator.kubernetes.planner.view import (
+from rosproxy_operator.kubernetes.planner.cluster_view import (
     View,
     abbreviated,
     group_by_key,
@@ -30,6 +29,7 @@ from rosproxy_operator.kubernetes.planner.view import (
     place_of,
     serves,
 )
+from rosproxy_operator.kubernetes.planner.state import ClusterState, host_ports_of
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Pod,

@@ -11,8 +11,8 @@ from ipaddress import ip_address, ip_network
 import msgspec
 from msgspec.structs import replace
 
+from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.planner.view import group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import ClusterNode
 

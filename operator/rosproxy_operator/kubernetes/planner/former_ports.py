@@ -1,8 +1,9 @@
 """Which ports participants of ROS 2 had, for a proxy whose pod is made anew.
 
 A proxy that is started again in its pod is told that by the participants themselves. A new pod has
-another address, at which they don't answer it (see `rosproxy.ros2.discovery.returning`): then the
-operator tells it what the former proxy reported last, if it has seen that; otherwise nobody does.
+another address, at which they don't answer it (see
+`rosproxy.ros2.discovery.returning_participants`): then the operator tells it what the former proxy
+reported last, if it has seen that; otherwise nobody does.
 """
 
 from collections.abc import Mapping
@@ -10,7 +11,7 @@ from collections.abc import Mapping
 import msgspec
 
 from rosproxy_operator.common.proxy_status import Leases
-from rosproxy_operator.kubernetes.planner.view import View
+from rosproxy_operator.kubernetes.planner.cluster_view import View
 from rosproxy_operator.kubernetes.resources.model import ProxyPlace
 
 

@@ -21,6 +21,7 @@ from rosproxy_operator.kubernetes.planner.access.bounds import within_bounds
 from rosproxy_operator.kubernetes.planner.access.policies import policies
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
+from rosproxy_operator.kubernetes.planner.cluster_view import view
 from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
 from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
@@ -43,7 +44,6 @@ from rosproxy_operator.kubernetes.planner.steps.reconcile import (
     site_of,
 )
 from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
-from rosproxy_operator.kubernetes.planner.view import view
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,

@@ -21,9 +21,9 @@ from rosproxy_operator.common.port_negotiation import (
     overlap,
     within,
 )
+from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
-from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,

@@ -40,7 +40,7 @@ from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, count_reply
-from rosproxy.ros1.standins.stand_in_ports import StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer

@@ -27,7 +27,7 @@ from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.tcpros_server import InsideNodes, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
-from rosproxy.ros1.standins.stand_in_ports import StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 
 log = logging.getLogger(__name__)

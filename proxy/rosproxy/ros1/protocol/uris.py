@@ -1,10 +1,10 @@
 """The addresses in ROS URIs: slave URIs (``http://host:port/``) and service URIs (``rosrpc://``).
 
 An *advertised* URI is ``http://HOST:PORT/`` with a port of the range, which says all that others
-need. Where the node is is remembered elsewhere (`rosproxy.ros1.registry.memory`), in the form of a
-path, in which former versions advertised it: ``/10.0.0.5:40001/``. Where the node calls itself by a
-name, a second segment holds the address that it was found at: ``/c1:40001/10.0.0.5/``. Where its
-own URI has a path, a third one holds that.
+need. Where the node is is remembered elsewhere (`rosproxy.ros1.registry.remembered_leases`), in the
+form of a path, in which former versions advertised it: ``/10.0.0.5:40001/``. Where the node calls
+itself by a name, a second segment holds the address that it was found at: ``/c1:40001/10.0.0.5/``.
+Where its own URI has a path, a third one holds that.
 """
 
 import re

@@ -1,9 +1,9 @@
 """The policy's part in calls: what of a call is asked about, and what is answered in its place.
 
 A registration that is denied is answered as the master would have answered it, with what the nodes
-inside are to know; `rosproxy.ros1.registry.hidden` tells what that is. Texts and values of replies:
-ros_comm/tools/rosmaster/src/rosmaster/master_api.py and registrations.py, and for a topic that a
-node does not publish clients/rospy/src/rospy/impl/masterslave.py (requestTopic).
+inside are to know; `rosproxy.ros1.registry.hidden_registrations` tells what that is. Texts and
+values of replies: ros_comm/tools/rosmaster/src/rosmaster/master_api.py and registrations.py, and
+for a topic that a node does not publish clients/rospy/src/rospy/impl/masterslave.py (requestTopic).
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from rosproxy.access.rules import RuleKind
 from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call
-from rosproxy.ros1.registry import hidden
+from rosproxy.ros1.registry import hidden_registrations
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import LocalAnswer, RegistryChange, second_parameter_name
@@ -70,11 +70,11 @@ def hidden_registration(
         return LocalAnswer(1, text, 1, fact)
     if registration.kind is Kind.PUBLISHER:
         endpoints: Iterable[Endpoint] = (
-            e for e, _ in hidden.subscribers_inside(registry, registration.name)
+            e for e, _ in hidden_registrations.subscribers_inside(registry, registration.name)
         )
         text = f"Registered [{registration.caller_id}] as publisher of [{registration.name}]"
     else:
-        endpoints = hidden.publishers_inside(registry, registration.name)
+        endpoints = hidden_registrations.publishers_inside(registry, registration.name)
         text = f"Subscribed to [{registration.name}]"
     return LocalAnswer(1, text, _imported(dict.fromkeys(endpoints), caller, addressing), fact)
 
@@ -88,7 +88,7 @@ def hidden_unregistration(registration: Registration) -> LocalAnswer:
 
 def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> LocalAnswer | None:
     """The answer to lookupService, if the master does not know of the service."""
-    endpoint = hidden.service(addressing.registry, second_parameter_name(call))
+    endpoint = hidden_registrations.service(addressing.registry, second_parameter_name(call))
     if endpoint is None:
         return None
     uri = addressing.advertised_service(endpoint)
@@ -98,7 +98,7 @@ def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> LocalA
 
 def hidden_node(call: Call, caller: Caller, addressing: Addressing) -> LocalAnswer | None:
     """The answer to lookupNode, if the master knows nothing of that node."""
-    endpoint = hidden.node(addressing.registry, second_parameter_name(call))
+    endpoint = hidden_registrations.node(addressing.registry, second_parameter_name(call))
     if endpoint is None:
         return None
     uri = addressing.import_slave(addressing.advertised_uri(endpoint), caller)
@@ -131,10 +131,10 @@ def publishers_for(
     registry = addressing.registry
     if endpoint is None:
         return [*at_master]
-    if hidden.is_hidden_subscriber(registry, endpoint, topic):
-        at_master, extra = [], hidden.publishers_inside(registry, topic)
+    if hidden_registrations.is_hidden_subscriber(registry, endpoint, topic):
+        at_master, extra = [], hidden_registrations.publishers_inside(registry, topic)
     else:
-        extra = hidden.publishers(registry, topic)
+        extra = hidden_registrations.publishers(registry, topic)
     return [*dict.fromkeys([*at_master, *map(addressing.advertised_uri, extra)])]
 
 

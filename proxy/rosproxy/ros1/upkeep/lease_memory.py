@@ -3,7 +3,8 @@
 It is written before a node is registered for the first time, and before a service's registration is
 answered: whatever the master knows of, the next process of the proxy can find. All who wait at once
 are served by one write. Once in a while it is looked after: the master may have lost it, and what
-nobody needs any more is taken back. What is kept, and how: `rosproxy.ros1.registry.memory`.
+nobody needs any more is taken back. What is kept, and how:
+`rosproxy.ros1.registry.remembered_leases`.
 """
 
 import asyncio
@@ -11,8 +12,8 @@ from collections.abc import Mapping
 
 from rosproxy.ros1.clients.master_client import MasterError
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry import memory
-from rosproxy.ros1.registry.memory import RememberedLease
+from rosproxy.ros1.registry import remembered_leases
+from rosproxy.ros1.registry.remembered_leases import RememberedLease
 
 REFUSED = (
     "the master does not keep this parameter ({}), so that nodes have to be restarted after a "
@@ -26,7 +27,7 @@ class LeaseMemory:
     def __init__(self, context: Context) -> None:
         self._context, self._lock = context, asyncio.Lock()
         settings = context.settings
-        self.parameter = memory.parameter_of(settings.advertise_host, settings.ports)
+        self.parameter = remembered_leases.parameter_of(settings.advertise_host, settings.ports)
         self._written_changes = -1
         self._stored: object = None
         """What the master has, as far as is known."""
@@ -34,7 +35,7 @@ class LeaseMemory:
     async def read(self) -> Mapping[int, RememberedLease]:
         """What a former process has left, by port. Raises Unreachable."""
         self._stored = await self._read()
-        return memory.read_leases(self._stored, self._context.settings.ports)
+        return remembered_leases.read_leases(self._stored, self._context.settings.ports)
 
     async def write(self) -> None:
         """Have the master keep what is known of all leases, unless it does. Raises Unreachable."""
@@ -43,7 +44,9 @@ class LeaseMemory:
             async with self._lock:  # whoever has waited here finds the write done, as a rule
                 changes = registry.lease_changes
                 if self._written_changes != changes:
-                    await self._write(memory.leases_text(registry, self._context.settings.ports))
+                    await self._write(
+                        remembered_leases.leases_text(registry, self._context.settings.ports)
+                    )
                     self._written_changes = changes
 
     async def look(self) -> None:

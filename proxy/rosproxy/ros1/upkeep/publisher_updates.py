@@ -1,9 +1,9 @@
 """The master's part for what it does not know: which publishers subscribers inside hear of.
 
 A list of publishers for a node inside is what the master says, and the hidden publishers besides
-(`rosproxy.ros1.registry.hidden`). When those change, the subscribers inside are told. The ones that
-the master knows need the master's list for that: registering them again yields it, and tells
-nobody anything.
+(`rosproxy.ros1.registry.hidden_registrations`). When those change, the subscribers inside are told.
+The ones that the master knows need the master's list for that: registering them again yields it,
+and tells nobody anything.
 
 Updates of one topic wait for each other, so that an older list never comes after a newer one.
 """
@@ -18,10 +18,10 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry import hidden
+from rosproxy.ros1.registry import hidden_registrations
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.rewriting import policing
-from rosproxy.ros1.standins.stand_in_ports import StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import registration as decisions
 
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ class PublisherUpdates:
         try:
             while topic in self._changed_topics:
                 everybody = self._changed_topics.pop(topic)
-                inside = hidden.subscribers_inside(self._context.registry, topic)
+                inside = hidden_registrations.subscribers_inside(self._context.registry, topic)
                 inside = [(e, r) for e, r in inside if e.answers and (everybody or r.hidden)]
                 try:
                     await self._hand_out(inside)

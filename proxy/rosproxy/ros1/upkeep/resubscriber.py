@@ -29,7 +29,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Regi
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
-from rosproxy.ros1.standins.stand_in_ports import StandInPorts
+from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import resubscription as decisions
 from rosproxy.ros1.upkeep.decisions.registration import one_publisher_per_topic
 from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription

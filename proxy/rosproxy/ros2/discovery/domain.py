@@ -28,17 +28,17 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.leases.ports import PortPool
+from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.keeper import Keeper
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.own_participants import OwnParticipants
-from rosproxy.ros2.discovery.partings import Partings
-from rosproxy.ros2.discovery.rates import DiscoveryRates
-from rosproxy.ros2.discovery.returning import ReturningParticipants
+from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.rediscovery import Rediscovery
+from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
 from rosproxy.ros2.protocol.envelope import unwrapped
 from rosproxy.ros2.protocol.rtps import (
@@ -80,7 +80,7 @@ class Domain:
     returning: ReturningParticipants
     refused: Refused
     fragments: FragmentStores
-    partings: Partings
+    rediscovery: Rediscovery
     rates: DiscoveryRates = field(default_factory=DiscoveryRates)
     passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
 
@@ -98,9 +98,9 @@ class Domain:
         participants = OwnParticipants(
             settings, Observer(own), keeper, inside, outside, returning, fragments
         )
-        partings = Partings(settings, outside)
+        meetings = Rediscovery(settings, outside)
         return cls(
-            settings, ports, participants, inside, outside, returning, refused, fragments, partings
+            settings, ports, participants, inside, outside, returning, refused, fragments, meetings
         )
 
     def is_kept(self, participant: InsideParticipant) -> bool:
@@ -132,7 +132,7 @@ class Domain:
             # Participants on the ear's host have its address, too; what they send has no envelope.
             if is_wrapped := heard_by_ear and not datagram.startswith(MAGIC):
                 source, datagram = unwrapped(datagram)
-                self.partings.ear_heard = True
+                self.rediscovery.ear_heard = True
             if not heard_by_ear and self.outside.is_strange(source):
                 return []
             if self._is_too_much(datagram, source, now):
@@ -194,7 +194,7 @@ class Domain:
         for source, message in self.returning.ready(now):
             if message.prefix not in self.outside.by_prefix:
                 sent += self._announced_inside(message, source, now)
-        return sent + self.partings.proceed(self.inside.by_prefix.values(), now)
+        return sent + self.rediscovery.proceed(self.inside.by_prefix.values(), now)
 
     def expire(self, now: float) -> None:
         """Forget those that have not been heard for as long as they said."""
@@ -222,7 +222,7 @@ class Domain:
         for insider in self.inside.by_prefix.values():
             if has_changed(self.settings.judge, insider):
                 insider.verdicts.clear()
-                sent += self.partings.separate(insider, now)
+                sent += self.rediscovery.separate(insider, now)
         return sent
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
@@ -307,7 +307,7 @@ class Domain:
         self.fragments.forget(insider.prefix)
 
     def _forget_outside(self, outsider: OutsideParticipant) -> None:
-        self.partings.forget(self.inside.by_prefix.values(), outsider.prefix)
+        self.rediscovery.forget(self.inside.by_prefix.values(), outsider.prefix)
         self.outside.forget(outsider)
         self.own.forget(outsider.prefix)
         self.fragments.forget(outsider.prefix)
@@ -322,7 +322,7 @@ class Domain:
             return [], []
         if insider.is_apart:
             return [], []
-        self.partings.note_met(insider, reader)
+        self.rediscovery.note_met(insider, reader)
         count, exported = len(insider.leases), partial(self.inside.exported, insider, now=now)
         passed, questions = self.fragments.rewritten(port, message, reader, exported)
         return passed, sent_to(insider.metatraffic, questions) + self._reminders(insider, count)

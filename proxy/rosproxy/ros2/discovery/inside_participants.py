@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced import (
+from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
     note_endpoints,

@@ -11,7 +11,7 @@ from functools import partial
 from math import inf
 
 from rosproxy.net.addresses import HostPort, is_loopback, is_of_link
-from rosproxy.ros2.discovery.announced import (
+from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
     next_number,

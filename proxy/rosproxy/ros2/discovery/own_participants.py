@@ -12,10 +12,10 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.keeper import Keeper
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.discovery.returning import ReturningParticipants
+from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage

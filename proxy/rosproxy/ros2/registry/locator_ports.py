@@ -5,7 +5,7 @@ So a proxy that has lost all memory gives the same ports again, unless two parti
 same one first: then who came first has it, which a new process can't know. But outside goes on
 sending to the ports that it was told, and names the participant that it means (INFO_DST). So no
 port is given in the first second. Then a port goes first to the participant that was named there,
-next to one that says itself that it had it (`rosproxy.ros2.discovery.keeper`), as anybody may.
+next to one that says itself that it had it (`rosproxy.ros2.discovery.port_keeper`), as anybody may.
 What the kernel forwards does not come here; but its table is what a former process has left there,
 and tells which port led to which locator.
 """

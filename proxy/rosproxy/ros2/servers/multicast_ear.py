@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
 from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
 )
-from rosproxy.ros2.discovery.rates import DiscoveryRates
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery

@@ -8,7 +8,7 @@ import pytest
 
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiConflict, ApiUnavailable
-from rosproxy_operator.kubernetes.confirm import StateChanged, confirm
+from rosproxy_operator.kubernetes.confirm_deletion import StateChanged, confirm
 from rosproxy_operator.kubernetes.planner.actions import DeleteEar, DeleteProxy, DeleteService
 from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.api_server import ApiServer

@@ -1,7 +1,7 @@
 """Which parts are planned when: what has changed, what wanted to be, and now and then all."""
 
-from rosproxy_operator.kubernetes.due import PlanSchedule
-from rosproxy_operator.kubernetes.planner.parts import Partition
+from rosproxy_operator.kubernetes.plan_schedule import PlanSchedule
+from rosproxy_operator.kubernetes.planner.partition import Partition
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
 

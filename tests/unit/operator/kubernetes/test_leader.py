@@ -8,11 +8,11 @@ import pytest
 
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes import leader as module
+from rosproxy_operator.kubernetes import leader_election as module
 from rosproxy_operator.kubernetes.api.api_client import Api, NotLeading
 from rosproxy_operator.kubernetes.api.leader_gate import Gate
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.leader import LeaderElection
+from rosproxy_operator.kubernetes.leader_election import LeaderElection
 from rosproxy_operator.kubernetes.planner import leadership
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.run import hand_over

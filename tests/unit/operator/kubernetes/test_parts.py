@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import Action
-from rosproxy_operator.kubernetes.planner.parts import (
+from rosproxy_operator.kubernetes.planner.partition import (
     Partition,
     merge_state,
     partition_of,

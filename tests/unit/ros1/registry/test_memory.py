@@ -6,9 +6,14 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import InsidePath
-from rosproxy.ros1.registry import memory
+from rosproxy.ros1.registry import remembered_leases
 from rosproxy.ros1.registry.endpoint import MOST_SERVICE_PORTS
-from rosproxy.ros1.registry.memory import RememberedLease, lease_at, parameter_of, read_leases
+from rosproxy.ros1.registry.remembered_leases import (
+    RememberedLease,
+    lease_at,
+    parameter_of,
+    read_leases,
+)
 from tests.unit.builders import add_node, make_addressing
 
 PORTS = PortMap(PortRange(45000, 45009), PortRange(30000, 30009))
@@ -32,7 +37,7 @@ def test_a_lease_is_a_line() -> None:
     add_node(addressing, "http://c6:40001/", "10.0.0.6")
     for port in (41234, 41235):
         first.note_service_port(port)
-    text = memory.leases_text(addressing.registry, addressing.ports)
+    text = remembered_leases.leases_text(addressing.registry, addressing.ports)
     assert text == "45000 /10.0.0.5:40001/ 41234 41235\n45001 /c6:40001/10.0.0.6/\n"
     leases = read_leases(text, addressing.ports)
     assert leases == {
@@ -52,7 +57,7 @@ def test_so_many_ports_of_services_are_kept_the_newest() -> None:
     news = [endpoint.note_service_port(port) for port in range(1, 40)]
     assert all(news)
     assert not endpoint.note_service_port(39)
-    text = memory.leases_text([endpoint], addressing.ports)
+    text = remembered_leases.leases_text([endpoint], addressing.ports)
     (lease,) = read_leases(text, addressing.ports).values()
     assert lease.service_ports == tuple(range(40 - MOST_SERVICE_PORTS, 40))
 

@@ -11,7 +11,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call
-from rosproxy.ros1.registry import hidden
+from rosproxy.ros1.registry import hidden_registrations
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
@@ -102,13 +102,13 @@ def test_what_is_hidden_is_known_by_kind_and_name() -> None:
     )
     registry = addressing.registry
     a, b, c = registry
-    assert nodes(hidden.publishers(registry, "/t")) == ["/a"]
-    assert hidden.service(registry, "/s") is b
-    assert hidden.service(registry, "/shown") is None
-    assert hidden.node(registry, "/a") is a
-    assert hidden.node(registry, "/c") is None
+    assert nodes(hidden_registrations.publishers(registry, "/t")) == ["/a"]
+    assert hidden_registrations.service(registry, "/s") is b
+    assert hidden_registrations.service(registry, "/shown") is None
+    assert hidden_registrations.node(registry, "/a") is a
+    assert hidden_registrations.node(registry, "/c") is None
     a.health.note_cleaned(1.0)
-    assert hidden.publishers(registry, "/t") == []
+    assert hidden_registrations.publishers(registry, "/t") == []
     registry.register(b, replace(b.registrations[Kind.SERVICE, "/s", "/b"], hidden=False))
     registry.remove(a)
     assert registry.hidden == {}

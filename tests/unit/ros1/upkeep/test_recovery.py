@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry import memory
+from rosproxy.ros1.registry import remembered_leases
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.decisions import recovery_claims
@@ -27,7 +27,7 @@ def graph(uris: dict[str, str]) -> Graph:
     return Graph({node: [make_registration("/a", node)] for node in uris}, uris)
 
 
-MEMORY = memory.read_leases(
+MEMORY = remembered_leases.read_leases(
     "45003 /10.0.0.5:40001/\n"
     "45004 /c5:40001/10.0.0.5/ 41234 41235\n"
     "45005 /127.0.0.1:40001/10.0.0.5/\n"
@@ -90,7 +90,7 @@ def test_of_some_nothing_is_remembered() -> None:
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
     addressing = make_addressing(advertise=(30000, 30009))
     uris = {"/n": "http://robot-host:30003/", "/m": "http://robot-host:45003/"}
-    kept = memory.read_leases("30003 /10.0.0.5:1/\n", addressing.ports)
+    kept = remembered_leases.read_leases("30003 /10.0.0.5:1/\n", addressing.ports)
     assert [
         claim.port for claim in recovery_claims.find_claims(graph(uris), addressing, kept)[0]
     ] == [45003]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced import traits
+from rosproxy.ros2.discovery.announced_participant import traits
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import DdsSecurity, LocatorFault, ParticipantTraits

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
-from rosproxy.ros2.discovery.rates import BURST
-from rosproxy.ros2.discovery.returning import ANSWER_TIME
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator

@@ -10,8 +10,8 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain_settings import MOST_INSIDE, MOST_PER_ADDRESS, MOST_PER_HOST
-from rosproxy.ros2.discovery.partings import APART_TIME
-from rosproxy.ros2.discovery.returning import ANSWER_TIME
+from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.keeper import COUNTS_EACH_SECOND, Keeper
+from rosproxy.ros2.discovery.port_keeper import COUNTS_EACH_SECOND, Keeper
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import destination, source_prefix
 

@@ -6,7 +6,7 @@ from rosproxy.admin.requests import BodyError, ContainerNews, read_body
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.outside_participants import FAREWELL_INTERVAL
-from rosproxy.ros2.discovery.partings import APART_TIME, EAR_TIME
+from rosproxy.ros2.discovery.rediscovery import APART_TIME, EAR_TIME
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery

@@ -4,7 +4,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
-from rosproxy.ros2.discovery.partings import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.protocol.rtps import SubmessageId, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery import domains

@@ -14,8 +14,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery import fragments
+from rosproxy.ros2.discovery.discovery_rates import BURST, MOST_SOURCES
 from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, Outgoing
-from rosproxy.ros2.discovery.rates import BURST, MOST_SOURCES
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER
 from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS

@@ -7,8 +7,8 @@ well, since it may have been wired before that one was created.
 
 from collections.abc import Mapping
 
+from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
-from rosproxy_operator.kubernetes.planner.view import group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.ros2 import EAR_COMMAND, ear_variables
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateEar, DeleteEar
+from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.manifests import (
     POD_SECURITY_CONTEXT,
     ProxySite,
@@ -23,7 +24,6 @@ from rosproxy_operator.kubernetes.planner.manifests import (
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext, site_of
-from rosproxy_operator.kubernetes.planner.view import group_by_key
 from rosproxy_operator.kubernetes.resources.cluster import EarPod
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, ProxyPlace, RosProxy
 from rosproxy_operator.kubernetes.resources.names import EAR, NODE, ear_id

@@ -26,10 +26,10 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
+from rosproxy_operator.kubernetes.planner.cluster_view import View, serves
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.planner.view import View, serves
 from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,

@@ -16,7 +16,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_inside_path, slave_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
-from rosproxy.ros1.registry.memory import RememberedLease
+from rosproxy.ros1.registry.remembered_leases import RememberedLease
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)

@@ -10,14 +10,14 @@ from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced import first_metatraffic
+from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.domain_settings import (
     MOST_INSIDE,
     MOST_PER_ADDRESS,
     DomainSettings,
     Outgoing,
 )
-from rosproxy.ros2.discovery.keeper import Keeper
+from rosproxy.ros2.discovery.port_keeper import Keeper
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage

@@ -41,8 +41,8 @@ from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
-from rosproxy.ros1.standins.outside_nodes import Outside, OutsideNode
-from rosproxy.ros1.standins.udpros_relays import UdprosRelays
+from rosproxy.ros1.stand_ins.outside_nodes import Outside, OutsideNode
+from rosproxy.ros1.stand_ins.udpros_relays import UdprosRelays
 
 log = logging.getLogger(__name__)
 

@@ -41,7 +41,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
 from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
 from rosproxy.ros1.servers.access_checks import AccessChecks
-from rosproxy.ros1.standins.outside_nodes import Outside
+from rosproxy.ros1.stand_ins.outside_nodes import Outside
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ All of them are due every ``resync`` seconds in any case: whatever was missed is
 
 from collections.abc import Iterable
 
-from rosproxy_operator.kubernetes.planner.parts import Partition, partition_of
+from rosproxy_operator.kubernetes.planner.partition import Partition, partition_of
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 
 

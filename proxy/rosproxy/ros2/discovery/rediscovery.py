@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
 
-from rosproxy.ros2.discovery.announced import next_number
+from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.protocol.announcement import farewell
@@ -31,7 +31,7 @@ EAR_TIME = 30.0
 
 
 @dataclass(slots=True)
-class Partings:
+class Rediscovery:
     """Parts participants inside from all outside, and introduces them again."""
 
     settings: DomainSettings
