@@ -112,7 +112,7 @@ class ControlPlane:
         end = time.monotonic() + _PATIENCE
         while True:
             for program in self.programs:
-                assert program.poll() is None, f"{program.args} has ended: see {self.folder}"
+                assert program.poll() is None, f"{program.args!r} has ended: see {self.folder}"
             with suppress(aiohttp.ClientError):
                 async with self.session.get("/readyz") as reply:
                     if reply.status == 200:

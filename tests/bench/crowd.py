@@ -62,7 +62,8 @@ def register(master: str, uri: str, number: int) -> None:
     for topic in topics(number):
         body = dumps((f"/crowd_{number}", topic, STRING, uri), "registerPublisher").encode()
         http.request("POST", "/", body, {"Content-Type": "text/xml"})
-        reply = loads(http.getresponse().read())[0][0]
+        (reply,), _ = loads(http.getresponse().read())
+        assert isinstance(reply, list)
         assert reply[0] == 1, reply
     http.close()
 

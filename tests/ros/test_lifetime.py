@@ -104,7 +104,7 @@ def test_a_node_answers_over_one_connection_until_it_ends(lab: Lab, library: str
 
 
 async def asked_until_it_ends(address: HostPort, node: Process) -> None:
-    upstream = MasterClient("http://127.0.0.1:1", "test", Metrics([]))
+    upstream = MasterClient("http://127.0.0.1:1", "test", Metrics())
     nodes = NodeClient(upstream, 5.0)
     connections = KeptConnections[str](nodes, within=60.0)
     connections.most = 1
