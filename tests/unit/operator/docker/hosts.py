@@ -127,11 +127,11 @@ class Hosts(Invariants):
         ports = frozenset({11400 + m % 16})
         udp = bool(m & 1)
         box = self.engine.add(name, **{"udp" if udp else "ports": ports})
+        if not self.engine.conflicts(box) and n % 2:
+            self.engine.begin(box, "running")
         network = pick(NETWORKS, m)
         if network in self.engine.networks:
             self.engine.join(box, network)
-        if not self.engine.conflicts(box) and n % 2:
-            box.state = "running"
 
     def forge(self, n: int, m: int) -> None:
         """A container of an image that has the labels of what the operator makes."""
@@ -141,7 +141,8 @@ class Hosts(Invariants):
         if len(self.strangers()) > 6:
             return
         labels = pick([own_labels(made), *own], n)
-        box = self.engine.add(name, labels=labels, state=pick(STATES[:3], m // 5))
+        box = self.engine.add(name, labels=labels)
+        self.engine.begin(box, pick(STATES[:3], m // 5))
         if networks := sorted(self.engine.networks.keys()):
             self.engine.join(box, pick(networks, m))
 
