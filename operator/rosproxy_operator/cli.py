@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from rosproxy import __version__
 from rosproxy.cli.main import main as proxy_main
@@ -111,9 +112,13 @@ def docker(
     # The proxy's variables have the same prefix, ROSPROXY_, and are no mistake here.
     unknown_variables(main, proxy_main)
     with setting_errors():
-        context.obj = make_plan_settings(options)
+        settings = make_plan_settings(options)
+    # Who gives options asks what an operator with these would do, whatever the running one does.
+    given = (context.get_parameter_source(name) for name in options if name != "admin_bind")
+    asks = ParameterSource.COMMANDLINE not in given
+    context.obj = docker_commands.CommandContext(settings, options["admin_bind"] if asks else None)
     if context.invoked_subcommand is None:
-        _run(context.obj, options["resync"], options["admin_bind"], once)
+        _run(settings, options["resync"], options["admin_bind"], once)
     elif once:
         raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
 

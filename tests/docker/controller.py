@@ -139,9 +139,8 @@ class Controller:
         return logs(self.container)
 
     def command(self, *words: str, check: bool = True) -> str:
-        """Run another command of the controller's program with the same settings."""
-        return docker("exec", self.container, "rosproxy-operator", "docker", *self.options,
-                      *words, check=check)  # fmt: skip
+        """Run another command in its container: the controller itself knows its options."""
+        return docker("exec", self.container, "rosproxy-operator", "docker", *words, check=check)
 
     def status(self) -> dict[str, Any]:
         document: dict[str, Any] = json.loads(self.command("status", "--json", check=False))

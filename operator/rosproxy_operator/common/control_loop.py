@@ -69,6 +69,7 @@ class ControlLoop:
         self._again_in: float | None = None
         self._looking_since: float | None = None
         self._looked_at = self._beat_at = 0.0
+        self._awaiting_look: list[asyncio.Future[None]] = []
 
     async def run(self, look: Look) -> None:
         """Look until cancelled, also after an unexpected error: a bug must not end the loop."""
@@ -119,6 +120,20 @@ class ControlLoop:
         self._woken.set()
         self._back.set()
 
+    async def look_anew(self) -> None:
+        """Have a look that begins from now on, and wait for its end.
+
+        Raises LookFailed if it was no success, or the one before was not: then it takes long.
+        """
+        if self._failures:
+            raise LookFailed(self._error or "")
+        ended = asyncio.get_running_loop().create_future()
+        self._awaiting_look.append(ended)
+        self.wake()
+        await ended
+        if self._error is not None:
+            raise LookFailed(self._error)
+
     def dead(self) -> str | None:
         """Why the loop is not alive; None if it is. May be asked from any thread."""
         if self._loop is None:
@@ -138,6 +153,7 @@ class ControlLoop:
         """One look; whether it succeeded. Raises LookFailed only if the engine is away."""
         self._woken.clear()
         self._back.clear()
+        awaiting, self._awaiting_look = self._awaiting_look, []
         self._looking_since = asyncio.get_running_loop().time()
         try:
             async with asyncio.timeout(self._pace.longest):
@@ -157,6 +173,9 @@ class ControlLoop:
             self._metrics.up.set(1)
         finally:
             self._looking_since, self._looked_at = None, asyncio.get_running_loop().time()
+            for ended in awaiting:
+                if not ended.done():  # whoever waited may have given up
+                    ended.set_result(None)
         return not self._failures
 
     def _failed(self, error: LookFailed) -> None:

@@ -1,6 +1,7 @@
-"""The operator's own endpoint: /healthz, /readyz, /metrics, and the live page of its proxies."""
+"""The operator's own endpoint: /healthz, /readyz, /metrics, /status, and its proxies' live page."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Awaitable, Callable
 from functools import partial
 
 from aiohttp import web
@@ -9,15 +10,30 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.page.routes import Page
+from rosproxy.page.visitors import Visitors
 from rosproxy.setting_kinds import SettingError
+from rosproxy_operator.common.control_loop import LookFailed
+from rosproxy_operator.common.proxy_client import Json
 
 Check = Callable[[], str | None]
+GetStatus = Callable[[], Awaitable[Json]]
+"""Makes the document at ``/status``; raises LookFailed."""
 
 
 class HealthServer:
-    """Serves what orchestrators ask. ``alive`` and ``ready`` give None or the reason why not."""
+    """Serves what orchestrators ask. ``alive`` and ``ready`` give None or the reason why not.
 
-    def __init__(self, metrics: CollectorRegistry, alive: Check, ready: Check, page: Page) -> None:
+    ``status`` is for callers on loopback, as the page is.
+    """
+
+    def __init__(
+        self,
+        metrics: CollectorRegistry,
+        alive: Check,
+        ready: Check,
+        page: Page,
+        status: GetStatus | None = None,
+    ) -> None:
         self._page = page
         app = web.Application()
         for (method, path), handler in page.routes.items():
@@ -25,6 +41,9 @@ class HealthServer:
         app.router.add_get("/healthz", partial(_check, alive))
         app.router.add_get("/readyz", partial(_check, ready))
         app.router.add_get("/metrics", partial(_show, metrics))
+        if status is not None:
+            visitors = Visitors(None, time.monotonic, local=True)
+            app.router.add_get("/status", partial(_tell, status, visitors))
         self._runner = web.AppRunner(app, access_log=None)
 
     async def start(self, listener: HostPort) -> None:
@@ -50,3 +69,12 @@ async def _check(check: Check, request: web.Request) -> web.Response:
 async def _show(metrics: CollectorRegistry, request: web.Request) -> web.Response:
     body = generate_latest(metrics)
     return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+
+async def _tell(status: GetStatus, visitors: Visitors, request: web.Request) -> web.Response:
+    if not visitors.may_look(request):
+        return web.Response(status=403, text="the status is for this machine's own loopback\n")
+    try:
+        return web.json_response(await status())
+    except LookFailed as error:
+        return web.Response(status=503, text=f"{error}\n")

@@ -1,16 +1,30 @@
-"""The commands below ``rosproxy-operator docker``: they look, and need no running operator.
+"""The commands below ``rosproxy-operator docker``: they tell what there is, and change nothing.
 
 They import what they need when they run: the Docker SDK may not be installed.
 """
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import click
 
 from rosproxy.cli.options import Command, Seconds
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.command_errors import exit_on_error
 from rosproxy_operator.docker.settings import PlanSettings
+
+
+@dataclass(frozen=True, slots=True)
+class CommandContext:
+    """What was given before a command: ``operator`` is where one is to be asked, None for nowhere.
+
+    ``settings`` count where none answers.
+    """
+
+    settings: PlanSettings
+    operator: HostPort | None
+
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
 
@@ -24,46 +38,48 @@ def _wait_option(text: str) -> Callable[[Command], Command]:
 @click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
 @_wait_option("Time in which all may come to be as wanted, before it is shown.")
 @click.pass_obj
-def status(settings: PlanSettings, as_json: bool, watch: bool, wait: float) -> None:
+def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> None:
     """Show the proxies, the labelled containers, their nodes, and what is wrong.
 
-    Needs no running controller. Exits with 0 if all is as wanted: nothing is wrong or left to be
-    done, and every proxy answers; else with 1.
+    The running operator tells it. Where none answers at --admin-bind, or options are given before
+    this command, it is what an operator with those options would see. Exits with 0 if all is as
+    wanted: nothing is wrong or left to be done, and every proxy answers; else with 1.
     """
     if as_json and watch:
         raise click.UsageError("--json or --watch, not both")
     from rosproxy_operator.docker.errors import EngineError
-    from rosproxy_operator.docker.host_status import show_status, watch_status
+    from rosproxy_operator.docker.host_status import HostStatus, show_status, watch_status
 
+    host = HostStatus(context.settings, context.operator)
     if watch:
-        watch_status(settings)
+        watch_status(host)
         return
     with exit_on_error(EngineError):
-        sys.exit(show_status(settings, as_json, wait))
+        sys.exit(show_status(host, as_json, wait))
 
 
 @click.command()
 @_json_option
 @_wait_option("Time in which there may come to be nothing to do, before it is shown.")
 @click.pass_obj
-def plan(settings: PlanSettings, as_json: bool, wait: float) -> None:
+def plan(context: CommandContext, as_json: bool, wait: float) -> None:
     """Show what the operator would do now, and change nothing.
 
-    Exits with 0 if there is nothing to do, with 3 if there is, with 1 if something is wrong that
-    the operator can't mend.
+    The running operator tells it, as status does. Exits with 0 if there is nothing to do, with 3 if
+    there is, with 1 if something is wrong that the operator can't mend.
     """
     from rosproxy_operator.docker.errors import EngineError
-    from rosproxy_operator.docker.host_status import show_plan
+    from rosproxy_operator.docker.host_status import HostStatus, show_plan
 
     with exit_on_error(EngineError):
-        sys.exit(show_plan(settings, as_json, wait))
+        sys.exit(show_plan(HostStatus(context.settings, context.operator), as_json, wait))
 
 
 @click.command()
 @click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
 @_json_option
 @click.pass_obj
-def doctor(settings: PlanSettings, names: tuple[str, ...], as_json: bool) -> None:
+def doctor(context: CommandContext, names: tuple[str, ...], as_json: bool) -> None:
     """Find out what is wrong on this host, and say what mends it, the first cause first.
 
     Looks at images, networks, masters and labels, and asks the doctor of each proxy, in its
@@ -73,7 +89,8 @@ def doctor(settings: PlanSettings, names: tuple[str, ...], as_json: bool) -> Non
     from rosproxy.cli.questions import print_findings
     from rosproxy_operator.docker.doctor import examine
     from rosproxy_operator.docker.errors import EngineError
+    from rosproxy_operator.docker.host_status import HostStatus
 
     with exit_on_error(EngineError):
-        findings = examine(settings, names)
+        findings = examine(HostStatus(context.settings, context.operator), names)
     print_findings(findings, as_json)

@@ -1,7 +1,7 @@
 """Reconciling a Docker host: look, plan, carry out, report. The loop is `ControlLoop`.
 
-How a label takes effect: the engine's events (`client`) tell that something has changed and wake
-the loop. A look lists everything anew and reads the labels (`snapshot`), decides
+How a label takes effect: the engine's events (`engine_client`) tell that something has changed and
+wake the loop. A look lists everything anew and reads the labels (`snapshot`), decides
 (`planner.plan`), begins to carry out what was decided (`executor`), and brings the running proxies
 up to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
 """
@@ -22,15 +22,16 @@ from rosproxy_operator.common.master_resolver import AGAIN_UNRESOLVED, MasterRes
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.problem import Problem, ProblemLog
-from rosproxy_operator.common.proxy_client import ProxyClient
+from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker import engine_json
-from rosproxy_operator.docker.engine_client import DockerClient, Json, listen
+from rosproxy_operator.docker.engine_client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
+from rosproxy_operator.docker.host_document import host_document
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
-from rosproxy_operator.docker.proxy_sync import DockerProxySync
+from rosproxy_operator.docker.proxy_sync import DockerProxySync, ask_proxies
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
@@ -65,7 +66,9 @@ async def _run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics)
     page = operator_page(controller.documents)
-    health = HealthServer(metrics.registry, controller.dead, controller.unready, page)
+    health = HealthServer(
+        metrics.registry, controller.dead, controller.unready, page, controller.status
+    )
     await health.start(admin)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, admin)
     running = asyncio.create_task(controller.run())
@@ -124,6 +127,16 @@ class DockerController:
         access = self._last[0].access if self._last else {}
         endpoints = {name: (p.admin, p.token) for name, p in access.items()}
         return await self._proxies.documents(endpoints)
+
+    async def status(self) -> Json:
+        """What a new look sees and plans, and what proxies say now. Raises LookFailed."""
+        await self._loop.look_anew()  # the last one may not have seen a container just started
+        if self._last is None:
+            raise LookFailed("the engine has not been looked at yet")
+        snapshot, planned = self._last
+        answers = await ask_proxies(self._proxies, snapshot, self._settings.uplink)
+        problems = self._current(snapshot, planned)
+        return host_document(snapshot.state, planned, problems, answers, self._settings)
 
     async def look(self) -> float | None:
         """One look and what follows from it; when to look again. Raises LookFailed."""

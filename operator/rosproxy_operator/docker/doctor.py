@@ -15,8 +15,7 @@ from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
-from rosproxy_operator.docker.host_status import survey
-from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.docker.host_status import HostStatus
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""
@@ -31,13 +30,13 @@ CURES = {
 """What mends what proxies find about themselves, by their checks."""
 
 
-def examine(settings: PlanSettings, names: Sequence[str]) -> list[DoctorFinding]:
+def examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
     """All findings; of proxies about these nodes and topics, if any. Raises EngineError."""
-    return asyncio.run(_examine(settings, names))
+    return asyncio.run(_examine(host, names))
 
 
-async def _examine(settings: PlanSettings, names: Sequence[str]) -> list[DoctorFinding]:
-    status = await survey(settings)
+async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
+    status = await host.now()
     engine, limit = DockerClient(), asyncio.Semaphore(AT_ONCE)
 
     async def ask(name: str) -> list[DoctorFinding]:

@@ -14,6 +14,7 @@ import logging
 import time
 from collections.abc import Callable, Collection
 
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
@@ -213,6 +214,21 @@ class DockerProxySync:
             for name, (updater, _) in self._running.items()
             if updater.error and updater.silent_since and updater.silent_since < lately
         ]
+
+
+async def ask_proxies(
+    proxies: ProxyClient, snapshot: DockerSnapshot, uplink: str
+) -> dict[str, ProxyStatus | Problem]:
+    """The status of each proxy that runs, by name, or the problem that it does not answer."""
+
+    async def ask(name: str, access: ProxyAccess) -> ProxyStatus | Problem:
+        try:
+            return await proxies.status(access.admin)
+        except ProxyError as error:
+            return silence(name, error, snapshot, uplink)
+
+    answers = await asyncio.gather(*(ask(*proxy) for proxy in snapshot.access.items()))
+    return dict(zip(snapshot.access, answers, strict=True))
 
 
 def silence(name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str) -> Problem:

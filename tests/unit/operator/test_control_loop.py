@@ -281,3 +281,40 @@ async def test_run_until_tells_mistakes_of_ours() -> None:
     looks = Looks(RuntimeError("oops"))
     with pytest.raises(RuntimeError):
         await looks.loop.run_until(looks.look, lambda: True, 60)
+
+
+@in_jumping_time
+async def test_who_wants_a_new_look_gets_one_that_began_afterwards() -> None:
+    async with looking(takes=2.0) as looks:
+        await asyncio.sleep(1)
+        await looks.loop.look_anew()
+        assert (looks.times, looks.now()) == ([0.0, 2.1], 4.1)
+
+
+@in_jumping_time
+async def test_all_who_want_a_new_look_share_it() -> None:
+    async with looking() as looks:
+        await asyncio.sleep(1)
+        given_up = asyncio.create_task(looks.loop.look_anew())
+        await asyncio.sleep(0)
+        given_up.cancel()
+        await asyncio.gather(looks.loop.look_anew(), looks.loop.look_anew())
+        assert looks.times == [0.0, 1.0]
+
+
+@in_jumping_time
+async def test_a_new_look_that_fails_is_told() -> None:
+    async with looking() as looks:
+        await asyncio.sleep(1)
+        looks.errors.append(AWAY)
+        with pytest.raises(LookFailed, match="no engine"):
+            await looks.loop.look_anew()
+
+
+@in_jumping_time
+async def test_nobody_waits_for_an_engine_that_is_away() -> None:
+    async with looking(*[AWAY] * 20) as looks:
+        await asyncio.sleep(30)
+        with pytest.raises(LookFailed, match="no engine"):
+            await looks.loop.look_anew()
+        assert looks.now() == 30.0

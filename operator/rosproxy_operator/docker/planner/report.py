@@ -31,6 +31,9 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
         columns,
         "",
     )
+    if status["operator"] is None:
+        text = "No operator was asked: this is as one with these options would see it."
+        head += wrap(text, columns, "")
     subjects = {f"container {container['name']}" for container in status["containers"]}
     problems = [
         f"{clean(problem['subject'])}: {clean(problem['text'])}"

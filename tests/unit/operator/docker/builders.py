@@ -54,7 +54,7 @@ def container(
     labels: Mapping[str, str] | None = None,
     networks: Iterable[str | Attachment] = ("app",),
     state: str = "running",
-    env: str = "",
+    env: str = "http://rosproxy:11311",
     mode: str = "",
     ports: Iterable[int] = (),
 ) -> Container:

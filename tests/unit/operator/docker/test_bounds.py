@@ -24,9 +24,9 @@ from tests.unit.operator.docker.builders import (
 )
 
 
-def read(settings: PlanSettings = SETTINGS, env: str = "", **labels: str) -> tuple[
-    Member | None, list[Problem]
-]:  # fmt: skip
+def read(
+    settings: PlanSettings = SETTINGS, env: str = "http://rosproxy:11311", **labels: str
+) -> tuple[Member | None, list[Problem]]:
     """The member of one container with these labels, and what it is told."""
     names = {f"rosproxy.{name.replace('_', '-')}": value for name, value in labels.items()}
     talker = container(labels={**ENABLED, **names}, env=env)

@@ -6,8 +6,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rosproxy.access.layers import PolicyMode
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker import host_status
+from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.docker.option_values import read_memory
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
 
@@ -167,3 +170,31 @@ def test_a_policy_can_stand_in_a_variable(monkeypatch: pytest.MonkeyPatch) -> No
         (layer,) = make_plan_settings(context.params).policy
         assert [str(rule) for rule in layer.rules] == rules
         assert layer.mode is PolicyMode.AUDIT
+
+
+@pytest.mark.parametrize(
+    ("words", "variables", "operator"),
+    [
+        ([], {}, DEFAULT_ADMIN),
+        ([], {"ROSPROXY_PORTS": "8"}, DEFAULT_ADMIN),
+        (["--admin-bind", "127.0.0.1:11400"], {}, HostPort("127.0.0.1", 11400)),
+        ([], {"ROSPROXY_ADMIN_BIND": "0.0.0.0:11400"}, HostPort("0.0.0.0", 11400)),
+        (["--ports", "8"], {}, None),
+        (["--admin-bind", "127.0.0.1:11400", "--ports", "8"], {}, None),
+    ],
+)
+def test_the_running_operator_is_asked_unless_options_are_given(
+    words: list[str],
+    variables: dict[str, str],
+    operator: HostPort | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[HostPort | None] = []
+
+    def show_status(host: HostStatus, as_json: bool, wait: float) -> int:
+        asked.append(host.operator)
+        return 0
+
+    monkeypatch.setattr(host_status, "show_status", show_status)
+    assert run("docker", *words, "status", **variables).exit_code == 0
+    assert asked == [operator]

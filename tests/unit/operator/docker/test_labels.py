@@ -180,7 +180,10 @@ def test_good_numbers_of_ports(value: str) -> None:
     ],
 )
 def test_a_master_has_one_uri(uri: str, same: str) -> None:
-    assert good(container(labels={**ON, "rosproxy.master-uri": uri})).key.master_uri == same
+    talker = container(labels={**ON, "rosproxy.master-uri": uri}, env=uri)
+    member, _ = read(talker)
+    assert member is not None
+    assert member.key.master_uri == same
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "0.0.0.0", "a.localhost"])
@@ -207,7 +210,7 @@ def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> Non
     arm = Key("http://arm:11311", HERE)
     for env in ("http://rosproxy:11311", f"http://{proxy_name(arm)}:11311"):
         assert good(container(labels=ON, env=env), settings).key == arm
-    member, told = read(container(labels=ON), settings)
+    member, told = read(container(labels=ON, env=""), settings)
     assert member is not None
     assert member.key == arm
     assert "so it is taken for ROS 1" in told[0].text
@@ -245,10 +248,21 @@ def test_a_variable_that_leads_astray(env: str, told: str) -> None:
     assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
 
 
-@pytest.mark.parametrize("env", ["", "http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
+@pytest.mark.parametrize("env", ["http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
 def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
-    needs = "rosproxy" if "rosproxy" in env or not env else "robot"
+    needs = "rosproxy" if "rosproxy" in env else "robot"
     assert good(container(env=env)).wanted_alias == needs
+
+
+def test_no_variable_leads_to_localhost() -> None:
+    """Nodes that are started with one of their own find the proxy all the same."""
+    assert warning(container(env="")) == (
+        "has no variable ROS_MASTER_URI, so its nodes look for a master on localhost, unless a "
+        "script of its own sets one: set ROS_MASTER_URI=http://rosproxy:11311"
+    )
+    member, _ = read(container(env=""))
+    assert member is not None
+    assert member.wanted_alias == "rosproxy"
 
 
 # this host's address
@@ -396,7 +410,7 @@ def test_who_is_dead_wants_nothing(state: str) -> None:
 def test_everybody_with_a_master_is_exposed() -> None:
     assert good(container(labels={}, env=ROBOT), EXPOSING).key == KEY
     assert good(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING).key == KEY
-    assert read(container(labels={}), EXPOSING) == (None, [])
+    assert read(container(labels={}, env=""), EXPOSING) == (None, [])
 
 
 def test_who_has_not_asked_is_no_failure() -> None:

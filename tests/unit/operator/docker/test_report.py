@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rosproxy.telemetry.text import width
 from rosproxy_operator.docker import host_status
+from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -68,6 +69,7 @@ LISTENER = {**TALKER, "name": "listener", "proxy": None, "nodes": []}
 STATUS = {
     "version": "1.0",
     "uplink": "0-rosproxy",
+    "operator": "http://127.0.0.1:11313",
     "proxies": [PROXY],
     "containers": [TALKER, LISTENER],
     "problems": [],
@@ -141,9 +143,10 @@ def test_a_plan_is_its_lines_and_its_exit_code(
         return {"actions": actions, "problems": problems}
 
     monkeypatch.setattr(host_status, "survey", survey)
-    assert host_status.show_plan(PlanSettings(), as_json=False, wait=0) == code
+    host = HostStatus(PlanSettings(), operator=None)
+    assert host_status.show_plan(host, as_json=False, wait=0) == code
     assert capsys.readouterr().out.splitlines() == lines
-    assert host_status.show_plan(PlanSettings(), as_json=True, wait=0) == code
+    assert host_status.show_plan(host, as_json=True, wait=0) == code
     assert json.loads(capsys.readouterr().out) == {"actions": actions, "problems": problems}
 
 
@@ -159,6 +162,11 @@ def test_the_whole_status() -> None:
         "    /talker  /rosout",
         "listener   running  -                      -            0",
     ]
+
+
+def test_it_says_when_no_operator_has_told_it() -> None:
+    assert "No operator was asked" in render({**STATUS, "operator": None}, 100)
+    assert "No operator was asked" not in render(STATUS, 100)
 
 
 def test_what_is_wrong_stands_where_it_belongs() -> None:

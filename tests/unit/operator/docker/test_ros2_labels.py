@@ -82,7 +82,7 @@ def test_the_label_says_it_whatever_the_variables_say() -> None:
 
 def test_a_container_with_both_versions_gets_both() -> None:
     labels = {**ON, "rosproxy.ros": "1,2", "rosproxy.master-uri": ROBOT, "rosproxy.ports": "40"}
-    members, told = read(labelled_container(labels))
+    members, told = read(labelled_container(labels, env=ROBOT))
     assert [(member.key, member.ports) for member in members] == [(KEY, 40), (DOMAIN, 40)]
     assert not told
     state = observed(labelled_container(labels))
@@ -145,7 +145,7 @@ def test_labels_of_the_other_version_are_told() -> None:
         "label rosproxy.slave-control is for ROS 1, which this is not: ignored"
     ]
     labels = {**ON, "rosproxy.master-uri": ROBOT, "rosproxy.peers": "robot"}
-    told = read(labelled_container(labels))[1]
+    told = read(labelled_container(labels, env=ROBOT))[1]
     assert told == ["label rosproxy.peers is for ROS 2, which this is not: ignored"]
 
 

@@ -269,12 +269,14 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
 
     The name is empty if no alias can help. The second text is empty if nothing is wrong.
     """
-    if not container.master_uri:
-        return ALIAS, ""
-    target = parse_slave_uri(container.master_uri)
-    variable = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
     real = master(key)
     fix = f"set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
+    if not container.master_uri:
+        # Which ROS's setup script takes (ros_comm/tools/roslaunch/env-hooks/10.roslaunch.sh.in).
+        nodes = "its nodes look for a master on localhost, unless a script of its own sets one"
+        return ALIAS, f"has no variable ROS_MASTER_URI, so {nodes}: {fix}"
+    target = parse_slave_uri(container.master_uri)
+    variable = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
     if target is None:
         return "", f"{variable} is not of the form http://HOST:11311: {fix}"
     host = target.host.lower()

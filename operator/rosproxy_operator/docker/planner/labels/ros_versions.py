@@ -84,11 +84,16 @@ def refuse_unserved(container: Container, host: str) -> None:
         raise UnusableLabel(f"{text}: give an IPv4 address")
 
 
+def is_guessed(container: Container) -> bool:
+    """Whether nothing says which version of ROS a container is of."""
+    explicit = {ROS, MASTER_URI} & container.labels.keys() or container.master_uri
+    return not explicit and not {"ROS_VERSION", "ROS_DISTRO"} & container.variables.keys()
+
+
 def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
     """Warnings for a container of these versions, which has a proxy nevertheless."""
     labels, variables = container.labels, container.variables
-    explicit = {ROS, MASTER_URI} & labels.keys() or container.master_uri
-    if not explicit and not {"ROS_VERSION", "ROS_DISTRO"} & variables.keys():
+    if is_guessed(container):
         yield f"nothing says which ROS it is, so it is taken for ROS 1: add the label {ROS}=1 or 2"
     for version, labels_of_version in (("1", _OF_ROS1), ("2", _OF_ROS2)):
         if version not in ros_versions:

@@ -1,0 +1,174 @@
+"""What a host's status tells, as one document: from a look, its plan, and what proxies say.
+
+``status --json`` prints it, `rosproxy_operator.docker.planner.report` makes a text of it, and the
+running operator answers with it.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+
+from rosproxy import __version__
+from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.proxy_client import Json
+from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
+from rosproxy_operator.docker.planner.label_policy import network_owner
+from rosproxy_operator.docker.planner.model import Container, HostState, Key, Member, OwnContainer
+from rosproxy_operator.docker.planner.plan import DockerPlan
+from rosproxy_operator.docker.planner.redirect import redirect_record_name
+from rosproxy_operator.docker.planner.specs import ear_name, proxy_name, sandbox_name
+from rosproxy_operator.docker.settings import PlanSettings
+
+ProxyStatuses = Mapping[str, ProxyStatus]
+"""The status of each proxy that answers, by the name of its container."""
+
+
+def host_document(
+    observed: HostState,
+    planned: DockerPlan,
+    problems: Iterable[Problem],
+    answers: Mapping[str, ProxyStatus | Problem],
+    settings: PlanSettings,
+) -> Json:
+    """The document. ``answers`` are those of proxies, by name, or why one does not answer.
+
+    Containers are those that have a proxy or whose labels are wrong; one with both versions of ROS
+    is listed twice. Actions for what the engine is busy with, and tells nothing of, are left out.
+    """
+    statuses = {name: answer for name, answer in answers.items() if isinstance(answer, ProxyStatus)}
+    problems = [*problems]
+    subjects = {problem.subject for problem in problems}
+    silent = [answer for answer in answers.values() if isinstance(answer, Problem)]
+    problems += [problem for problem in silent if problem.subject not in subjects]
+    subjects = {problem.subject for problem in problems}
+    redirects = _redirects(planned.members, observed)
+    keys: dict[str, list[Key]] = {}
+    for member in planned.members:
+        if member.key in observed.keys:
+            keys.setdefault(member.container.id, []).append(member.key)
+    return {
+        "version": __version__,
+        "uplink": settings.uplink,
+        "proxies": [_proxy(key, observed, statuses, settings) for key in sorted(observed.keys)],
+        "containers": [
+            _container(container, key, statuses, redirects.get((container.id, key)))
+            for container in observed.containers
+            if container.id in keys or f"container {container.name}" in subjects
+            for key in keys.get(container.id, [None])
+        ],
+        "problems": [asdict(problem) for problem in problems],
+        "actions": [
+            str(action)
+            for group in (*planned.groups, *planned.deferred)
+            for action in group.actions
+        ],
+    }
+
+
+def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: PlanSettings) -> Json:
+    """One row per proxy; its sandbox is only mentioned where that is what is wrong."""
+    proxy = _best(observed.proxies_of(key), proxy_name(key))
+    sandbox = _best(observed.sandboxes_of(key), sandbox_name(key))
+    own = sandbox or proxy
+    sandbox_state = sandbox.container.state if sandbox else "absent"
+    status = statuses.get(proxy.container.name) if proxy else None
+    problems = [f"{p.subject}: {p.text}" for p in (status.problems if status else ())]
+    if sandbox_state != "running":
+        subject = f"the container {sandbox_name(key)}, which holds its ports and networks"
+        problems.insert(0, f"{subject}, is {sandbox_state}")
+    ear = _best(observed.ears_of(key), ear_name(key))
+    if ear and ear.container.state != "running":
+        problems.append(f"the container {ear_name(key)}, its ear, is {ear.container.state}")
+    domain = status.domains[0] if status and status.domains else None
+    return {
+        "name": proxy_name(key),
+        "ros": "2" if key.is_ros2 else "1",
+        "domain": key.domain,
+        "peers": list(domain.peers) if domain else [],
+        "ear": ear.container.state if ear else None,
+        "master_uri": key.master_uri,
+        "master_address": (status.master.address if status else None) or "",
+        "master_up": status.master.up if status else None,
+        "advertise_host": key.advertise_host,
+        "range": str(own.range) if own else "",
+        "state": proxy.container.state if proxy else "absent",
+        "reachable": status is not None,
+        "networks": sorted(sandbox.container.networks - {settings.uplink}) if sandbox else [],
+        "data_plane": status.data_plane.plane if status and status.data_plane else None,
+        "used": status.ports.used if status else None,
+        "free": status.ports.free if status else None,
+        "problems": problems,
+    }
+
+
+def _best(containers: Iterable[OwnContainer], name: str) -> OwnContainer | None:
+    """The container of this name, if it runs; else any that runs; else any."""
+    return min(
+        containers,
+        key=lambda own: (own.container.state != "running", own.container.name != name),
+        default=None,
+    )
+
+
+def _participant(participant: ParticipantStatus) -> Json:
+    return {
+        "guid_prefix": participant.guid_prefix,
+        "vendor": participant.vendor,
+        "address": participant.address,
+        "ports": [lease.port for lease in participant.leases],
+        "publishes": list(participant.publishes),
+        "subscribes": list(participant.subscribes),
+        "services": list(participant.services),
+        "problem": participant.problem,
+    }
+
+
+def _redirects(
+    members: Iterable[Member], observed: HostState
+) -> dict[tuple[str, Key | None], Json]:
+    """The redirects in containers' networks, by container and proxy."""
+    by_id = {container.id: container for container in observed.containers}
+    return {
+        (member.container.id, member.key): {
+            "master": str(member.redirected_master),
+            "in_place": bool(
+                redirect_record_name(observed, member.key, network_owner(member.container, by_id))
+            ),
+        }
+        for member in members
+        if member.redirected_master and member.container.alive
+    }
+
+
+def _container(
+    container: Container, key: Key | None, statuses: ProxyStatuses, redirect: Json | None = None
+) -> Json:
+    proxy = proxy_name(key) if key else None
+    addresses = {a.network: a.address for a in container.attachments if a.address}
+    status = statuses.get(proxy or "")
+    nodes = nodes_by_address(status) if status else {}
+    participants = participants_by_address(status) if status else {}
+    return {
+        "name": container.name,
+        "state": container.state,
+        "proxy": proxy,
+        "ros": ("2" if key.is_ros2 else "1") if key else None,
+        "participants": [
+            _participant(p)
+            for address in dict.fromkeys(addresses.values())
+            for p in participants.get(address, ())
+        ],
+        "redirect": redirect,
+        "networks": sorted(container.networks),
+        "addresses": addresses,
+        "nodes": [
+            {
+                "names": list(node.nodes),
+                "address": node.address,
+                "advertised_uri": node.advertised_uri,
+                "state": node.state,
+            }
+            for address in dict.fromkeys(addresses.values())
+            for node in nodes.get(address, ())
+        ],
+    }

@@ -1,0 +1,66 @@
+"""The commonest mistakes of a first try: the advice, followed word by word, until messages flow."""
+
+import re
+from collections.abc import Callable
+
+from tests.docker.controller import Controller
+from tests.docker.engine import docker, wait_until
+from tests.docker.inside import ENABLE, Inside
+from tests.docker.robot import Robot
+
+ADVICE = re.compile(r"set (ROS_MASTER_URI=\S+)")
+
+
+def told(controller: Controller, name: str) -> str:
+    """What the status says of a container, once it says anything."""
+    subject = f"container {name}: "
+
+    def lines() -> list[str]:
+        return [line for line in controller.problems().splitlines() if line.startswith(subject)]
+
+    wait_until(lambda: bool(lines()), 60, controller.logs)
+    (line,) = lines()
+    return line.removeprefix(subject)
+
+
+def test_a_label_names_the_master_and_no_variable_does(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    controller = start_controller()
+    network, labels = net.network(), (ENABLE, f"rosproxy.master-uri={named.master_uri}")
+    first = net.idle(network, uri="", labels=labels)
+
+    text = told(controller, first.name)
+
+    assert text.startswith("has no variable ROS_MASTER_URI")
+    advice = ADVICE.search(text)
+    assert advice
+    first.remove()
+    variable, _, uri = advice[1].partition("=")
+    node = net.node(network, "rospy", "pub", "--topic", "/out", uri=uri, labels=labels)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
+    assert named.run("rostopic", "echo", "-n", "1", "/out")
+    assert variable == "ROS_MASTER_URI"
+    assert controller.problems() == ""
+
+
+def test_the_running_operator_is_asked(
+    start_controller: Callable[..., Controller], net: Inside
+) -> None:
+    """It has options that the command does not, and knows an image that is nowhere else named."""
+    controller = start_controller("--port-window", "13400-13499", "--ports", "7")
+    node = net.idle(net.network())
+
+    status = controller.status()
+
+    assert status["operator"] == "http://127.0.0.1:11313"
+    (proxy,) = status["proxies"]
+    assert proxy["range"] == "13400-13406"
+    assert controller.command("plan", "--wait", "60") == "Nothing to do."
+    other = docker(
+        "exec", controller.container, "rosproxy-operator", "docker", "--proxy-image", "no:such",
+        "status", check=False,
+    )  # fmt: skip
+    assert "No operator was asked" in other
+    assert "proxy image no:such" in other
+    node.remove()

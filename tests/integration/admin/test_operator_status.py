@@ -1,0 +1,114 @@
+"""The status that a running operator tells, and who asks it."""
+
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import aiohttp
+import pytest
+from prometheus_client import CollectorRegistry
+
+from examples.demo.fake_http import free_ports
+from rosproxy import __version__
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.control_loop import LookFailed
+from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.operator_page import operator_page
+from rosproxy_operator.docker import host_status
+from rosproxy_operator.docker.host_status import HostStatus
+from rosproxy_operator.docker.settings import PlanSettings
+from tests.integration.proxy import Proxy
+
+SETTINGS = PlanSettings()
+DOCUMENT = {"version": __version__, "uplink": "0-rosproxy", "actions": ["start container x"]}
+
+
+class RunningOperator:
+    """The endpoint of an operator that tells ``document``, or why it can't."""
+
+    def __init__(self) -> None:
+        self.document: dict[str, Any] = DOCUMENT
+        self.error: LookFailed | None = None
+        self.address = HostPort("127.0.0.1", free_ports(1))
+
+        async def status() -> dict[str, Any]:
+            if self.error:
+                raise self.error
+            return self.document
+
+        async def documents() -> dict[str, Any]:
+            return {}
+
+        page = operator_page(documents)
+        self.server = HealthServer(CollectorRegistry(), lambda: None, lambda: None, page, status)
+
+
+@pytest.fixture
+async def operator() -> AsyncIterator[RunningOperator]:
+    running = RunningOperator()
+    await running.server.start(running.address)
+    yield running
+    await running.server.stop()
+
+
+@pytest.fixture(autouse=True)
+def own_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the command sees by itself."""
+
+    async def survey(settings: PlanSettings) -> dict[str, Any]:
+        assert settings is SETTINGS
+        return {"actions": []}
+
+    monkeypatch.setattr(host_status, "survey", survey)
+
+
+async def test_the_operator_that_runs_is_asked(operator: RunningOperator) -> None:
+    told = await HostStatus(SETTINGS, operator.address).now()
+    assert told == {**DOCUMENT, "operator": f"http://{operator.address}"}
+
+
+async def test_one_that_listens_everywhere_is_asked_on_loopback(operator: RunningOperator) -> None:
+    told = await HostStatus(SETTINGS, HostPort("0.0.0.0", operator.address.port)).now()
+    assert told["operator"] == f"http://{operator.address}"
+
+
+async def test_without_one_the_command_looks_by_itself(proxy: Proxy) -> None:
+    """Also where something else listens, such as a proxy."""
+    for address in (None, HostPort("127.0.0.1", free_ports(1)), proxy.settings.admin):
+        assert await HostStatus(SETTINGS, address).now() == {"actions": [], "operator": None}
+
+
+@pytest.mark.parametrize("document", [{**DOCUMENT, "version": "0.0.1"}, {"uplink": 1}, ["uplink"]])
+async def test_what_another_version_tells_is_not_believed(
+    document: Any, operator: RunningOperator
+) -> None:
+    operator.document = document
+    assert (await HostStatus(SETTINGS, operator.address).now())["operator"] is None
+
+
+async def test_one_that_can_not_look_says_why(operator: RunningOperator) -> None:
+    operator.error = LookFailed("no engine answers")
+    async with (
+        aiohttp.ClientSession() as session,
+        session.get(f"http://{operator.address}/status") as reply,
+    ):
+        assert (reply.status, await reply.text()) == (503, "no engine answers\n")
+    assert (await HostStatus(SETTINGS, operator.address).now())["operator"] is None
+
+
+async def test_pages_of_strangers_do_not_get_it(operator: RunningOperator) -> None:
+    """By a name of theirs that leads to loopback."""
+    async with (
+        aiohttp.ClientSession(headers={"Host": "evil.example"}) as session,
+        session.get(f"http://{operator.address}/status") as reply,
+    ):
+        assert reply.status == 403
+        assert "uplink" not in await reply.text()
+
+
+async def test_it_is_json(operator: RunningOperator) -> None:
+    async with (
+        aiohttp.ClientSession() as session,
+        session.get(f"http://{operator.address}/status") as reply,
+    ):
+        assert json.loads(await reply.read()) == DOCUMENT
