@@ -3,12 +3,12 @@
 import re
 from collections.abc import Callable
 
-from tests.docker.controller import Controller
+from tests.docker.controller import Controller, the_proxy
 from tests.docker.engine import docker, wait_until
 from tests.docker.inside import ENABLE, Inside
 from tests.docker.robot import Robot
 
-ADVICE = re.compile(r"set (ROS_MASTER_URI=\S+)")
+ADVICE = re.compile(r"set ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?$")
 
 
 def told(controller: Controller, name: str) -> str:
@@ -23,6 +23,14 @@ def told(controller: Controller, name: str) -> str:
     return line.removeprefix(subject)
 
 
+def advised(text: str) -> tuple[str, tuple[str, ...]]:
+    """The variable's value and the labels that the text tells to set."""
+    advice = ADVICE.search(text)
+    assert advice, text
+    uri, label = advice.groups()
+    return uri, (label,) if label else ()
+
+
 def test_a_label_names_the_master_and_no_variable_does(
     start_controller: Callable[..., Controller], net: Inside, named: Robot
 ) -> None:
@@ -33,15 +41,32 @@ def test_a_label_names_the_master_and_no_variable_does(
     text = told(controller, first.name)
 
     assert text.startswith("has no variable ROS_MASTER_URI")
-    advice = ADVICE.search(text)
-    assert advice
+    uri, more = advised(text)
     first.remove()
-    variable, _, uri = advice[1].partition("=")
-    node = net.node(network, "rospy", "pub", "--topic", "/out", uri=uri, labels=labels)
+    node = net.node(network, "rospy", "pub", "--topic", "/out", uri=uri, labels=(*labels, *more))
     wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
     assert named.run("rostopic", "echo", "-n", "1", "/out")
-    assert variable == "ROS_MASTER_URI"
     assert controller.problems() == ""
+
+
+def test_a_wrong_port_came_first(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    controller = start_controller()
+    network = net.network()
+    bad = net.idle(network, uri=f"http://{named.name}:11312")
+    the_proxy()
+    first = net.idle(network)
+
+    text = told(controller, first.name)
+
+    assert bad.name in text
+    uri, more = advised(text)
+    first.remove()
+    node = net.node(network, "rospy", "pub", "--topic", "/out", uri=uri, labels=(ENABLE, *more))
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
+    assert named.run("rostopic", "echo", "-n", "1", "/out")
+    assert node.name not in controller.problems()
 
 
 def test_the_running_operator_is_asked(

@@ -18,6 +18,7 @@ from rosproxy_operator.docker.planner.labels.readers import (
     BUILT_IN,
     DATA_PLANE,
     DIRECTION,
+    MASTER_URI,
     UDP,
 )
 from rosproxy_operator.docker.planner.model import (
@@ -216,22 +217,26 @@ def assign_aliases(
             neighbours[network].append(container)
     for network in sorted({name for d in desired if d.live for name in d.networks}):
         proxies = [d for d in desired if network in d.networks]
-        for alias in sorted({name for d in proxies if d.live for name in _names(d.key)}):
-            claim = _claim(network, alias, proxies, neighbours[network], observed.sandboxes)
+        claims = [
+            _claim(network, alias, proxies, neighbours[network], observed.sandboxes)
+            for alias in sorted({name for d in proxies if d.live for name in _names(d.key)})
+        ]
+        for claim in claims:
             if claim.owner is not None:
                 names = aliases.setdefault(claim.owner, {})
-                names[network] = (*names.get(network, ()), alias)
-            problems += _problems(claim)
+                names[network] = (*names.get(network, ()), claim.alias)
+        common = next((claim for claim in claims if claim.alias == ALIAS), None)
+        problems += [problem for claim in claims for problem in _problems(claim, common)]
     return aliases, problems
 
 
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
     """The containers of a proxy on a network that look for it by this name."""
-    return tuple(
-        member.container.name
-        for member in desired.members
-        if network in member.networks and member.wanted_alias == alias
-    )
+    return tuple(member.container.name for member in _seekers(desired, network, alias))
+
+
+def _seekers(desired: Desired, network: str, alias: str) -> Iterator[Member]:
+    return (m for m in desired.members if network in m.networks and m.wanted_alias == alias)
 
 
 def answers_to(container: Container, network: str, alias: str) -> bool:
@@ -276,20 +281,44 @@ def _claim(
     )
 
 
-def _problems(claim: _Claim) -> Iterator[Problem]:
-    """Warnings for containers that look for their proxy by a name that others have."""
-    subjects = [f"container {name}" for name in claim.containers]
+def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
+    """Warnings for containers that look for their proxy by a name that others have.
+
+    ``common`` is the claim to the name that all proxies would have.
+    """
     for claimant in claim.claimants:
-        if claimant.key == claim.owner and not claim.containers and len(claim.holders) <= 1:
+        if _has_name(claim, claimant.key):
             continue
-        proxies = {*claim.holders, claim.owner or claimant.key} - {claimant.key}
-        holders = [*subjects, *sorted(f"proxy {proxy_name(key)}" for key in proxies)]
-        host = proxy_name(claimant.key) if claim.alias == ALIAS else ALIAS
-        for container in needed_by(claimant, claim.network, claim.alias):
+        holders = [f"container {name}" for name in claim.containers]
+        rivals = {*claim.holders, claim.owner or claimant.key} - {claimant.key}
+        holders += [_holder(claim, key) for key in sorted(rivals)]
+        key = claimant.key
+        host = ALIAS if common and _has_name(common, key) else proxy_name(key)
+        for member in _seekers(claimant, claim.network, claim.alias):
+            fix = f"set ROS_MASTER_URI=http://{host}:{master(key).port}"
+            if MASTER_URI not in member.container.labels:
+                # Without it a variable that names a proxy leaves open which master is meant.
+                fix += f" and the label {MASTER_URI}={key.master_uri}"
             yield Problem(
-                f"container {container}",
+                f"container {member.container.name}",
                 f"looks for its proxy by the name {claim.alias}, but on network {claim.network} "
-                f"{listed(holders)} answers to it, so its nodes go around their proxy: "
-                f"set ROS_MASTER_URI=http://{host}:{master(claimant.key).port}",
+                f"{listed(holders)} answers to it, so its nodes go around their proxy: {fix}",
                 fatal=False,
             )
+
+
+def _has_name(claim: _Claim, key: Key) -> bool:
+    """Whether a proxy, and nobody else, answers to the name, or will."""
+    return key == claim.owner and not claim.containers and len(claim.holders) <= 1
+
+
+def _holder(claim: _Claim, key: Key) -> str:
+    """A proxy that has the name, and the containers for which it is there: they may be wrong."""
+    containers = [
+        member.container.name
+        for claimant in claim.claimants
+        if claimant.key == key
+        for member in claimant.members
+    ]
+    served = f" (for the master {key.master_uri} of {listed(containers)})" if containers else ""
+    return f"proxy {proxy_name(key)}{served}"

@@ -1,5 +1,6 @@
 """Which proxies there ought to be, on which networks, under which names, with how many ports."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -255,3 +256,54 @@ def test_container_that_is_just_being_created_has_its_network_soon(mode: str) ->
     members, problems = read_members(seen, SETTINGS)
     assert [member.networks for member in members] == [{APP.name}]
     assert not problems
+
+
+WRONG = Key("http://robot:11312", HERE)
+ADVICE = re.compile(r"set ROS_MASTER_URI=(\S+)(?: and the label (\S+)=(\S+))?$")
+
+
+def test_a_wrong_port_that_came_first_is_named_to_those_who_are_right() -> None:
+    """Its proxy has the name of the master's host, which both look for."""
+    bare = {"rosproxy.enable": "true"}
+    bad = container("bad", bare, env=WRONG.master_uri)
+    seen = observed(bad, container("good", bare, env=KEY.master_uri), sandboxes=[sandbox(WRONG)])
+    problems = assign_aliases([*want(seen)[0].values()], seen)[1]
+    assert [problem.subject for problem in problems] == ["container good"]
+    assert problems[0].text == (
+        f"looks for its proxy by the name robot, but on network app proxy {proxy_name(WRONG)} (for "
+        f"the master {WRONG.master_uri} of bad) answers to it, so its nodes go around their proxy: "
+        f"set ROS_MASTER_URI=http://{NAME}:11311 and the label rosproxy.master-uri={KEY.master_uri}"
+    )
+
+
+@pytest.mark.parametrize("env", [KEY.master_uri, "http://rosproxy:11311"])
+@pytest.mark.parametrize("labels", [ENABLED, {"rosproxy.enable": "true"}])
+@pytest.mark.parametrize(
+    "neighbours",
+    [
+        {"containers": [container("robot", {})]},
+        {"containers": [container("robot", {}), container("rosproxy", {})]},
+        {"containers": [container("b", {"rosproxy.enable": "true"}, env=WRONG.master_uri)],
+         "sandboxes": [sandbox(WRONG)]},
+    ],
+)  # fmt: skip
+def test_who_follows_the_advice_is_told_nothing_more(
+    env: str, labels: dict[str, str], neighbours: dict[str, Any]
+) -> None:
+    settings = replace(SETTINGS, master_uri=KEY.master_uri)
+    others, more = neighbours["containers"], {"sandboxes": neighbours.get("sandboxes", [])}
+
+    def told(talker: Container) -> list[str]:
+        seen = observed(talker, *others, **more)
+        members, problems = read_members(seen, settings)
+        problems += assign_aliases([*want(seen, settings=settings)[0].values()], seen)[1]
+        assert KEY in {m.key for m in members if m.container.name == "talker"}
+        return [p.text for p in problems if p.subject == "container talker"]
+
+    texts = told(container(labels=labels, env=env))
+    assert texts or env != KEY.master_uri
+    for text in texts:
+        if advice := ADVICE.search(text):
+            uri, label, value = advice.groups()
+            cured = {**labels, label: value} if label else labels
+            assert told(container(labels=cured, env=uri)) == []

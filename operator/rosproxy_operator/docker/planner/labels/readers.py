@@ -284,6 +284,9 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
         if target.port == real.port:
             return host, ""
         return host, f"{variable} has another port than its proxy, {real.port}: {fix}"
+    if MASTER_URI not in container.labels:
+        # A variable that names the proxy no longer says which master is meant.
+        fix += f" and the label {MASTER_URI}={key.master_uri}"
     return "", f"{variable} {_wrong_master(host, key, fix)}"
 
 
