@@ -3,9 +3,12 @@
 import re
 from collections.abc import Callable
 
+import pytest
+
 from tests.docker.controller import Controller, the_proxy
 from tests.docker.engine import docker, wait_until
 from tests.docker.inside import ENABLE, Inside
+from tests.docker.nodes import node_command
 from tests.docker.robot import Robot
 
 ADVICE = re.compile(r"set ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?$")
@@ -89,3 +92,35 @@ def test_the_running_operator_is_asked(
     assert "No operator was asked" in other
     assert "proxy image no:such" in other
     node.remove()
+
+
+@pytest.mark.parametrize("how", ["on the default bridge", "disconnected"])
+def test_a_container_without_a_network_is_connected_while_it_runs(
+    how: str, start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    controller = start_controller()
+    home = "bridge" if how == "on the default bridge" else net.network()
+    container = net.idle(home)
+    if how == "disconnected":
+        docker("network", "disconnect", home, container.name)
+
+    create, connect = told(controller, container.name).rpartition(": ")[2].split("; ")
+
+    try:
+        for command in (create, connect):
+            program, *words = command.split()
+            assert program == "docker"
+            docker(*words)
+        container.start(*node_command("rospy", "pub", "--topic", "/out", "__name:=connected"))
+        wait_until(lambda: named.knows_proxied("connected"), 60, controller.logs)
+        assert named.run("rostopic", "echo", "-n", "1", "/out")
+        assert controller.problems() == ""
+    finally:
+        container.remove()
+        wait_until(_network_removed, 30, "the network is removed")
+
+
+def _network_removed() -> bool:
+    """The proxy may still be on it."""
+    docker("network", "rm", "ros", check=False)
+    return "ros" not in docker("network", "ls", "--format", "{{.Name}}").split()

@@ -379,6 +379,9 @@ def test_networks_where_no_proxy_is_found(networks: tuple[str, ...], mode: str, 
     text = refusal(container(networks=networks, mode=mode))
     assert text.startswith(told)
     assert "docker network create ros" in text
+    joins_live = mode not in ("host", "none")
+    assert ("docker network connect ros talker" in text) is joins_live
+    assert ("docker run --network ros" in text) is not joins_live
 
 
 def test_the_network_of_another_container() -> None:

@@ -231,15 +231,18 @@ def network_owner(container: Container, observed: HostState) -> Container:
 
 
 def _why_no_network(owner: Container) -> str:
-    fix = "attach it to a user-defined network: docker network create ros; docker run --network ros"
+    anew = "docker network create ros; docker run --network ros"
     if "host" in (*owner.networks, owner.network_mode):
         return (
-            f"is on the host's own network, where its nodes need no proxy: {fix}, or take its "
-            "labels off"
+            "is on the host's own network, where its nodes need no proxy: attach it to a "
+            f"user-defined network: {anew}, or take its labels off"
         )
+    if owner.network_mode == "none":  # the engine lets it join no other
+        return f"is on no network: start it with one: {anew}"
+    live = f"docker network create ros; docker network connect ros {owner.name}"
     if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
-        return f"is only on the default bridge network, where no names resolve: {fix}"
-    return f"is on no network: {fix}"
+        return f"is only on the default bridge network, where no names resolve: {live}"
+    return f"is on no network: {live}"
 
 
 def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
