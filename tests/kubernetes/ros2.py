@@ -100,10 +100,10 @@ def domain(proxy: Proxy) -> DomainStatus:
     return status
 
 
-def ports_are_kept(proxy: Proxy) -> bool:
-    """Whether it has participants inside, and each has been told to keep its ports for it."""
-    participants = domain(proxy).inside
-    return bool(participants) and all(participant.kept for participant in participants)
+def ports_are_kept(proxy: Proxy, count: int) -> bool:
+    """Whether it has so many participants inside, and each keeps its ports for it."""
+    kept = [participant.kept for participant in domain(proxy).inside]
+    return len(kept) == count and all(kept)
 
 
 def leased(proxy: Proxy) -> dict[str, list[int]]:

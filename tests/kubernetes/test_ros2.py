@@ -207,9 +207,7 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
     """On the same ports, for the same participants; outside and inside hear on."""
     of, flows = world.rosproxy, world.flows
     proxy = of.the_proxy("node1")
-    for log, text in flows.values():
-        log.wait_for(text, since=time.time())
-    wait_until(lambda: ports_are_kept(proxy), 30, "ports are kept")
+    _wait_until_ports_are_kept(world)
     before, lost = leased(proxy), time.time()
 
     LOSSES[how](of, proxy)
@@ -227,6 +225,17 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
     late = robot2.node("jazzy", "sub", "/one", name="late")
     late.wait_for("one", since=end)
     robot2.end("late")  # or each test begins with one node more than the one before
+
+
+def _wait_until_ports_are_kept(world: World) -> None:
+    """Until all participants have met, so that they have all of their ports, and keep them."""
+    of, now = world.rosproxy, time.time()
+    for log, text in world.flows.values():
+        log.wait_for(text, since=now)
+    wait_until(
+        lambda: all(ports_are_kept(of.the_proxy(on), of.on(on)["pods"]) for on in NODES),
+        60, of.tell,
+    )  # fmt: skip
 
 
 def test_on_other_ports_participants_meet_anew(world: World) -> None:
@@ -249,13 +258,13 @@ def _all_leased(of: RosProxy) -> list[dict[str, list[int]]]:
 def test_another_image_of_the_proxies(world: World) -> None:
     """It is changed in place: the same pods, the same ports; one proxy after the other."""
     of = world.rosproxy
-    wait_until(lambda: all(ports_are_kept(of.the_proxy(on)) for on in NODES), 30, "ports are kept")
+    _wait_until_ports_are_kept(world)
     before, started = _all_leased(of), time.time()
 
     release.upgrade(proxy={"image": {"tag": release.other_image()}})
     wait_until(lambda: all(of.the_proxy(on).restarts > 0 for on in NODES), 90, of.tell)
 
-    wait_until(lambda: _all_leased(of) == before, 60, of.tell)
+    wait_until(lambda: _all_leased(of) == before, 60, lambda: f"{_all_leased(of)} is not {before}")
     end = time.time()
     for log, text in world.flows.values():
         log.wait_for(text, count=10, since=end)
