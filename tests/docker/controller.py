@@ -17,8 +17,9 @@ PROGRAM = Path(sys.executable).with_name("rosproxy-operator")
 MANAGED = "io.rosproxy.managed=true"
 UPLINK = "0-rosproxy"
 WINDOW = range(12000, 13000)
+ADMIN_BIND = ("--admin-bind", "127.0.0.1:21313")
 OPTIONS = ("--port-window", f"{WINDOW[0]}-{WINDOW[-1]}", "--ports", "6", "--grace", "3",
-           "--resync", "5", "--admin-bind", "127.0.0.1:21313")  # fmt: skip
+           "--resync", "5", *ADMIN_BIND)  # fmt: skip
 HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privileges:true",
             "--user", "0:0")  # fmt: skip
 
@@ -139,8 +140,10 @@ class Controller:
         return logs(self.container)
 
     def command(self, *words: str, check: bool = True) -> str:
-        """Run another command in its container: the controller itself knows its options."""
-        return docker("exec", self.container, "rosproxy-operator", "docker", *words, check=check)
+        """Have another command in its container ask the controller, which has the options."""
+        return docker(
+            "exec", self.container, "rosproxy-operator", "docker", *ADMIN_BIND, *words, check=check
+        )
 
     def status(self) -> dict[str, Any]:
         document: dict[str, Any] = json.loads(self.command("status", "--json", check=False))

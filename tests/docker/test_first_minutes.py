@@ -81,7 +81,7 @@ def test_the_running_operator_is_asked(
 
     status = controller.status()
 
-    assert status["operator"] == "http://127.0.0.1:11313"
+    assert status["operator"] == "http://127.0.0.1:21313"
     (proxy,) = status["proxies"]
     assert proxy["range"] == "13400-13406"
     assert controller.command("plan", "--wait", "60") == "Nothing to do."
