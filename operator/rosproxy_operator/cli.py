@@ -3,7 +3,6 @@
 import importlib.util
 import logging
 import os
-import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -26,7 +25,7 @@ from rosproxy.cli.options import (
     unknown_variables,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy_operator.common.command_errors import exit_on_error, fail
+from rosproxy_operator.common.command_errors import exit_on_error, exit_with, fail
 from rosproxy_operator.common.proxy_options import policy_options, proxy_bound_options
 from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
@@ -114,9 +113,10 @@ def docker(
     with setting_errors():
         settings = make_plan_settings(options)
     # Who gives options asks what an operator with these would do, whatever the running one does.
-    given = (context.get_parameter_source(name) for name in options if name != "admin_bind")
-    asks = ParameterSource.COMMANDLINE not in given
-    context.obj = docker_commands.CommandContext(settings, options["admin_bind"] if asks else None)
+    sources = (context.get_parameter_source(name) for name in options if name != "admin_bind")
+    context.obj = docker_commands.CommandContext(
+        settings, options["admin_bind"], ParameterSource.COMMANDLINE in sources, options["resync"]
+    )
     if context.invoked_subcommand is None:
         _run(settings, options["resync"], options["admin_bind"], once)
     elif once:
@@ -133,7 +133,6 @@ def _need(library: str, extra: str) -> None:
 
 
 def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> None:
-    from rosproxy.telemetry.text import clean
     from rosproxy_operator.docker.controller import run, run_once
 
     if not once:
@@ -144,13 +143,15 @@ def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> 
 
     with exit_on_error(EngineError):
         problems = run_once(settings, resync)
-    for problem in problems:
-        text = clean(f"{problem.subject}: {problem.text}")
-        click.echo(f"rosproxy-operator: {text}", err=True)
-    sys.exit(1 if problems else 0)
+    exit_with(problems)
 
 
-for command in (docker_commands.status, docker_commands.plan, docker_commands.doctor):
+for command in (
+    docker_commands.status,
+    docker_commands.plan,
+    docker_commands.doctor,
+    docker_commands.uninstall,
+):
     docker.add_command(command)
 
 

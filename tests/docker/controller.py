@@ -142,7 +142,7 @@ class Controller:
     def command(self, *words: str, check: bool = True) -> str:
         """Have another command in its container ask the controller, which has the options."""
         return docker(
-            "exec", self.container, "rosproxy-operator", "docker", *ADMIN_BIND, *words, check=check
+            "exec", self.container, "rosproxy-operator", "docker", *words, check=check
         )
 
     def status(self) -> dict[str, Any]:

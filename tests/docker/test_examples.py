@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.docker.controller import UPLINK, remove_proxies, the_proxy
-from tests.docker.engine import ROOT, compose, docker, inspect, wait_until
+from tests.docker.controller import MANAGED, UPLINK, remove_proxies, the_proxy
+from tests.docker.engine import ROOT, compose, containers, docker, inspect, wait_until
 from tests.docker.robot import Robot
 from tests.docker.ros2 import HERE, THERE, Outside, wait_for_line
 
@@ -101,8 +101,10 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
         assert "listener" in status
         assert 11412 in the_proxy().ports
 
-        project.compose("rm", "--stop", "--force", "talker", "listener")
-        wait_until(lambda: not the_proxy().networks, 5, "the proxy has left the network")
+        project.compose("stop", "operator")
+        project.compose("run", "--rm", "-T", "operator", "docker", "uninstall")
+        assert containers(MANAGED) == []
+        assert UPLINK not in docker("network", "ls", "--format", "{{.Name}}").split()
 
 
 @pytest.mark.usefixtures("_no_other_controller")

@@ -11,19 +11,27 @@ import click
 
 from rosproxy.cli.options import Command, Seconds
 from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.command_errors import exit_on_error
+from rosproxy_operator.common.command_errors import exit_on_error, exit_with, fail
 from rosproxy_operator.docker.settings import PlanSettings
 
 
 @dataclass(frozen=True, slots=True)
 class CommandContext:
-    """What was given before a command: ``operator`` is where one is to be asked, None for nowhere.
+    """What was given before a command.
 
-    ``settings`` count where none answers.
+    ``admin`` is where an operator would listen. One is to be asked for its status there unless
+    options were ``given``; ``settings`` count then, and where none answers. ``resync`` in seconds.
     """
 
     settings: PlanSettings
-    operator: HostPort | None
+    admin: HostPort
+    given: bool
+    resync: float
+
+    @property
+    def operator(self) -> HostPort | None:
+        """Where an operator is to be asked; None for nowhere."""
+        return None if self.given else self.admin
 
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
@@ -73,6 +81,30 @@ def plan(context: CommandContext, as_json: bool, wait: float) -> None:
 
     with exit_on_error(EngineError):
         sys.exit(show_plan(HostStatus(context.settings, context.operator), as_json, wait))
+
+
+@click.command()
+@click.pass_obj
+def uninstall(context: CommandContext) -> None:
+    """Remove all that the operator has made on this host: run it once the operator has ended.
+
+    That is: redirects in containers' networks, proxies, which unregister their nodes at the master
+    first, and their networks. Labelled containers stay as they are. Exits with 0 if nothing is
+    left, else with 1.
+    """
+    from rosproxy_operator.docker.controller import uninstall as remove_all
+    from rosproxy_operator.docker.errors import EngineError
+    from rosproxy_operator.docker.host_status import ask_operators
+
+    if document := ask_operators(context.admin):
+        fail(
+            f"an operator is running at {document['operator']} and would make all anew: end it "
+            "first (docker rm -f rosproxy-operator, or docker compose stop operator), then "
+            "uninstall again"
+        )
+    with exit_on_error(EngineError):
+        problems = remove_all(context.settings, context.resync)
+    exit_with(problems)
 
 
 @click.command()

@@ -11,6 +11,7 @@ import contextlib
 import logging
 import signal
 import time
+from collections.abc import Callable
 
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
@@ -28,9 +29,13 @@ from rosproxy_operator.docker.engine_client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
 from rosproxy_operator.docker.host_document import host_document
+from rosproxy_operator.docker.operator_sign import publish_sign
+from rosproxy_operator.docker.planner.labels.members import LabelReading
+from rosproxy_operator.docker.planner.model import HostState
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.planner.uninstall import Uninstall
 from rosproxy_operator.docker.proxy_sync import DockerProxySync, ask_proxies
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
@@ -45,12 +50,21 @@ lists them."""
 LONGEST_LOOK = 60.0
 """Seconds after which a look that has not ended is given up."""
 ONCE = 60.0
-"""Seconds within which ``--once`` has to reach what is wanted."""
+"""Seconds that ``--once`` and ``uninstall`` have to reach what is wanted."""
+
+Decide = Callable[[HostState, LabelReading, PlanSettings, DockerMemory, float], DockerPlan]
+"""From what a look has seen, settings, memory and the time to what is to be done: `plan`."""
 
 
 def run_once(settings: PlanSettings, resync: float) -> list[Problem]:
     """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
     return asyncio.run(DockerController(settings, resync, DockerMetrics()).run_once(ONCE))
+
+
+def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
+    """Remove all that operators have made on this host; what is left. Raises LookFailed."""
+    controller = DockerController(settings, resync, DockerMetrics(), Uninstall())
+    return asyncio.run(controller.run_once(ONCE))
 
 
 def run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
@@ -70,25 +84,35 @@ async def _run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
         metrics.registry, controller.dead, controller.unready, page, controller.status
     )
     await health.start(admin)
+    sign = publish_sign(admin, controller.engine_url)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, admin)
     running = asyncio.create_task(controller.run())
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, running.cancel)
     with contextlib.suppress(asyncio.CancelledError):
         await running  # raises what it died of
+    if sign:
+        sign.close()
     await health.stop()
 
 
 class DockerController:
-    """Reconciles one engine's host. `run` it in an event loop."""
+    """Reconciles one engine's host, as ``decide`` says. `run` it in an event loop."""
 
-    def __init__(self, settings: PlanSettings, resync: float, metrics: DockerMetrics) -> None:
-        self._settings, self._metrics = settings, metrics
+    def __init__(
+        self,
+        settings: PlanSettings,
+        resync: float,
+        metrics: DockerMetrics,
+        decide: Decide = plan,
+    ) -> None:
+        self._settings, self._metrics, self._decide = settings, metrics, decide
         pace = Pace("engine", resync, DEBOUNCE, LONGEST_LOOK)
         self._loop = loop = ControlLoop(pace, metrics)
         self.dead, self.unready = loop.dead, loop.unready
         self._tasks = Tasks()
         self._engine = engine = DockerClient()
+        self.engine_url = engine.url
         self._proxies = ProxyClient()
         self._masters = MasterResolver(loop.wake)
         self._observer = DockerObserver(engine, settings, self._masters, loop.wake)
@@ -145,7 +169,7 @@ class DockerController:
             snapshot = await self._observer.look()
         except EngineError as error:
             raise LookFailed(str(error), away=isinstance(error, Unavailable)) from error
-        planned = plan(
+        planned = self._decide(
             snapshot.state, snapshot.labels, self._settings, self._memory, time.monotonic()
         )
         took = time.monotonic() - started
@@ -214,7 +238,7 @@ class DockerController:
         ]
         unfinished = planned.groups or planned.deferred or snapshot.state.busy
         if unfinished and not problems:
-            problems.append(Problem("operator", "not all was done in time: run --once again"))
+            problems.append(Problem("operator", "not all was done in time: run this again"))
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:

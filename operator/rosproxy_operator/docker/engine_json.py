@@ -13,7 +13,7 @@ import msgspec
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
 from rosproxy_operator.docker.planner.own_containers import CreationFacts
-from rosproxy_operator.docker.planner.specs import SECRET
+from rosproxy_operator.docker.planner.specs import MANAGED, SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
@@ -200,6 +200,7 @@ def read_network(row: Json) -> Network:
         internal=bool(row.get("Internal")),
         gateway=next((gateway for gateway in gateways if gateway and ":" not in gateway), ""),
         subnets=tuple(subnet for subnet in subnets if isinstance(subnet, IPv4Network)),
+        made_by_operator=dig(row, "Labels", MANAGED) == "true",
     )
 
 

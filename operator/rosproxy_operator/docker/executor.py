@@ -30,6 +30,7 @@ from rosproxy_operator.docker.planner.actions import (
     CreateSandbox,
     Disconnect,
     Remove,
+    RemoveNetwork,
     Rename,
     Restart,
     Run,
@@ -72,6 +73,7 @@ DONE: dict[type, tuple[str, ...]] = {
     Connect: ("already exists in network", "already attached"),
     Disconnect: ("is not connected",),
     Remove: ("is already in progress",),
+    RemoveNetwork: (),
 }
 """Parts of the engine's error that mean there is nothing left to do; so does NoSuchObject."""
 
@@ -266,10 +268,8 @@ class DockerApplier:
     def _call(self, action: Action, snapshot: DockerSnapshot) -> None:  # noqa: C901 - cases only
         do = self._engine.do
         match action:
-            case CreateNetwork(name):
-                labels = {MANAGED: "true", SECRET: snapshot.new_secret}
-                # Without check_duplicate engines before API 1.44 may make a second one of the name.
-                do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
+            case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
+                self._call_network(action, snapshot)
             case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
                 self._create(action.name, self._config(action, snapshot), snapshot.state.image_id)
             case Start(name):
@@ -283,12 +283,24 @@ class DockerApplier:
                 do("unpause", name)
             case Rename(name, to):
                 do("rename", name, to)
+            case Remove():
+                self._remove(action, snapshot)
+
+    def _call_network(
+        self, action: CreateNetwork | RemoveNetwork | Connect | Disconnect, snapshot: DockerSnapshot
+    ) -> None:
+        do = self._engine.do
+        match action:
+            case CreateNetwork(name):
+                labels = {MANAGED: "true", SECRET: snapshot.new_secret}
+                # Without check_duplicate engines before API 1.44 may make a second one of the name.
+                do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
+            case RemoveNetwork(name):
+                do("remove_network", name)
             case Connect(name, network, aliases):
                 do("connect_container_to_network", name, network, aliases=list(aliases))
             case Disconnect(name, network):  # also from one that does not exist any more
                 do("disconnect_container_from_network", name, network, force=True)
-            case Remove():
-                self._remove(action, snapshot)
 
     def _await_end(self, name: str) -> None:
         """Wait until a container has ended. Raises EngineError if it failed or takes too long."""

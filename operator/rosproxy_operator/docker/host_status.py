@@ -21,6 +21,7 @@ from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.host_document import host_document
+from rosproxy_operator.docker.operator_sign import operators
 from rosproxy_operator.docker.planner.plan import plan
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -59,19 +60,28 @@ class HostStatus:
 
     def _ask_operator(self) -> Json | None:
         """What the operator says; None if none answers, or not one of this version."""
-        if self.operator is None:
-            return None
-        client = AdminClient(default_url(str(self.operator)))
-        try:
-            document = json.loads(client.get("/status", within=ASKING))
-        except (AdminError, ValueError, RecursionError):
-            return None
-        # A proxy may listen there, whose status has no uplink; an operator of another version may
-        # tell other things.
-        is_document = isinstance(document, dict) and "uplink" in document
-        if not is_document or document.get("version") != __version__:
-            return None
-        return {**document, "operator": client.url}
+        document = ask_operators(self.operator) if self.operator else None
+        # One of another version may tell other things.
+        return document if document and document.get("version") == __version__ else None
+
+
+def ask_operators(first: HostPort) -> Json | None:
+    """What the first operator of this machine that answers tells; None without one.
+
+    As ``operator`` it has that one's URL. ``first`` is asked before those that have put up signs.
+    """
+    return next(filter(None, map(_ask, operators(first, DockerClient().url))), None)
+
+
+def _ask(endpoint: HostPort) -> Json | None:
+    client = AdminClient(default_url(str(endpoint)))
+    try:
+        document = json.loads(client.get("/status", within=ASKING))
+    except (AdminError, ValueError, RecursionError):
+        return None
+    # A proxy may listen there: its status has no uplink.
+    is_document = isinstance(document, dict) and "uplink" in document
+    return {**document, "operator": client.url} if is_document else None
 
 
 def show_plan(host: HostStatus, as_json: bool, wait: float) -> int:

@@ -1,29 +1,20 @@
 """Which other proxies there are on this machine: each puts up a sign.
 
 A port that is bound and does not listen is in none of the kernel's lists, so that nobody can tell
-who holds a range. A sign is a Unix socket with an abstract name (unix(7)), which says it. Like
-ports it belongs to a network namespace, and the kernel takes it down when its process ends, however
-that ends. ``/proc/net/unix`` lists all of them.
-
-Anybody can put up a sign. So what is read is told to people, not too much of it, and nothing is
-decided by it.
+who holds a range. A sign says it (`signs`), to people alone, and not too much of it.
 """
 
-import contextlib
-import re
-import secrets
 import socket
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
+from rosproxy.net import signs
 from rosproxy.net.addresses import is_address, parse_host_port
 
 MOST = 8
 """Proxies that are told of."""
-_LISTED = Path("/proc/net/unix")
-_SIGN = re.compile(r"@rosproxy/([12]{1,2})/(\d{1,5})-(\d{1,5})/([0-9A-Fa-z.:\[\]-]{1,60})/\w{8}$")
+_SIGN = r"rosproxy/([12]{1,2})/(\d{1,5})-(\d{1,5})/([0-9A-Fa-z.:\[\]-]{1,60})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +41,7 @@ def publish_sign(
 
     None where that is not possible: a sign only helps people.
     """
-    name = f"\0rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}/{secrets.token_hex(4)}"
-    with contextlib.suppress(OSError):
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
-            sock.bind(name)
-        except OSError:
-            sock.close()
-            raise
-        return sock
-    return None
+    return signs.put_up(f"rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}")
 
 
 def overlapping_proxies(ros: str, first: int, last: int, admin: object) -> list[Sign]:
@@ -68,15 +50,10 @@ def overlapping_proxies(ros: str, first: int, last: int, admin: object) -> list[
     ``admin`` is the own admin endpoint, which no other can have. MOST at most, and none whose admin
     endpoint is not at an address: people are told to ask there.
     """
-    try:
-        lines = _LISTED.read_text("utf-8", "replace").splitlines()
-    except OSError:
-        return []
-    matches = filter(None, map(_SIGN.search, lines))
-    signs = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in matches)
+    proxies = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in signs.read_all(_SIGN))
     overlapping = (
         s
-        for s in signs
+        for s in proxies
         if ros in s.ros and s.first <= last and first <= s.last and s.admin != str(admin)
     )
     return list(islice(dict.fromkeys(s for s in overlapping if _is_at_address(s.admin)), MOST))

@@ -44,6 +44,12 @@ class CreateNetwork(Action, frozen=True):
         return ", a bridge: the uplink of all proxies"
 
 
+class RemoveNetwork(Action, frozen=True):
+    """Remove a network that the operator has made."""
+
+    does = "remove network"
+
+
 class _CreateContainer(Action, frozen=True):
     """Create one of a proxy's containers, without starting it."""
 

@@ -131,14 +131,15 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
     return None if process_actions is None else actions + process_actions
 
 
-def removal_steps(observed: HostState, key: Key) -> Iterator[Action]:
-    """Remove everything of a key that nobody wants any more."""
-    reason = "no running container wants it any more"
+def removal_steps(
+    observed: HostState, key: Key, reason: str, again: bool = False
+) -> Iterator[Action]:
+    """Remove everything of a key; ``again`` also what the engine is removing already."""
     for own in (*observed.ears_of(key), *observed.proxies_of(key), *observed.sandboxes_of(key)):
         state, name = own.container.state, own.container.name
         if state == "paused" and isinstance(own, Proxy):
             yield Unpause(name)
-        if state != "removing":
+        if again or state != "removing":
             yield Remove(name, reason, retire=isinstance(own, Proxy) and state in STARTED)
 
 

@@ -82,7 +82,10 @@ class Container:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A network of the engine. ``gateway`` is its IPv4 gateway, empty if it has none."""
+    """A network of the engine. ``gateway`` is its IPv4 gateway, empty if it has none.
+
+    ``made_by_operator``: its label says so.
+    """
 
     id: str
     name: str
@@ -90,6 +93,7 @@ class Network:
     internal: bool = False
     gateway: str = ""
     subnets: tuple[IPv4Network, ...] = ()
+    made_by_operator: bool = False
 
 
 @dataclass(frozen=True, slots=True, order=True)

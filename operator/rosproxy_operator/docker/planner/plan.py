@@ -28,6 +28,7 @@ from rosproxy_operator.docker.planner.specs import master, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
 from rosproxy_operator.docker.settings import PlanSettings
 
+UNWANTED = "no running container wants it any more"
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""
 
@@ -96,7 +97,7 @@ def plan(
     memory, tight = allocate(observed, settings, desired, memory, now, frozen=not creatable)
     expired = {key for key, since in memory.absent.items() if now - since >= settings.grace}
     planned: dict[Key, list[Action] | None] = {
-        key: [*removal_steps(observed, key)] for key in expired
+        key: [*removal_steps(observed, key, UNWANTED)] for key in expired
     }
     for wanted in desired:
         if ports := memory.planned.get(wanted.key):  # else its problem is reported already

@@ -1,7 +1,7 @@
 """A pure engine: what actions do to a host, and what must never be done to it."""
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
@@ -15,6 +15,7 @@ from rosproxy_operator.docker.planner.actions import (
     CreateSandbox,
     Disconnect,
     Remove,
+    RemoveNetwork,
     Rename,
     Restart,
     Run,
@@ -124,6 +125,7 @@ class Engine:
         self.names_ports = True
         self.redirects_fail = False
         self.rules: dict[tuple[int, Key], tuple[HostPort | None, HostPort | None]] = {}
+        self.uninstalls = False
         self.ids = itertools.count()
 
     # what users do
@@ -217,10 +219,8 @@ class Engine:
     def apply(self, action: Action) -> None:  # noqa: C901, PLR0912 - one case per action
         """Raises Failed. An AssertionError means that the plan is wrong in itself."""
         match action:
-            case CreateNetwork(name):
-                if name in self.networks:
-                    raise Failed(f"network {name} exists")
-                self.add_network(name)
+            case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
+                self._apply_to_network(action)
             case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
                 self._create(action)
             case Run(name):
@@ -242,6 +242,25 @@ class Engine:
                 if self.named(to):
                     raise Failed(f"{to} exists")
                 box.name = to
+            case Remove(name) if [box.state for box in self.named(name)] == ["removing"]:
+                assert self.uninstalls
+            case Remove(name):
+                self.boxes.remove(self.own(name))
+
+    def _apply_to_network(
+        self, action: CreateNetwork | RemoveNetwork | Connect | Disconnect
+    ) -> None:
+        match action:
+            case CreateNetwork(name):
+                if name in self.networks:
+                    raise Failed(f"network {name} exists")
+                self.add_network(name)
+                self.networks[name] = replace(self.networks[name], made_by_operator=True)
+            case RemoveNetwork(name):
+                assert self.networks[name].made_by_operator
+                if self.active(name):
+                    raise Failed("has active endpoints")
+                del self.networks[name]
             case Connect(name, network, aliases):
                 self._connect(self.own(name), network, aliases)
             case Disconnect(name, network):
@@ -249,8 +268,6 @@ class Engine:
                 if network not in box.networks or network not in self.networks:
                     raise Failed("not connected")
                 del box.networks[network]
-            case Remove(name):
-                self.boxes.remove(self.own(name))
 
     def own(self, name: str) -> Box:
         """A container to do something to, which must be the operator's own."""

@@ -119,12 +119,33 @@ def test_a_wrong_word_is_one_line(words: list[str]) -> None:
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("words", [["status"], ["plan"], ["--once"]])
+@pytest.mark.parametrize("words", [["status"], ["plan"], ["--once"], ["uninstall"]])
 def test_no_engine_is_one_line_that_says_what_to_do(words: list[str]) -> None:
     result = run("docker", *words)
     assert result.exit_code == 1
     assert "there is no Docker engine's socket /nowhere: start the engine" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_uninstall_says_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    problems = [Problem("network 0-rosproxy", "stays")]
+    monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: None)
+    monkeypatch.setattr("rosproxy_operator.docker.controller.uninstall", lambda *_: problems)
+    result = run("docker", "uninstall")
+    assert result.exit_code == 1
+    assert result.stderr == "rosproxy-operator: network 0-rosproxy: stays\n"
+    problems.clear()
+    assert run("docker", "uninstall").exit_code == 0
+
+
+def test_uninstall_refuses_beside_an_operator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where options are given, for which status and plan do not ask it."""
+    answer = {"operator": "http://127.0.0.1:11313", "version": "another"}
+    monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: answer)
+    result = run("docker", "--proxy-image", "other", "uninstall")
+    assert result.exit_code == 1
+    assert "an operator is running at http://127.0.0.1:11313" in result.stderr
+    assert "docker rm -f rosproxy-operator" in result.stderr
 
 
 def test_once_is_for_the_controller_itself() -> None:

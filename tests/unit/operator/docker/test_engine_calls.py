@@ -21,6 +21,7 @@ from rosproxy_operator.docker.planner.actions import (
     CreateSandbox,
     Disconnect,
     Remove,
+    RemoveNetwork,
     Rename,
     Restart,
     Run,
@@ -96,6 +97,19 @@ async def test_the_documentation_lists_exactly_what_is_called(engine: FakeEngine
     assert [
         call for call in engine.calls if not any(re.fullmatch(pattern, call) for pattern in listed)
     ] == []
+
+
+async def test_uninstall_removes_a_network_besides(engine: FakeEngine) -> None:
+    await carry_out(RemoveNetwork("0-rosproxy"))
+    engine.refuses["DELETE /networks/gone"] = (404, "network gone not found")
+    await carry_out(RemoveNetwork("gone"))
+    assert [call for call in engine.calls if call.startswith("DELETE")] == [
+        "DELETE /networks/0-rosproxy",
+        "DELETE /networks/gone",
+    ]
+    engine.refuses["DELETE /networks/busy"] = (403, "network busy has active endpoints")
+    with pytest.raises(EngineError, match="has active endpoints"):
+        await carry_out(RemoveNetwork("busy"))
 
 
 async def test_what_does_not_do_its_one_thing_is_told(engine: FakeEngine) -> None:

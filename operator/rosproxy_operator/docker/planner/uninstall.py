@@ -1,0 +1,104 @@
+"""What is to be done so that nothing of the operator's is left on a Docker host.
+
+It goes in the opposite order of how it came: redirects out of the networks of containers that stay,
+while their records tell of them; each key's ear, proxy and sandbox, of which the proxy unregisters
+its nodes first; and once no container is left, the networks that the operator has made.
+
+Nothing may come back meanwhile. Who sees a container of the operator's that was not there before
+has found another operator at work, and stops.
+"""
+
+from collections.abc import Iterator
+
+from rosproxy.telemetry.text import listed
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.actions import RemoveNetwork
+from rosproxy_operator.docker.planner.container_steps import removal_steps
+from rosproxy_operator.docker.planner.labels.members import LabelReading
+from rosproxy_operator.docker.planner.model import STARTED, HostState
+from rosproxy_operator.docker.planner.plan import DockerPlan, Group
+from rosproxy_operator.docker.planner.redirect import redirect_steps
+from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.settings import PlanSettings
+
+REASON = "rosproxy is uninstalled"
+
+
+class Uninstall:
+    """Decides as `plan` does, look after look; it remembers what there was at the first."""
+
+    def __init__(self) -> None:
+        self._first: frozenset[str] | None = None
+
+    def __call__(
+        self,
+        observed: HostState,
+        _labels: LabelReading,
+        settings: PlanSettings,
+        memory: DockerMemory,
+        _now: float,
+    ) -> DockerPlan:
+        """The next actions; none if nothing is left, or nothing can be done about what is."""
+        ids = frozenset(own.container.id for own in observed.own)
+        if self._first is None:
+            self._first = ids
+        problem = _other_operator(observed, self._first)
+        groups = () if problem else tuple(_groups(observed, settings))
+        problems = (problem,) if problem else tuple(_remaining(observed, settings))
+        return DockerPlan(groups, memory, problems, members=(), desired=())
+
+
+def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | None:
+    """Who makes anew what is removed, as a problem; None if nobody does."""
+    anew = [own.container.name for own in observed.own if own.container.id not in first]
+    if not anew:
+        return None
+    return Problem(
+        "operator",
+        f"an operator is running on this host: {listed(anew)} was made meanwhile; end it first "
+        "(docker rm -f rosproxy-operator, or docker compose stop operator), then uninstall again",
+    )
+
+
+def _groups(observed: HostState, settings: PlanSettings) -> Iterator[Group]:
+    """All that can be removed now."""
+    busy = {own.key for own in observed.own if own.container.name in observed.busy}
+    for steps in redirect_steps(observed, settings, ()):
+        yield Group(steps.key, steps.actions, f"container {steps.container}")
+    for key in sorted(observed.keys - busy):
+        # One that is already being removed is asked for again: the network has to wait for its end.
+        if actions := tuple(removal_steps(observed, key, REASON, again=True)):
+            yield Group(key, actions)
+    if not observed.own:
+        for network in observed.networks:
+            if network.made_by_operator and not _guests(observed, network.name):
+                yield Group(None, (RemoveNetwork(network.name),))
+
+
+def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]:
+    """What can't be removed, and what to do."""
+    for network in observed.networks:
+        if guests := _guests(observed, network.name) if network.made_by_operator else []:
+            yield Problem(
+                f"network {network.name}",
+                f"stays, as {listed(guests)} is on it: docker network disconnect {network.name} "
+                f"{guests[0]}, then uninstall again",
+            )
+    if observed.redirects and not observed.image_id:
+        names = {container.id: container.name for container in observed.containers}
+        owners = (record.container.network_container or "" for record in observed.redirects)
+        yield Problem(
+            f"proxy image {settings.proxy_image}",
+            "not on this host, and it is what takes the redirects out of the networks of "
+            f"{listed(sorted({names.get(owner, owner[:12]) for owner in owners}))}: docker pull "
+            f"{settings.proxy_image}, then uninstall again",
+        )
+
+
+def _guests(observed: HostState, network: str) -> list[str]:
+    """Other containers that are on a network, so that the engine does not remove it."""
+    return sorted(
+        container.name
+        for container in observed.containers
+        if container.state in STARTED and network in container.networks
+    )
