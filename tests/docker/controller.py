@@ -141,9 +141,7 @@ class Controller:
 
     def command(self, *words: str, check: bool = True) -> str:
         """Have another command in its container ask the controller, which has the options."""
-        return docker(
-            "exec", self.container, "rosproxy-operator", "docker", *words, check=check
-        )
+        return docker("exec", self.container, "rosproxy-operator", "docker", *words, check=check)
 
     def status(self) -> dict[str, Any]:
         document: dict[str, Any] = json.loads(self.command("status", "--json", check=False))

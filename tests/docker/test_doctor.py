@@ -96,6 +96,29 @@ def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named
         remove_proxies()
 
 
+def test_what_has_ended_is_nothing_wrong(process: Process, net: Inside, named: Robot) -> None:
+    """A container that is restarted leaves a port behind each time, and one node."""
+    process.start()
+    try:
+        node = net.node(net.network(), "roscpp", "pub", "--topic", "/out")
+        uris: set[str | None] = set()
+        for _ in range(3):
+            wait_until(
+                lambda: named.knows_proxied(node.node) and named.uri(node.node) not in uris, 60,
+                node.log.read,
+            )  # fmt: skip
+            uris.add(named.uri(node.node))
+            docker("restart", "--time", "1", node.name)
+        asking = Process(process._directory, names={named.name: named.address})
+        asking.options = process.options
+        wait_until(lambda: wrong(asking) == (0, []), 60, lambda: str(wrong(asking)))
+        said = docker("exec", the_proxy().name, "rosproxy", "doctor")
+        assert "1 of 1 answer; those that have ended still hold" in said
+    finally:
+        process.stop()
+        remove_proxies()
+
+
 def test_a_misspelt_label(process: Process, net: Inside) -> None:
     node = net.idle(net.network(), labels=("ros-proxy.enable=true",))
     _, findings = wrong(process)

@@ -50,6 +50,25 @@ def test_sound_nodes_are_counted() -> None:
     ]
 
 
+@pytest.mark.parametrize("state", ["refused", "silent", "failing", "cleaned"])
+def test_what_has_ended_is_no_node_that_does_not_answer(state: str) -> None:
+    """A container that was restarted: its node is back, or it took its name back itself."""
+    former = make_node(uri="http://10.0.0.5:40009/", port=45009, state=state)
+    nameless = make_node(nodes=[], uri="http://10.0.0.5:40008/", port=45008, state=state)
+    facts = make_facts(status=make_status(former, make_node(), nameless))
+    assert [(f.severity, f.text) for f in check(facts) if f.subject != "nodes at the master"] == [
+        (Severity.OK, "1 of 1 answer; those that have ended still hold 2 ports for up to 30 s")
+    ]
+
+
+@pytest.mark.parametrize("state", ["refused", "silent", "cleaned"])
+def test_one_that_is_not_back_is_told(state: str) -> None:
+    gone = make_node(nodes=["/other"], uri="http://10.0.0.5:40009/", port=45009, state=state)
+    findings = check(make_facts(status=make_status(gone, make_node())))
+    assert "1 of 2 answer" in {finding.text for finding in findings}
+    assert any(f.subject == "/other" and f.severity >= Severity.WARNING for f in findings)
+
+
 def test_an_address_of_the_proxy_is_of_its_host_and_range() -> None:
     facts = make_facts()
     ports = [port for port in (44999, 45000, 45099, 45100) if facts.is_ours(HostPort(HOST, port))]

@@ -1,7 +1,7 @@
 """The nodes: those behind the proxy, and those that the master knows."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from ipaddress import ip_network
 
 from msgspec.structs import replace
@@ -12,9 +12,11 @@ from rosproxy.doctor.facts import DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
+from rosproxy.telemetry.text import plural
 
 INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
 TWO_PROXIES = "two proxies"
+_ENDED = ("refused", "silent", "failing", "cleaned")
 CLEANUP = "rosnode cleanup (answer y)"
 # The host name of a container that was given none (moby daemon/container.go).
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
@@ -42,9 +44,14 @@ def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
 
 
 def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[DoctorFinding]:
-    states = [node.state for node in facts.proxy.nodes]
-    if states:
-        yield ok(INSIDE, "inside nodes", f"{states.count('ok')} of {len(states)} answer")
+    present, ended = _present_and_ended(facts.proxy.nodes)
+    if present or ended:
+        states = [node.state for node in present]
+        text = f"{states.count('ok')} of {len(states)} answer"
+        if ended:
+            held = f"{plural(len(ended), 'port')} for up to {facts.proxy.settings.linger:g} s"
+            text += f"; those that have ended still hold {held}"
+        yield ok(INSIDE, "inside nodes", text)
     elif facts.status is not None:
         text = "none has registered through the proxy"
         yield warning(INSIDE, "inside nodes", text, _start_inside(facts, "them"))
@@ -55,8 +62,22 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
         yield (note if faults else ok)(OUTSIDE, "nodes at the master", text)
 
 
+def _present_and_ended(
+    nodes: Sequence[EndpointStatus],
+) -> tuple[list[EndpointStatus], list[EndpointStatus]]:
+    """The nodes that are there, or ought to be, and those that have ended as nodes do.
+
+    What has ended has nothing registered any more, or is back under the same name at another
+    address: its container was restarted. It has its port for a while.
+    """
+    answering = {name for node in nodes if node.state in ("ok", "new") for name in node.nodes}
+    ended = [n for n in nodes if n.state in _ENDED and answering.issuperset(n.nodes)]
+    return [node for node in nodes if node not in ended], ended
+
+
 def _inside(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    for node in facts.proxy.nodes:
+    present, _ = _present_and_ended(facts.proxy.nodes)
+    for node in present:
         for name in node.nodes:
             yield from _inside_node(facts, node, name)
 
