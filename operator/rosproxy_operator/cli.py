@@ -24,8 +24,10 @@ from rosproxy.cli.options import (
     settings_options,
     unknown_variables,
 )
+from rosproxy.cli.variables import UnknownVariable
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.command_errors import exit_on_error, exit_with, fail
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_options import policy_options, proxy_bound_options
 from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, PlanSettings, make_plan_settings
@@ -108,8 +110,8 @@ def docker(
     logs.set_up(log_format, log_level)
     for library in ("docker", "urllib3"):  # they log each request otherwise
         logging.getLogger(library).setLevel(logging.INFO)
-    # The proxy's variables have the same prefix, ROSPROXY_, and are no mistake here.
-    unknown_variables(main, proxy_main)
+    runs = context.invoked_subcommand is None
+    unknown = _unknown_variables(log=not runs)
     with setting_errors():
         settings = make_plan_settings(options)
     # Who gives options asks what an operator with these would do, whatever the running one does.
@@ -117,10 +119,16 @@ def docker(
     context.obj = docker_commands.CommandContext(
         settings, options["admin_bind"], ParameterSource.COMMANDLINE in sources, options["resync"]
     )
-    if context.invoked_subcommand is None:
-        _run(settings, options["resync"], options["admin_bind"], once)
+    if runs:
+        mistakes = [Problem(f"variable {v.name}", v.text, fatal=False) for v in unknown]
+        _run(settings, options["resync"], options["admin_bind"], once, mistakes)
     elif once:
         raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
+
+
+def _unknown_variables(log: bool = True) -> list[UnknownVariable]:
+    # The proxy's variables have the same prefix, ROSPROXY_, and are no mistake here.
+    return unknown_variables(main, proxy_main, log=log)
 
 
 def _need(library: str, extra: str) -> None:
@@ -132,17 +140,19 @@ def _need(library: str, extra: str) -> None:
         )
 
 
-def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> None:
+def _run(
+    settings: PlanSettings, resync: float, admin: HostPort, once: bool, mistakes: list[Problem]
+) -> None:
     from rosproxy_operator.docker.controller import run, run_once
 
     if not once:
         with setting_errors():
-            run(settings, resync, admin)
+            run(settings, resync, admin, mistakes)
         return
     from rosproxy_operator.docker.errors import EngineError
 
     with exit_on_error(EngineError):
-        problems = run_once(settings, resync)
+        problems = run_once(settings, resync, mistakes)
     exit_with(problems)
 
 
@@ -185,6 +195,8 @@ def kubernetes(context: click.Context, /, log_format: str, log_level: str, **opt
         settings = make_kubernetes_settings(options)
         if context.invoked_subcommand is None:
             _run_kubernetes(settings, log_format, log_level)
+        else:
+            _unknown_variables()
     context.obj = settings.namespaces
 
 
@@ -198,7 +210,7 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     from rosproxy_operator.kubernetes.serving import quiet_library_logs
 
     logs.set_up(log_format, log_level)
-    unknown_variables(main, proxy_main)
+    _unknown_variables()
     quiet_library_logs()
     with exit_on_error(ApiError):
         run(settings)

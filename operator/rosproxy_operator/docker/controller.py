@@ -11,7 +11,7 @@ import contextlib
 import logging
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
@@ -56,29 +56,37 @@ Decide = Callable[[HostState, LabelReading, PlanSettings, DockerMemory, float], 
 """From what a look has seen, settings, memory and the time to what is to be done: `plan`."""
 
 
-def run_once(settings: PlanSettings, resync: float) -> list[Problem]:
-    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
-    return asyncio.run(DockerController(settings, resync, DockerMetrics()).run_once(ONCE))
+def run_once(settings: PlanSettings, resync: float, mistakes: Sequence[Problem]) -> list[Problem]:
+    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed.
+
+    ``mistakes`` as of `run`.
+    """
+    controller = DockerController(settings, resync, DockerMetrics(), mistakes=mistakes)
+    return asyncio.run(controller.run_once(ONCE))
 
 
 def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
     """Remove all that operators have made on this host; what is left. Raises LookFailed."""
-    controller = DockerController(settings, resync, DockerMetrics(), Uninstall())
+    controller = DockerController(settings, resync, DockerMetrics(), decide=Uninstall())
     return asyncio.run(controller.run_once(ONCE))
 
 
-def run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
+def run(
+    settings: PlanSettings, resync: float, admin: HostPort, mistakes: Sequence[Problem]
+) -> None:
     """Run the operator until a signal ends it; its proxies go on. Raises SettingError.
 
     ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
-    serves its own health.
+    serves its own health. ``mistakes`` are what is wrong with how it was started, to be told.
     """
-    asyncio.run(_run(settings, resync, admin))
+    asyncio.run(_run(settings, resync, admin, mistakes))
 
 
-async def _run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
+async def _run(
+    settings: PlanSettings, resync: float, admin: HostPort, mistakes: Sequence[Problem]
+) -> None:
     metrics = DockerMetrics()
-    controller = DockerController(settings, resync, metrics)
+    controller = DockerController(settings, resync, metrics, mistakes=mistakes)
     page = operator_page(controller.documents)
     health = HealthServer(
         metrics.registry, controller.dead, controller.unready, page, controller.status
@@ -105,8 +113,10 @@ class DockerController:
         resync: float,
         metrics: DockerMetrics,
         decide: Decide = plan,
+        mistakes: Sequence[Problem] = (),
     ) -> None:
         self._settings, self._metrics, self._decide = settings, metrics, decide
+        self._mistakes = mistakes
         pace = Pace("engine", resync, DEBOUNCE, LONGEST_LOOK)
         self._loop = loop = ControlLoop(pace, metrics)
         self.dead, self.unready = loop.dead, loop.unready
@@ -201,7 +211,12 @@ class DockerController:
 
         What a look finds and plans in the midst of it is outdated a moment later.
         """
-        latest = [*planned.problems, *self._executor.problems, *self._proxy_sync.problems(snapshot)]
+        latest = [
+            *self._mistakes,
+            *planned.problems,
+            *self._executor.problems,
+            *self._proxy_sync.problems(snapshot),
+        ]
         busy = self._executor.busy
         self._shown = [
             *(problem for problem in latest if problem.subject not in busy),

@@ -23,7 +23,7 @@ def publish_sign(admin: HostPort, engine: str) -> socket.socket | None:
 
 
 def operators(first: HostPort, engine: str) -> list[HostPort]:
-    """Where operators of this engine may listen: there first, then where signs say; MOST at most."""
+    """Where operators of this engine may listen: ``first``, then where signs say; MOST at most."""
     matches = signs.read_all(_begin(engine) + r"/([0-9a-f.:\[\]]{1,60})")
     listeners = (parse_host_port(match[1]) for match in matches)
     near = (at for at in listeners if at and (is_loopback(at.host) or at.host in ("0.0.0.0", "::")))

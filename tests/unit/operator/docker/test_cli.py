@@ -127,6 +127,21 @@ def test_no_engine_is_one_line_that_says_what_to_do(words: list[str]) -> None:
     assert "Traceback" not in result.stderr
 
 
+def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By commands at once, and by the operator for as long as it runs."""
+    misspelt = "is no variable of rosproxy's and is ignored; did you mean ROSPROXY_PORT_WINDOW?"
+    result = run("docker", "status", ROSPROXY_PORT_WINDO="12000-12999")
+    assert f"ROSPROXY_PORT_WINDO {misspelt}" in result.stderr
+    told: list[Problem] = []
+    monkeypatch.setattr(
+        "rosproxy_operator.docker.controller.run", lambda *given: told.extend(given[-1])
+    )
+    run("docker", ROSPROXY_PORT_WINDO="12000-12999", ROSPROXY_PORT_RANGE="11000-11009")
+    assert told == [Problem("variable ROSPROXY_PORT_WINDO", misspelt, fatal=False)]
+
+
 def test_uninstall_says_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     problems = [Problem("network 0-rosproxy", "stays")]
     monkeypatch.setattr("rosproxy_operator.docker.host_status.ask_operators", lambda _: None)

@@ -163,3 +163,9 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
     result = run()
     assert result.exit_code == 1
     assert "pip install 'rosproxy[kubernetes]'" in result.stderr
+
+
+def test_a_misspelt_variable_is_told_by_the_doctor_too(caplog: pytest.LogCaptureFixture) -> None:
+    run("doctor", ROSPROXY_ALLOW_MASTERS="robot", KUBECONFIG="/nowhere")
+    assert "ROSPROXY_ALLOW_MASTERS is no variable of rosproxy's and is ignored" in caplog.text
+    assert "did you mean ROSPROXY_ALLOW_MASTER?" in caplog.text
