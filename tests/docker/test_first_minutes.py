@@ -124,3 +124,34 @@ def _network_removed() -> bool:
     """The proxy may still be on it."""
     docker("network", "rm", "ros", check=False)
     return "ros" not in docker("network", "ls", "--format", "{{.Name}}").split()
+
+
+ROSLAUNCH = (
+    'echo \'<launch><node pkg="rostopic" type="rostopic" name="said" required="true" '
+    'args="pub -r 5 /out std_msgs/String hello"/></launch>\' > /tmp/one.launch'
+    " && exec roslaunch --wait /tmp/one.launch"
+)
+
+
+def test_the_hosts_address_as_the_containers_own(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    """As manuals of drivers have it: roslaunch ends with it, and starts without."""
+    controller = start_controller()
+    network, command = net.network(), ("sh", "-c", ROSLAUNCH)
+    first = net.run(network, *command, options=("--env", f"ROS_IP={named.host_address}"))
+
+    text = told(controller, first.name)
+
+    wait_until(lambda: first.state == "exited", 60, first.log.read)
+    quoted = re.search(r"ends with '(.+)':", text)
+    assert quoted
+    assert quoted[1] in first.log.read()
+    advice = re.search(r"leave (\w+) out", text)
+    assert advice
+    assert advice[1] == "ROS_IP"
+    first.remove()
+    net.run(network, *command)
+    wait_until(lambda: named.knows_proxied("said"), 60, controller.logs)
+    assert "hello" in named.run("rostopic", "echo", "-n", "1", "/out")
+    assert controller.problems() == ""

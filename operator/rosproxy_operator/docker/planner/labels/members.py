@@ -8,6 +8,7 @@ from functools import lru_cache
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
+from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
 from rosproxy_operator.docker.planner.labels.readers import (
     ADVERTISE_HOST,
     ENABLE,
@@ -81,7 +82,8 @@ def find_members(
         key = replace(request.key, advertise_host=host)
         if host:
             member, text = _placed(replace(request, key=key), observed, settings)
-            wrong = [_problem(container, text, False)] if text else []
+            texts = [text, "" if key.is_ros2 else wrong_own_address(container, key, observed)]
+            wrong = [_problem(container, text, False) for text in texts if text]
             members.append(member)
         else:
             text = _why_no_host(key, observed)

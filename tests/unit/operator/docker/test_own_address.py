@@ -1,0 +1,46 @@
+"""What a container says of its own address, where that keeps its nodes from working."""
+
+from dataclasses import replace
+
+import pytest
+
+from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
+from rosproxy_operator.docker.planner.model import Key
+from tests.unit.operator.docker.builders import HERE, KEY, ROBOT, container, observed, read_members
+
+TOWARDS, FAR = "198.51.100.7", "203.0.113.9"
+
+
+def wrong(key: Key = KEY, **variables: str) -> str:
+    seen = observed(advertise={"robot": TOWARDS}, far=FAR)
+    return wrong_own_address(replace(container(), variables=variables), key, seen)
+
+
+@pytest.mark.parametrize("name", ["ROS_IP", "ROS_HOSTNAME"])
+@pytest.mark.parametrize("value", ["127.0.0.1", "127.0.1.1", "localhost", " LOCALHOST ", "::1"])
+def test_loopback(name: str, value: str) -> None:
+    text = wrong(KEY, **{name: value})
+    assert "listen on loopback only" in text
+    assert f"leave {name} out" in text
+
+
+@pytest.mark.parametrize("value", [HERE, TOWARDS, FAR, "172.18.0.1"])
+def test_an_address_of_this_host(value: str) -> None:
+    text = wrong(ROS_IP=value)
+    assert f"ROS_IP={value} is this host's address" in text
+    assert "Unable to contact my own server" in text
+
+
+def test_a_name_of_this_host() -> None:
+    assert "is this host's" in wrong(Key(ROBOT, "edge7"), ROS_HOSTNAME="Edge7")
+
+
+@pytest.mark.parametrize("value", ["", "172.18.0.3", "talker", "192.0.2.99"])
+def test_what_does_no_harm(value: str) -> None:
+    assert wrong(ROS_IP=value) == wrong(ROS_HOSTNAME=value) == wrong() == ""
+
+
+def test_it_is_a_warning_of_the_container() -> None:
+    _, (problem,) = read_members(observed(replace(container(), variables={"ROS_IP": HERE})))
+    assert problem.subject == "container talker"
+    assert not problem.fatal
