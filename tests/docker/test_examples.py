@@ -14,7 +14,6 @@ from tests.docker.robot import Robot
 from tests.docker.ros2 import HERE, THERE, Outside, wait_for_line
 
 EXAMPLES = ROOT / "examples/docker"
-BY_ADDRESS = EXAMPLES / "by-address"
 ROS2 = EXAMPLES / "ros2"
 SOCKET_PROXY = EXAMPLES / "socket-proxy"
 
@@ -112,7 +111,7 @@ def test_example_with_a_master_by_address(
     robot: Robot, images: dict[str, str], tmp_path: Path
 ) -> None:
     """Its services are stock ones, but for the label."""
-    with example(BY_ADDRESS, robot, images, tmp_path) as project:
+    with example(EXAMPLES, robot, images, tmp_path) as project:
         assert project.variables["ROS_MASTER_URI"] == f"http://{robot.address}:11311"
         works_both_ways(project, robot)
 
@@ -188,7 +187,7 @@ def test_example_with_ros_2(
 
 def test_examples_need_no_more_than_their_readme_says() -> None:
     """A variable without a default is one that the README tells to set."""
-    for directory in (EXAMPLES, BY_ADDRESS, SOCKET_PROXY, ROS2):
+    for directory in (EXAMPLES, SOCKET_PROXY, ROS2):
         needed = set(re.findall(r"\$\{(\w+):\?", (directory / "compose.yaml").read_text()))
         told = set(re.findall(r"export (\w+)=", (directory / "README.md").read_text()))
         assert needed == told, directory

@@ -329,8 +329,10 @@ class DockerObserver:
                 own_by_role[own.role].append(own_container)
             if own and not self._inspector.is_current(row):
                 busy.add(container.name)
+        # Who shares the network of one that is not inspected yet is left out as long as that is.
+        unread = {row["Id"] for row in rows if self._inspector.get(row["Id"]) is None}
         return HostState(
-            containers=tuple(containers),
+            containers=tuple(c for c in containers if c.network_container not in unread),
             networks=networks,
             proxies=tuple(own_by_role[ROLE_PROXY]),
             ephemeral=host.ephemeral_ports(),

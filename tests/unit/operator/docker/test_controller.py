@@ -152,6 +152,28 @@ async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine)
     assert look.state.masters == {"robot": ""}
 
 
+async def test_who_shares_the_network_of_one_that_is_not_inspected_yet_waits(
+    engine: FakeEngine,
+) -> None:
+    """It is no mistake of its user's: Compose starts both in the same moment."""
+    talker = engine.rows[0]["Id"]
+    inspected = engine.knows.pop(f"/containers/{talker}/json")
+    beside = captured.running() | {
+        "Id": "c" * 64,
+        "Names": ["/beside"],
+        "HostConfig": {"NetworkMode": f"container:{talker}"},
+        "NetworkSettings": {"Networks": {}},
+    }
+    engine.add(beside, {**inspected, "NetworkSettings": {"Networks": {}}})
+    looking = observer()
+    look = await looking.look(5.0)
+    assert not look.labels.problems
+    engine.knows[f"/containers/{talker}/json"] = inspected
+    look = await looking.look(5.0)
+    assert [c.name for c in look.state.containers] == ["talker", "beside"]
+    assert not look.labels.problems
+
+
 @pytest.mark.parametrize(
     "garbage", [[], {"Config": 1}, {"NetworkSettings": {"Networks": {"app": {"Aliases": [5]}}}}]
 )
