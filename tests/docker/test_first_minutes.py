@@ -1,7 +1,8 @@
 """The commonest mistakes of a first try: the advice, followed word by word, until messages flow."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -124,6 +125,39 @@ def _network_removed() -> bool:
     """The proxy may still be on it."""
     docker("network", "rm", "ros", check=False)
     return "ros" not in docker("network", "ls", "--format", "{{.Name}}").split()
+
+
+@pytest.fixture
+def without_nft(proxy_image: str, tmp_path: Path) -> Iterator[str]:
+    """A proxy's image that can set no redirect, as where the kernel lacks what nft needs."""
+    tag = "rosproxy-test-without-nft:latest"
+    says = "echo 'Error: Could not process rule: Operation not supported' >&2; exit 1"
+    (tmp_path / "Dockerfile").write_text(
+        f"FROM {proxy_image}\nUSER 0\n"
+        f'RUN printf "#!/bin/sh\\n{says}\\n" >/usr/sbin/nft\n'
+        "USER 10001:10001\n"
+    )
+    docker("build", "--tag", tag, tmp_path)
+    yield tag
+    docker("rmi", "--force", tag, check=False)
+
+
+def test_where_no_redirect_can_be_set_the_name_is_told(
+    start_controller: Callable[..., Controller], near: Inside, robot: Robot, without_nft: str
+) -> None:
+    controller = start_controller("--proxy-image", without_nft)
+    network = near.network()
+    first = near.idle(network)
+
+    text = told(controller, first.name)
+
+    assert "docker logs" in text
+    uri, more = advised(text)
+    first.remove()
+    node = near.node(network, "rospy", "pub", "--topic", "/out", uri=uri, labels=(ENABLE, *more))
+    wait_until(lambda: robot.knows_proxied(node.node), 60, node.log.read)
+    assert robot.run("rostopic", "echo", "-n", "1", "/out")
+    assert controller.problems() == ""
 
 
 ROSLAUNCH = (

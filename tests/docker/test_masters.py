@@ -110,6 +110,49 @@ def test_masters_host_gets_another_address(
             remove_proxies()
 
 
+@pytest.mark.usefixtures("_no_other_controller")
+def test_a_master_given_by_address_gets_another_one(
+    ros_image: str, proxy_image: str, net: Inside, tmp_path: Path
+) -> None:
+    """Where a label has its name, nodes go on with the old address; else a new container does."""
+    with named_robot(ros_image, "mover", MOVER) as robot:
+        robot.start_master()
+        options = ("--proxy-image", proxy_image, "--advertise-host", robot.host_address)
+        controller = Process(tmp_path, *options, names={robot.name: robot.address})
+        controller.start()
+        try:
+            network, old = net.network(), f"http://{robot.address}:11311"
+            named = (ENABLE, f"rosproxy.master-uri={robot.master_uri}")
+            node = net.node(network, "rospy", "pub", "--topic", "/out", "--word", "inside",
+                            uri=old, labels=named)  # fmt: skip
+            plain = net.node(network, "roscpp", "pub", "--topic", "/plain", "--word", "new",
+                             uri=old)  # fmt: skip
+            for container in (node, plain):
+                wait_until(
+                    lambda: robot.knows_proxied(container.node),  # noqa: B023
+                    60, controller.logs,
+                )  # fmt: skip
+
+            address = move(robot)
+            controller.name(robot.name, address)
+            plain.remove()
+            moved = replace(robot, address=address)
+            later = net.node(network, "rospy", "sub", "--topic", "/new", uri=old, labels=named)
+            plain = net.node(network, "roscpp", "pub", "--topic", "/plain", "--word", "new",
+                             uri=f"http://{address}:11311")  # fmt: skip
+
+            for container in (later, plain):
+                wait_until(
+                    lambda: moved.knows_proxied(container.node),  # noqa: B023
+                    60, controller.logs,
+                )  # fmt: skip
+            moved.node("ear", "rospy", "sub", "--topic", "/out").wait_for("inside")
+            moved.node("ear2", "rospy", "sub", "--topic", "/plain").wait_for("new")
+        finally:
+            controller.stop()
+            remove_proxies()
+
+
 def move(robot: Robot) -> str:
     """Give the robot another address on the same cable; return it."""
     address = f"198.18.{MOVER + 1}.2"

@@ -199,7 +199,9 @@ class Executor:
                 self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
-                problem = Problem(_subject((group.key, group.subject)), f"{action}: {error}")
+                cure = f"; {group.cure}" if group.cure else ""
+                subject = _subject((group.key, group.subject))
+                problem = Problem(subject, f"{action}: {error}{cure}")
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem

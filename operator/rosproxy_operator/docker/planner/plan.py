@@ -40,11 +40,13 @@ class Group:
     One ``subject`` a container alone, for a redirect, and the key's other groups do not wait for
     each other. When an action fails, the rest of its group is left out, so that a proxy is only
     removed when its successor was created; but a failed Connect or Disconnect stops nothing else.
+    ``cure`` is what users can do where one fails again and again, in words; empty for nothing.
     """
 
     key: Key | None
     actions: tuple[Action, ...]
     subject: str = ""
+    cure: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +155,7 @@ def _possible_groups(
     groups = _groups(observed, settings.uplink, desired, planned)
     yield from (group for group in groups if group.key not in busy)
     for steps in redirect_steps(observed, settings, desired):
-        yield Group(steps.key, steps.actions, f"container {steps.container}")
+        yield Group(steps.key, steps.actions, f"container {steps.container}", steps.cure)
 
 
 def _groups(

@@ -26,6 +26,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.docker.planner.actions import Action, CreateRedirect, Remove, Run
 from rosproxy_operator.docker.planner.label_policy import network_owner
+from rosproxy_operator.docker.planner.labels.readers import MASTER_URI
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Container,
@@ -70,11 +71,15 @@ RedirectSite = tuple[Key, str]
 
 @dataclass(frozen=True, slots=True)
 class RedirectSteps:
-    """What is to be done for one redirect; ``container`` names the one whose network it is in."""
+    """What is to be done for one redirect; ``container`` names the one whose network it is in.
+
+    ``cure`` is what its user can do where that fails; empty where a redirect is taken away.
+    """
 
     key: Key
     container: str
     actions: tuple[Action, ...]
+    cure: str = ""
 
 
 def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
@@ -131,7 +136,17 @@ def redirect_steps(
         else:
             steps = _removal_steps(site[1], existing, observed, settings)
         if steps and not _is_busy(existing, observed):
-            yield RedirectSteps(site[0], names.get(site[1], site[1][:12]), tuple(steps))
+            name, cure = names.get(site[1], site[1][:12]), _by_name(site[0])
+            yield RedirectSteps(site[0], name, tuple(steps), cure if site in wanted else "")
+
+
+def _by_name(key: Key) -> str:
+    """How nodes use their proxy where no redirect can be set."""
+    return (
+        "so its nodes go around the proxy, and it is tried again; or set "
+        f"ROS_MASTER_URI=http://{proxy_name(key)}:{master(key).port} and the label "
+        f"{MASTER_URI}={key.master_uri}"
+    )
 
 
 def redirect_record_name(observed: HostState, key: Key, owner: Container) -> str:

@@ -97,14 +97,14 @@ async def test_a_key_that_takes_long_holds_up_no_other(host: Host) -> None:
 
 async def test_what_fails_ends_its_group_and_is_tried_again_later(host: Host) -> None:
     host.does[Start("a")] = EngineError("no")
-    group = Group(ONE, (Start("a"), Start("b")))
+    group = Group(ONE, (Start("a"), Start("b")), cure="do this")
     await host.start(group, Group(OTHER, (Start("c"),)))
     while host.work.busy:
         await asyncio.sleep(0.01)
     assert host.done == [Start("c")]
     (problem,) = host.work.problems
     assert problem.subject.startswith("proxy rosproxy-one-")
-    assert problem.text.endswith(": no")
+    assert problem.text.endswith(": no; do this")
     assert 0.5 < (host.work.again_in or 0) <= 1.0
     host.begin(group)
     assert not host.work.busy

@@ -236,7 +236,7 @@ ASTRAY = {
     "http://localhost:11311": "is the container itself: set ROS_MASTER_URI=",
     "http://rosproxy-arm-0a1b2c:11311": "names another master's proxy, its own is rosproxy-robot-",
     "robot:11311": f"{URI}: set ROS_MASTER_URI=",
-    "http://192.0.2.7:11311": "is an address, so its nodes go around the proxy and can't be",
+    "http://192.0.2.7:11399": "is an address, so its nodes go around the proxy and can't be",
 }
 
 

@@ -23,7 +23,7 @@ from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.proxy_news import network_facts
 from rosproxy_operator.docker.planner.redirect import redirect_config
-from rosproxy_operator.docker.planner.specs import own_labels, read_own
+from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, read_own
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
@@ -131,6 +131,20 @@ def test_it_is_not_set_without_a_proxy_and_stays_while_that_is_away() -> None:
         assert steps(replace(state, redirects=(record(made),))) == []
 
 
+def test_where_it_can_not_be_set_a_name_is_the_cure() -> None:
+    state = observed(node(), **nodes_proxy())
+    (group,) = (g for g in look(state).groups if g.subject == "container talker")
+    assert group.cure.endswith(f"set ROS_MASTER_URI=http://{proxy_name(KEY)}:11311 and the label "
+                               f"rosproxy.master-uri={MASTER}")  # fmt: skip
+    made = wanted(state)
+    (undo,) = (
+        g
+        for g in look(replace(state, redirects=(record(made),)), OFF).groups
+        if g.subject == "container talker"
+    )
+    assert undo.cure == ""
+
+
 def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:
     made = wanted(observed(node(), **nodes_proxy()))
     state = observed(node(), **nodes_proxy(), redirects=(record(made),))
@@ -179,14 +193,13 @@ def test_containers_that_share_a_network_have_it_once() -> None:
     assert made.target == "id-box"
 
 
-def test_a_masters_name_may_be_known_by_the_address() -> None:
+@pytest.mark.parametrize("address", [ADDRESS, "192.0.2.8"])
+def test_a_masters_name_may_be_known_by_an_address(address: str) -> None:
+    """Also by one that it had: the master has moved, and its nodes go on."""
     by_name = Key("http://robot:11311", HERE)
     talker = node(master_uri="http://robot:11311")
-    masters = {"robot": ADDRESS}
-    assert str(wanted(observed(talker, **nodes_proxy(key=by_name), masters=masters)).master) == (
-        f"{ADDRESS}:11311"
-    )
-    assert steps(observed(talker, **nodes_proxy(key=by_name), masters={"robot": "192.0.2.8"})) == []
+    state = observed(talker, **nodes_proxy(key=by_name), masters={"robot": address})
+    assert str(wanted(state).master) == f"{ADDRESS}:11311"
 
 
 @pytest.mark.parametrize(
@@ -195,6 +208,7 @@ def test_a_masters_name_may_be_known_by_the_address() -> None:
         (node(env="http://192.0.2.8:11311", master_uri=MASTER), SETTINGS, "name of the master"),
         (node(env="http://192.0.2.7:11399", master_uri=MASTER), SETTINGS, "name of the master"),
         (node(env="http://[2001:db8::7]:11311"), SETTINGS, "name of the master's host"),
+        (node(env="http://127.0.0.1:11311", master_uri="http://robot:11311"), SETTINGS, "itself"),
         (node(redirect="false"), SETTINGS, "without label rosproxy.redirect='false' it is led"),
         (node(redirect="true"), OFF, "the operator's --no-redirect keeps it"),
         (node(redirect="perhaps"), SETTINGS, "neither true nor false: write rosproxy.redirect="),

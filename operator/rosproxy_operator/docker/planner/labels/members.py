@@ -100,7 +100,7 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
     needs, text = readers.proxy_alias(container, key)
     if not container.master_uri and ros_versions.is_guessed(container):
         text = ""  # it may be of ROS 2: first its version has to be known
-    by_address = readers.master_by_address(container, key, observed.masters)
+    by_address = readers.master_by_address(container, key)
     if by_address is None:
         return replace(request, wanted_alias=needs), text
     internal = {network.name for network in observed.networks if network.internal}

@@ -293,17 +293,18 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
     return "", f"{variable} {_wrong_master(host, key, fix)}"
 
 
-def master_by_address(
-    container: Container, key: Key, addresses: Mapping[str, str]
-) -> HostPort | None:
-    """The address and port in a container's ROS_MASTER_URI, if they are those of its master.
+def master_by_address(container: Container, key: Key) -> HostPort | None:
+    """The address and port in a container's ROS_MASTER_URI that stand for its master.
 
-    ``addresses`` are those of masters' hosts, where names are known. None for a name, and for IPv6.
+    That is its master's own address, or where a label gives the master by name any address: the
+    name may lead to another one by now. None for a name, and for IPv6.
     """
     target, real = parse_slave_uri(container.master_uri), master(key)
     if target is None or target.port != real.port or ":" in target.host:
         return None
-    if not is_address(target.host) or target.host not in (real.host, addresses.get(real.host)):
+    if not is_address(target.host) or is_loopback(target.host):
+        return None
+    if is_address(real.host) and target.host != real.host:
         return None
     return HostPort(target.host, target.port)
 
