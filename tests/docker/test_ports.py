@@ -125,7 +125,9 @@ def test_range_taken_by_another_while_the_proxy_was_down(
         controller.logs,
     )
     the_proxy(40)
-    wait_until(lambda: "HAS LEFT ITS PORTS" in controller.logs(), 40, controller.logs)
+    wait_until(lambda: "HAS LEFT ITS PORTS" in controller.problems(), 40, controller.problems)
+    assert "HAS LEFT ITS PORTS" in controller.logs()
+    assert "restart them" in controller.problems()
     left = named.uri(node.node)
     docker("restart", "--time", "0", node.name)
     # roscpp takes what the reply to its subscription says, also if it is older than an update.

@@ -32,8 +32,9 @@ def host_document(
 ) -> Json:
     """The document. ``answers`` are those of proxies, by name, or why one does not answer.
 
-    Containers are those that have a proxy or whose labels are wrong; one with both versions of ROS
-    is listed twice. Actions for what the engine is busy with, and tells nothing of, are left out.
+    Containers are those that have a proxy, are to have one, or whose labels are wrong; one with
+    both versions of ROS is listed twice. Actions for what the engine is busy with, and tells
+    nothing of, are left out.
     """
     statuses = {name: answer for name, answer in answers.items() if isinstance(answer, ProxyStatus)}
     problems = [*problems]
@@ -42,10 +43,10 @@ def host_document(
     problems += [problem for problem in silent if problem.subject not in subjects]
     subjects = {problem.subject for problem in problems}
     redirects = _redirects(planned.members, observed)
-    keys: dict[str, list[Key]] = {}
+    keys: dict[str, list[Key | None]] = {}
     for member in planned.members:
-        if member.key in observed.keys:
-            keys.setdefault(member.container.id, []).append(member.key)
+        key = member.key if member.key in observed.keys else None
+        keys.setdefault(member.container.id, []).append(key)
     return {
         "version": __version__,
         "uplink": settings.uplink,
