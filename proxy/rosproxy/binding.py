@@ -54,4 +54,4 @@ def report_taken_ports(
     if proxies:
         text += f"; held by {holders}: {cure}"
     log.warning("%s", text)
-    problems.add(RANGE_OPTION, text)
+    problems.add(RANGE_OPTION, text, holds=True)

@@ -18,6 +18,7 @@ def test_status_and_columns(net: Namespace, robot: Robot) -> None:
 
     made.wait_status(lambda s: s.get("proxies") == "2/2", "both proxies are ready")
     made.wait_for("Ready")
+    made.wait_for("PortsReachable")
     made.wait_status(lambda s: s.get("topics", 0) >= 1, "the topic is counted", START)
     status = made.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted")
 
@@ -35,6 +36,7 @@ def test_status_and_columns(net: Namespace, robot: Robot) -> None:
         "Ready": "True",
         "PortsAllocated": "True",
         "MasterReachable": "True",
+        "PortsReachable": "True",
         "Degraded": "False",
     }
     narrow = kubectl("get", "rosproxy", "-n", net.name).splitlines()

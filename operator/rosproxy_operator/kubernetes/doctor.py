@@ -18,18 +18,16 @@ from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.resources.model import Json
-from rosproxy_operator.kubernetes.resources.names import ADVERTISE_HOST
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
+from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_CURE, PORTS_CURE
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""
 WITHIN = 60
 """Seconds that a doctor has: it tries what may not answer."""
-_ADDRESS = f"spec.advertise, or the annotation {ADVERTISE_HOST}=ADDRESS on the node"
 CURES = {
-    "advertised host": _ADDRESS,
-    "published range": f"let its hostPorts through the node's firewall and any NetworkPolicy; or "
-    f"{_ADDRESS}",
+    "advertised host": ADDRESS_CURE,
+    "published range": PORTS_CURE,
     "ports": "a larger spec.ports",
 }
 """What mends what proxies find about themselves, by their checks."""

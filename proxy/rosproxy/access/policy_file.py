@@ -63,7 +63,7 @@ class PolicyFile:
             if text not in (problem.text for problem in self._problems.all()):
                 log.error("%s: %s", OPTION, text)
                 self._problems.solved(OPTION)
-                self._problems.add(OPTION, text)
+                self._problems.add(OPTION, text, holds=True)
         else:
             log.info("%s %s was read again", OPTION, self._path)
             self._problems.solved(OPTION)

@@ -67,6 +67,6 @@ def _problems(problems: Problems) -> tuple[ProblemStatus, ...]:
     """The problems that were noted, each with how long ago."""
     # Not below 0, which readers refuse (`Seconds`): the clock may have been set back meanwhile.
     return tuple(
-        ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
+        ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text, p.holds)
         for p in problems.all()
     )

@@ -8,8 +8,8 @@ from it is not reported.
 from collections.abc import Iterator, Sequence
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
-from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.status_document import PortsStatus
+from rosproxy.admin.requests import PortProbe, RangeProbe
+from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import listed, plural
 
@@ -24,7 +24,7 @@ _OF_THIS_HOST = (
 )
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
 """How the proxy's own try may end although outside gets through: NAT has no hairpin."""
-_TEXT_BY_OUTCOME = {
+TEXT_BY_OUTCOME = {
     "refused": "nothing listens there: the range is not published, or the host is another machine",
     "silent": "no answer: a firewall drops it, or the host is not this one",
     "unreachable": "there is no route to it",
@@ -69,6 +69,27 @@ def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterato
             yield _reached(host, from_proxy, from_master, target)
         else:
             yield _not_reached(host, ports, from_proxy, from_master, target, is_uniform)
+
+
+def probe_result(probe: RangeProbe) -> RangeProbeStatus | None:
+    """What tries at some ports of the range prove, in the sense of `published_range`.
+
+    It is the worst of them; None if none was tried.
+    """
+    results = [
+        RangeProbeStatus(_is_reached(p), p.from_proxy, p.from_master, p.transport)
+        for p in probe.probes
+    ]
+    return min(results, key=lambda r: (False, None, True).index(r.reached), default=None)
+
+
+def _is_reached(trial: PortProbe) -> bool | None:
+    """Whether outside reaches a port; None where the proxy alone has tried and NAT may be why."""
+    if trial.from_master != "unknown":
+        return trial.from_master == "ok"
+    if trial.from_proxy == "ok":
+        return True
+    return None if trial.transport == "udp" or trial.from_proxy in _NO_WAY_BACK else False
 
 
 def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
@@ -126,7 +147,7 @@ def _not_reached(
         fix += f", and let it through the firewall; or correct --advertise-host, now {host}"
     else:
         fix = f"publish the whole range: {fix}"
-    text = f"{target}: {_TEXT_BY_OUTCOME.get(from_proxy, from_proxy)}"
+    text = f"{target}: {TEXT_BY_OUTCOME.get(from_proxy, from_proxy)}"
     if from_master == "missed":
         return error(RANGE, RANGE, f"{text}. The master does not get through either", fix)
     if from_proxy in _NO_WAY_BACK:

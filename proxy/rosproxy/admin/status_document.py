@@ -87,6 +87,19 @@ class PortsStatus(msgspec.Struct, frozen=True):
     held_by: Names = ()
 
 
+class RangeProbeStatus(msgspec.Struct, frozen=True):
+    """How the last try at ports of the range ended, ``age`` ago: the worst of several ports.
+
+    ``reached``: outside gets in; None: not proven. The others are those of `PortProbe`.
+    """
+
+    reached: bool | None = None
+    from_proxy: str = ""
+    from_master: str = ""
+    transport: str = ""
+    age: Seconds = 0.0
+
+
 class DataPlaneStatus(msgspec.Struct, frozen=True):
     """How topics are forwarded: as ``mode`` says or, for a ``reason``, by another ``plane``."""
 
@@ -207,11 +220,12 @@ class PolicyStatus(msgspec.Struct, frozen=True):
 
 
 class ProblemStatus(msgspec.Struct, frozen=True):
-    """What the user should know, of which subject, and how long ago it was noted."""
+    """What the user should know, of which subject, how long ago noted, and if it ``holds`` yet."""
 
     age: Seconds = 0.0
     subject: str = ""
     text: str = ""
+    holds: bool = False
 
 
 class LocatorStatus(msgspec.Struct, frozen=True):
@@ -311,8 +325,8 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
     ``instance`` differs after each start; ``retired``: it registers nothing any more;
-    ``stand_ins`` are the ports that stand in for nodes outside, for inside nodes; ``udpros`` the
-    subscriptions by UDPROS that it passes on; ``domains`` those of ROS 2.
+    ``range_probe`` is None before the first try; ``stand_ins`` are the ports that stand in for
+    nodes outside; ``udpros`` the subscriptions by UDPROS; ``domains`` those of ROS 2.
     """
 
     version: str = ""
@@ -323,6 +337,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     settings: StatusSettings = StatusSettings()
     master: MasterStatus = MasterStatus()
     ports: PortsStatus = PortsStatus()
+    range_probe: RangeProbeStatus | None = None
     data_plane: DataPlaneStatus | None = None
     stand_ins: tuple[StandInStatus, ...] = ()
     udpros: tuple[UdprosStatus, ...] = ()

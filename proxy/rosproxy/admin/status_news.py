@@ -6,6 +6,7 @@ Callers that wait for a change (``/status/changes``) are answered when the versi
 import hashlib
 
 import msgspec
+from msgspec.structs import replace
 
 from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxyStatus
 
@@ -20,6 +21,7 @@ def version_of(status: ProxyStatus) -> str:
         [_node(node) for node in status.nodes],
         [_domain(domain) for domain in status.domains],
         sorted((problem.subject, problem.text) for problem in status.problems),
+        replace(status.range_probe, age=0.0) if status.range_probe else None,
     )
     return hashlib.sha256(msgspec.json.encode(news)).hexdigest()[:16]
 

@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
 from typing import Any
 
+from msgspec.structs import replace
+
 from rosproxy.admin.admin_client import default_url
 from rosproxy.admin.admin_server import Action, AdminServer
 from rosproxy.admin.common_status import common_status
@@ -102,7 +104,7 @@ class App:
 
     def state(self) -> ProxyStatus:
         """The state."""
-        status = common_status(self.runtime)
+        status = replace(common_status(self.runtime), range_probe=self._check.result)
         for stack in self.stacks:
             status = stack.add_to(status)
         return status
@@ -148,7 +150,7 @@ async def _run_until_signal(settings: Settings, remarks: Mapping[str, str]) -> N
     _raise_file_limit()
     app = App(settings)
     for subject, text in remarks.items():
-        app.runtime.problems.add(subject, text)
+        app.runtime.problems.add(subject, text, holds=True)
     try:
         await app.start()
         await ending.wait()

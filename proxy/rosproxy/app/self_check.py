@@ -4,7 +4,8 @@ The advertised host is looked up before the proxy says that it is ready. Then, o
 start is over and the master answers, the range is tried from outside (`rosproxy.ros1.range_probe`;
 of ROS 2 by UDP, which can prove that all is well, and not that it is not). What is wrong is told in
 the log and in ``rosproxy status``, in the doctor's words, and tried again at times until it is
-mended. It keeps nothing from working: who can reach the proxy does.
+mended. It keeps nothing from working: who can reach the proxy does. How the last try ended is a
+field of the status of its own (``range_probe``).
 """
 
 import asyncio
@@ -12,10 +13,18 @@ import logging
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from msgspec.structs import replace
+
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, published_range
-from rosproxy.admin.status_document import PortsStatus, to_json
+from rosproxy.admin.setup_rules import (
+    HOST,
+    RANGE,
+    advertised_host,
+    probe_result,
+    published_range,
+)
+from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus, to_json
 from rosproxy.app.stacks import Stack
 from rosproxy.net.addresses import is_loopback, parse_authority
 from rosproxy.net.resolver import resolve
@@ -38,11 +47,22 @@ class SelfCheck:
         self._findings: dict[str, list[DoctorFinding]] = {}
         self._probing = asyncio.Lock()
         self._addresses: list[str] = []
+        self._result: RangeProbeStatus | None = None
+        self._tried_at = 0.0
+        self._unproven = asyncio.Event()
+        self._unproven.set()
 
     @property
     def findings(self) -> list[DoctorFinding]:
         """What is wrong, as far as is known."""
         return [finding for findings in self._findings.values() for finding in findings]
+
+    @property
+    def result(self) -> RangeProbeStatus | None:
+        """How the last try at the range ended; None if there was none."""
+        if self._result is None:
+            return None
+        return replace(self._result, age=round(self._runtime.now() - self._tried_at, 1))
 
     async def start(self) -> None:
         """Look at the advertised host, and try the range in a moment."""
@@ -62,10 +82,7 @@ class SelfCheck:
                 await self._try_range(or_fast=False)
             except OSError as error:  # a port that was free a moment ago
                 log.debug("the range could not be tried: %s", error)
-                await asyncio.sleep(RETRY_INTERVAL)
-                continue
-            if not any(self._findings.values()):
-                return
+            await self._unproven.wait()
             await asyncio.sleep(RETRY_INTERVAL)
             await self._look_at_host()
 
@@ -93,7 +110,11 @@ class SelfCheck:
         probed = RangeProbe(tuple(probe for of_stack in probes for probe in of_stack))
         settings = self._runtime.settings
         ports = PortsStatus(str(settings.ports.listen), str(settings.ports.advertise))
-        if self._addresses:  # else the host's name is reported, which leads nowhere
+        result = probe_result(probed)
+        # Where no port was free, what was found before holds. Where the host's name leads nowhere,
+        # that is reported.
+        if self._addresses and result is not None:
+            self._result, self._tried_at = result, self._runtime.now()
             self._note(RANGE, published_range(probed, settings.advertise_host, ports))
         return probed
 
@@ -102,12 +123,16 @@ class SelfCheck:
         wrong = [f for f in findings if f.severity >= Severity.WARNING]
         previous = self._findings.get(subject, [])
         self._findings[subject] = wrong
-        self._runtime.metrics.setup_faults.set(sum(map(len, self._findings.values())))
+        self._runtime.metrics.setup_faults.set(len(self.findings))
+        if self.findings or self._result is None or not self._result.reached:
+            self._unproven.set()
+        else:
+            self._unproven.clear()
         if wrong == previous:
             return
         self._runtime.problems.solved(subject)
         for finding in wrong:
-            self._runtime.problems.add(subject, f"{finding.text}: {finding.fix}")
+            self._runtime.problems.add(subject, f"{finding.text}: {finding.fix}", holds=True)
             level = logging.ERROR if finding.severity is Severity.ERROR else logging.WARNING
             log.log(level, "%s: %s; %s", subject, finding.text, finding.fix)
         if previous and not wrong:

@@ -83,7 +83,15 @@ def _ports(status: document.ProxyStatus) -> str:
     mapped = "" if advertise == listen else f", here {listen}"
     holders = "; ".join(map(clean, ports.held_by)) or "other programs"
     blocked = f", {ports.blocked} held by {holders}" if ports.blocked else ""
-    return f"{host}:{advertise}{mapped}: {ports.used} used, {ports.free} free{blocked}"
+    used = f"{ports.used} used, {ports.free} free{blocked}"
+    return f"{host}:{advertise}{mapped}: {used}{_reached(status.range_probe)}"
+
+
+def _reached(probe: document.RangeProbeStatus | None) -> str:
+    """Whether outside gets in, as far as that is known."""
+    if probe is None or probe.reached is None:
+        return ""
+    return ", reached from outside" if probe.reached else ", NOT reached from outside"
 
 
 def _policy(policy: document.PolicyStatus) -> str:

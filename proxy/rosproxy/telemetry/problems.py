@@ -20,26 +20,34 @@ LONGEST_SUBJECT, LONGEST_TEXT = 200, 500
 class NotedProblem(msgspec.Struct, frozen=True):
     """A problem: when (Unix time), with which node, port or option, and what.
 
-    ``port`` is the lease of the node concerned, if it is about one.
+    ``port`` is the lease of the node concerned, if it is about one. ``holds``: it is so until it is
+    solved, and not only when it was noted.
     """
 
     when: float
     subject: str
     text: str
     port: int | None = None
+    holds: bool = False
 
 
 class Problems:
-    """The most recent problems, newest last; the same one again replaces the older entry."""
+    """The most recent problems, newest last; the same one again replaces the older entry.
+
+    Those that hold stay, however many others there are.
+    """
 
     def __init__(self) -> None:
         self._problems: list[NotedProblem] = []
 
-    def add(self, subject: str, text: str, port: int | None = None) -> None:
-        """Note a problem."""
+    def add(self, subject: str, text: str, port: int | None = None, holds: bool = False) -> None:
+        """Note a problem; one that ``holds`` is to be `solved` by whoever notes it."""
         subject, text = brief(subject, LONGEST_SUBJECT), brief(text, LONGEST_TEXT)
         remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]
-        self._problems = [*remaining, NotedProblem(time.time(), subject, text, port)][-MOST:]
+        noted = [*remaining, NotedProblem(time.time(), subject, text, port, holds)]
+        if len(noted) > MOST:
+            noted.remove(next((p for p in noted if not p.holds), noted[0]))
+        self._problems = noted
 
     def solved(self, subject: str) -> None:
         """Forget what was noted about a subject."""

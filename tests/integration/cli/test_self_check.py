@@ -11,7 +11,9 @@ from examples.demo.fake_http import free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.proxy_process import clean_environment
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
+from rosproxy.admin.requests import PortProbe
 from rosproxy.ros1.range_probe import probe_range
+from tests.clock import pass_time
 from tests.integration.commands import run
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.doctor.test_doctor import examine
@@ -142,7 +144,35 @@ async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(sta
         problem for problem in await problems(process) if problem.startswith("published range: ")
     ]
     assert "docker run -p" in told
+    document = await status(process)
+    assert document["range_probe"]["reached"] is False
+    assert [p["holds"] for p in document["problems"] if p["subject"] == "published range"] == [True]
     assert process.text.count("published range: ") == 1
+
+
+async def test_the_range_is_tried_until_outside_gets_in(
+    make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A try that no port was free for says nothing: what was found before holds."""
+    dead, sound = PortProbe(1, "h:1", "refused", "missed"), PortProbe(1, "h:1", "ok", "ok")
+    scripted = iter([(dead,), (), (sound,), (dead,)])
+    tries: list[tuple[PortProbe, ...]] = []
+
+    async def probe(*_: Any) -> tuple[PortProbe, ...]:
+        tries.append(next(scripted))
+        return tries[-1]
+
+    monkeypatch.setattr("rosproxy.ros1.stack.probe_range", probe)
+    monkeypatch.setattr("rosproxy.app.self_check.RETRY_INTERVAL", 3.0)
+    proxy = await make_proxy()
+    assert proxy.app.state().range_probe is None
+    for count, reached in ((1, False), (2, False), (3, True)):
+        await pass_time(3.1)
+        state = proxy.app.state()
+        assert (len(tries), state.range_probe and state.range_probe.reached) == (count, reached)
+        assert ["published range"] * (not reached) == [p.subject for p in state.problems]
+    await pass_time(9)
+    assert len(tries) == 3, "outside gets in: nothing is tried any more"
 
 
 def findings(text: str) -> list[DoctorFinding]:

@@ -1,7 +1,10 @@
 """A node: containerd, kubelet and kube-proxy in a network namespace."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from tests.docker.engine import run, wait_until
 from tests.kubernetes.cluster import cgroups, mounts
@@ -138,8 +141,26 @@ def _write_configuration(node: Node) -> None:
     (node.directory / "containerd.toml").write_text(text)
     (node.directory / "kubelet.json").write_text(json.dumps(_kubelet_configuration(node), indent=1))
     (node.directory / "cni").mkdir(exist_ok=True)
-    network = json.dumps(_cni_configuration(node), indent=1)
-    (node.directory / "cni/rosproxy.conflist").write_text(network)
+    plug_in_pods(node, _cni_configuration(node))
+
+
+def plug_in_pods(node: Node, configuration: dict[str, Any]) -> None:
+    """Say how new pods of a node are plugged in; containerd heeds it at once."""
+    path = node.directory / "cni/rosproxy.conflist"
+    new = path.with_suffix(".new")  # a name that containerd does not read
+    new.write_text(json.dumps(configuration, indent=1))
+    new.rename(path)
+
+
+@contextmanager
+def without_host_ports(node: Node) -> Iterator[None]:
+    """Meanwhile no hostPort of a new pod is mapped, as where a network plug-in knows none."""
+    whole = _cni_configuration(node)
+    plug_in_pods(node, {**whole, "plugins": whole["plugins"][:1]})
+    try:
+        yield
+    finally:
+        plug_in_pods(node, whole)
 
 
 def _kubelet_configuration(node: Node) -> dict[str, object]:
@@ -168,7 +189,7 @@ def _kubelet_configuration(node: Node) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _cni_configuration(node: Node) -> dict[str, object]:
+def _cni_configuration(node: Node) -> dict[str, Any]:
     """How pods are plugged in: `ptp`, as Services that lead back to a node fail with `bridge`."""
     ipam = {
         "type": "host-local",

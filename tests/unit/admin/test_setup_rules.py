@@ -4,7 +4,7 @@ import pytest
 
 from rosproxy.admin.doctor_finding import Severity
 from rosproxy.admin.requests import PortProbe, RangeProbe
-from rosproxy.admin.setup_rules import advertised_host, few_ports, published_range
+from rosproxy.admin.setup_rules import advertised_host, few_ports, probe_result, published_range
 from rosproxy.admin.status_document import PortsStatus
 
 
@@ -37,6 +37,35 @@ def test_udp_that_does_not_come_back_proves_little() -> None:
         (finding,) = published_range(probe, "host", ports)
         assert finding.severity is severity
     assert "12400-12431:11400-11431/udp" in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("trials", "reached", "from_proxy"),
+    [
+        ([("refused", "ok", "tcp")], True, "refused"),
+        ([("ok", "missed", "tcp")], False, "ok"),
+        ([("ok", "unknown", "tcp")], True, "ok"),
+        ([("silent", "unknown", "tcp")], None, "silent"),
+        ([("stranger", "unknown", "tcp")], False, "stranger"),
+        ([("silent", "unknown", "udp")], None, "silent"),
+        ([("ok", "unknown", "udp")], True, "ok"),
+        ([("ok", "ok", "tcp"), ("refused", "missed", "tcp")], False, "refused"),
+        ([("ok", "ok", "tcp"), ("silent", "unknown", "udp")], None, "silent"),
+        ([("silent", "unknown", "udp"), ("refused", "missed", "tcp")], False, "refused"),
+    ],
+)
+def test_tries_prove_what_their_findings_say(trials, reached, from_proxy) -> None:
+    probe = RangeProbe(tuple(PortProbe(1, "host:1", p, m, t) for p, m, t in trials))
+    result = probe_result(probe)
+    assert result is not None
+    assert (result.reached, result.from_proxy) == (reached, from_proxy)
+    worst = max(f.severity for f in published_range(probe, "host", PortsStatus("1-9", "1-9")))
+    assert (worst is Severity.OK) == (reached is True)
+    assert (worst is Severity.ERROR) == (reached is False)
+
+
+def test_no_try_proves_nothing() -> None:
+    assert probe_result(RangeProbe()) is None
 
 
 def test_another_proxy_on_the_range_is_named() -> None:

@@ -19,6 +19,7 @@ STATUS: dict[str, Any] = {
     "master": {"up": True, "since": 2.0},
     "nodes": [NODE],
     "domains": [{"domain": 7, "inside": [MEMBER]}],
+    "range_probe": {"reached": True, "age": 3.0},
     "problems": [{"age": 1.0, "subject": "master", "text": "refused"}],
 }
 
@@ -35,6 +36,7 @@ def version(**more: Any) -> str:
         {"nodes": [{**NODE, "connections": [{"name": "/chatter"}], "state": "live"}]},
         {"domains": [{"domain": 7, "inside": [{**MEMBER, "leases": [{"port": 11401}]}]}]},
         {"problems": [{"age": 9.0, "subject": "master", "text": "refused"}]},
+        {"range_probe": {"reached": True, "age": 300.0}},
     ],
 )
 def test_what_only_passes_is_no_news(change: dict[str, Any]) -> None:
@@ -55,6 +57,9 @@ def test_what_only_passes_is_no_news(change: dict[str, Any]) -> None:
         {"domains": []},
         {"domains": [{"domain": 7, "inside": [{**MEMBER, "leases": []}]}]},
         {"problems": []},
+        {"range_probe": {"reached": False}},
+        {"range_probe": {"reached": True, "from_proxy": "refused"}},
+        {"range_probe": None},
     ],
 )
 def test_who_and_what_is_news(change: dict[str, Any]) -> None:

@@ -42,6 +42,15 @@ def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
     assert lines[4] == "outside  ROS_MASTER_URI=http://robot-host:11411"
 
 
+@pytest.mark.parametrize(
+    ("reached", "end"),
+    [(True, "reached from outside"), (False, "NOT reached from outside"), (None, "100 free")],
+)
+def test_head_tells_whether_outside_gets_in(reached, end) -> None:
+    status = {**make_status(), "range_probe": {"reached": reached}}
+    assert shown(status, 120).split("\n")[2].endswith(f", {end}")
+
+
 def test_head_names_stand_ins() -> None:
     status = make_status()
     status["stand_ins"] = []

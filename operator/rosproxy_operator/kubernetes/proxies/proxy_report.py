@@ -1,5 +1,7 @@
 """The part of a proxy's status that matters to the operator."""
 
+from msgspec.structs import replace
+
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
@@ -11,7 +13,7 @@ from rosproxy_operator.common.proxy_status import (
 from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 
 RECENT = 300.0
-"""Seconds for which a problem counts: a proxy lists the last ones, however old they are."""
+"""Seconds for which a problem counts that the proxy does not take back: it lists the last ones."""
 _LONGEST = 300
 """Characters kept of a problem or an error, which may be of any size in the status."""
 
@@ -42,7 +44,10 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         },
         topics=frozenset(topics),
         refusal=refusal,
-        problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if p.age <= RECENT),
+        problems=tuple(
+            short(f"{p.subject}: {p.text}") for p in status.problems if p.holds or p.age <= RECENT
+        ),
+        range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
     )
 
 

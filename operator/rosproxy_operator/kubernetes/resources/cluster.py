@@ -5,6 +5,7 @@ from enum import Enum
 
 import msgspec
 
+from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
@@ -112,6 +113,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     warns of; ``error`` is why its master is not reached, or why the proxy itself does not answer;
     ``refusal`` why it does not take its policy. ``participants`` are the GUID prefixes of those of
     ROS 2, ``leases`` their ports. One without ROS 1 has no master, which counts as reached.
+    ``range_probe`` is, without its age, whether outside reaches its ports; None: not tried yet.
     """
 
     answered: bool
@@ -123,6 +125,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     refusal: str = ""
     participants: Mapping[str, tuple[str, ...]] = {}
     leases: Mapping[str, tuple[int, ...]] = {}
+    range_probe: RangeProbeStatus | None = None
 
     @property
     def addresses(self) -> frozenset[str]:

@@ -9,6 +9,7 @@ from rosproxy_operator.kubernetes.resources.names import INJECT
 
 _WRONG = {
     "MasterReachable": "False",
+    "PortsReachable": "False",
     "PortsAllocated": "False",
     "Ready": "False",
     "Degraded": "True",

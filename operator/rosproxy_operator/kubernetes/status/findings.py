@@ -5,12 +5,14 @@ The texts stay the same as long as the trouble does: an Event is made of each ne
 
 from collections.abc import Iterable, Iterator, Mapping
 
+from rosproxy.admin.setup_rules import RANGE
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.cluster import (
     EarPod,
     PodFailure,
     ProxyPod,
+    ProxyReport,
     RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import (
@@ -22,6 +24,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, KIND
+from rosproxy_operator.kubernetes.status.range_texts import no_way_in
 
 NOT_ADMITTED = "ProxyNotAdmitted"
 CONFLICT = "PortConflict"
@@ -29,6 +32,7 @@ EXHAUSTED = "PortsExhausted"
 STUCK = "ProxyStuck"
 SILENT = "ProxyUnreachable"
 NO_MASTER = "MasterUnreachable"
+NO_WAY_IN = "PortsUnreachable"
 WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _LONGEST = 600
@@ -84,7 +88,8 @@ def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> Cluste
     return finding(rosproxy, reason, bounded(text, _LONGEST), fatal=True, subject=subject)
 
 
-def _subject(proxy: ProxyPod) -> str:
+def proxy_subject(proxy: ProxyPod) -> str:
+    """How a finding names a proxy."""
     return f"proxy {proxy.pod.id.name} on node {proxy.node}"
 
 
@@ -103,7 +108,7 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
         PodFailure.SANDBOX: f"the node can't start it ({error}): {command}",
     }
     reason = CONFLICT if cause is PodFailure.PORTS else STUCK
-    return _finding(rosproxy, _subject(proxy), texts[cause], reason)
+    return _finding(rosproxy, proxy_subject(proxy), texts[cause], reason)
 
 
 def _deaf(rosproxy: RosProxy, ear: EarPod) -> ClusterFinding:
@@ -120,7 +125,7 @@ def _answered(
     rosproxy: RosProxy, state: RosProxyOnNode, proxy: ProxyPod
 ) -> Iterator[ClusterFinding]:
     """What follows from a proxy's answer. One that is not asked yet is not to blame."""
-    answer, subject = state.answer, _subject(proxy)
+    answer, subject = state.answer, proxy_subject(proxy)
     if answer is None:
         return
     if not answer.answered:
@@ -137,10 +142,21 @@ def _answered(
     if not answer.master_up:
         text = f"it does not reach the master ({answer.error}): {_master_remedy(rosproxy)}"
         yield _finding(rosproxy, subject, text, NO_MASTER)
-    for problem in answer.problems:
-        # While the master is away, the proxy's own problem about it says the same as NO_MASTER.
-        if answer.master_up or not problem.startswith("master: "):
-            yield ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
+    probe = answer.range_probe
+    if probe is not None and probe.reached is False:
+        yield _finding(rosproxy, subject, no_way_in(state, probe), NO_WAY_IN)
+    for problem in _own_problems(answer):
+        yield ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
+
+
+def _own_problems(answer: ProxyReport) -> list[str]:
+    """The problems that a proxy tells, but those of its master and its range.
+
+    They would say the same again, and with the cures of Docker.
+    """
+    told = ["master: "] if not answer.master_up else []
+    told += [f"{RANGE}: "] if answer.range_probe else []
+    return [problem for problem in answer.problems if not problem.startswith(tuple(told))]
 
 
 def _master_remedy(rosproxy: RosProxy) -> str:

@@ -26,10 +26,14 @@ from rosproxy_operator.kubernetes.status.findings import (
     CONFLICT,
     EXHAUSTED,
     NO_MASTER,
+    NO_WAY_IN,
     node_findings,
+    proxy_subject,
 )
+from rosproxy_operator.kubernetes.status.range_texts import not_proven
 
 READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
+WAY_IN = "PortsReachable"
 LONGEST = 1024
 """Characters of a message."""
 MOST_NODES = 200
@@ -87,6 +91,7 @@ def status_of(
         _ready(rosproxy, wanted, problems, " and ".join(served)),
         _allocated(wanted, problems),
         *([_reached(states, problems, former)] if spec.ros1 else []),
+        _way_in(states, problems, former),
         _degraded(problems),
     )
     return {
@@ -309,8 +314,34 @@ def _reached(
         return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
     if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
-    previous = (c for c in submaps(former, "conditions") if c.get("type") == MASTER)
-    unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has answered yet")
+    return _previous(MASTER, former)
+
+
+def _way_in(
+    states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
+) -> Condition:
+    """Whether outside reaches the ports. Proxies that are not asked yet say nothing, as above."""
+    proxies = [(s, s.proxy, s.answer) for s in states if s.proxy is not None]
+    probes = [(s, p, a.range_probe) for s, p, a in proxies if a is not None and a.answered]
+    if any(probe is not None and probe.reached is False for _, _, probe in probes):
+        lines = [_one_line(p) for p in problems if p.reason == NO_WAY_IN]
+        return Condition(WAY_IN, "False", NO_WAY_IN, "; ".join(lines) or "not those of each proxy")
+    if not proxies:
+        return Condition(WAY_IN, "Unknown", "NoProxies", "there is no proxy that could tell")
+    if len(probes) < len(proxies):
+        return _previous(WAY_IN, former)
+    open_questions = [(s, p, probe) for s, p, probe in probes if probe is None or not probe.reached]
+    if not open_questions:
+        return Condition(WAY_IN, "True", "Reached", "outside reaches the ports of every proxy")
+    lines = [f"{proxy_subject(p)}: {not_proven(s, probe)}" for s, p, probe in open_questions]
+    reason = "NotTried" if any(probe is None for _, _, probe in open_questions) else "NotProven"
+    return Condition(WAY_IN, "Unknown", reason, "; ".join(lines))
+
+
+def _previous(condition: str, former: Json) -> Condition:
+    """The condition as it was, where not every proxy that is there has been asked."""
+    previous = (c for c in submaps(former, "conditions") if c.get("type") == condition)
+    unknown = Condition(condition, "Unknown", "NotAsked", "no proxy has answered yet")
     return next(map(_read, previous), unknown)
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.cluster import (
     PodFailure,
@@ -32,6 +33,7 @@ URI = f"http://{CLUSTER_IP}:11311"
 RANGE = PortRange(11400, 11431)
 INJECT = {"rosproxy.io/inject": "true"}
 STAMP = "2026-11-21T14:00:00Z"
+REACHED = RangeProbeStatus(True, "ok", "ok", "tcp")
 LATER = "2026-11-21T15:00:00Z"
 
 
@@ -144,9 +146,10 @@ def stuck_proxy(why: PodFailure, message: str = "because") -> ProxyPod:
 
 
 def answer(*names: str, **more: Any) -> ProxyReport:
-    """The answer of a proxy whose master is up, with ROS nodes in one pod."""
+    """The answer of a proxy that master and outside reach, with ROS nodes in one pod."""
     nodes = {"10.244.1.5": names} if names else {}
-    return ProxyReport(**{"answered": True, "master_up": True, "nodes": nodes, **more})
+    given = {"answered": True, "master_up": True, "nodes": nodes, "range_probe": REACHED}
+    return ProxyReport(**{**given, **more})
 
 
 def state(node: str = "node1", **more: Any) -> RosProxyOnNode:

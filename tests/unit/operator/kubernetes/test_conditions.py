@@ -3,12 +3,15 @@
 import pytest
 from msgspec.structs import replace
 
+from rosproxy.admin.status_document import RangeProbeStatus
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer
 from rosproxy_operator.kubernetes.resources.cluster import Obstacle, PodFailure, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, MasterSpec, Name, Reference
 from rosproxy_operator.kubernetes.status.findings import findings
 from tests.unit.operator.kubernetes.builders_api import (
     answer,
+    condition,
     judged,
     message,
     proxy,
@@ -115,6 +118,65 @@ def test_a_proxy_that_does_not_answer_the_controller():
     assert judged(rosproxy_status, "Ready") == ("False", "ProxyUnreachable")
     assert "(timed out): let the operator's pod connect to port 11312" in message(rosproxy_status)
     assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NotAsked")
+
+
+@pytest.mark.parametrize(
+    ("from_proxy", "from_master", "cause", "cure"),
+    [
+        ("refused", "missed", "nothing listens there", "hostPorts (CNI: the plug-in portmap)"),
+        ("silent", "missed", "there is no answer", "the node's firewall"),
+        ("ok", "missed", "the master's machine does not", "as the master's machine knows the node"),
+        ("stranger", "unknown", "something else answers there", "spec.portWindow"),
+        ("of a later release", "missed", "the try failed", "portmap"),
+    ],
+)
+def test_ports_that_outside_does_not_reach(from_proxy, from_master, cause, cure):
+    probe = RangeProbeStatus(False, from_proxy, from_master, "tcp")
+    said = ("published range: 192.0.2.11, port 11400: docker run -p", "/a: hangs")
+    dead = answer("/a", range_probe=probe, problems=said)
+    rosproxy_status = status(state("node2"), state(answer=dead))
+
+    assert judged(rosproxy_status, "PortsReachable") == ("False", "PortsUnreachable")
+    text = message(rosproxy_status, "PortsReachable")
+    proxy_name = f"proxy {proxy().pod.id.name} on node node1"
+    assert text.startswith(
+        f"{proxy_name}: outside does not reach ports 11400-11431 of 192.0.2.11 ("
+    )
+    assert cause in text
+    assert cure in text
+    assert judged(rosproxy_status, "Ready") == ("True", "Serving")
+    assert judged(rosproxy_status, "Degraded") == ("True", "PortsUnreachable")
+    assert "docker" not in message(rosproxy_status, "Degraded")
+    assert "/a: hangs" in message(rosproxy_status, "Degraded")
+    assert rosproxy_status["perNode"][0]["message"] == bounded(text, 300)
+    (finding,) = (f for f in findings(rosproxy(), [state(answer=dead)], {}) if f.about)
+    assert finding.about == Reference("RosProxy", rosproxy().id, "uid-arm")
+
+
+@pytest.mark.parametrize(
+    ("probe", "reason", "said"),
+    [
+        (None, "NotTried", "it has not tried ports 11400-11431 of 192.0.2.11 yet"),
+        (RangeProbeStatus(None, "silent", "unknown", "tcp"), "NotProven", "11 itself, where"),
+        (RangeProbeStatus(None, "silent", "unknown", "udp"), "NotProven", "by UDP itself"),
+    ],
+)
+def test_it_is_not_known_whether_outside_reaches_the_ports(probe, reason, said):
+    rosproxy_status = status(state("node2"), state(answer=answer("/a", range_probe=probe)))
+
+    assert judged(rosproxy_status, "PortsReachable") == ("Unknown", reason)
+    assert said in message(rosproxy_status, "PortsReachable")
+    assert judged(rosproxy_status, "Degraded") == ("False", "AsExpected")
+
+
+def test_ports_of_a_proxy_that_does_not_answer_are_as_they_were():
+    dead = RangeProbeStatus(False, "refused", "missed", "tcp")
+    first = status(state("node2"), state(answer=answer("/a", range_probe=dead)))
+    silent = [state("node2"), state(answer=no_answer("timed out"))]
+
+    assert judged(status(*silent), "PortsReachable") == ("Unknown", "NotAsked")
+    second = status(*silent, of=rosproxy(status=first))
+    assert condition(second, "PortsReachable") == condition(first, "PortsReachable")
 
 
 def test_a_proxy_that_does_not_take_its_policy():

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.status_document import read_status
+from rosproxy.admin.status_document import RangeProbeStatus, read_status
 from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.resources.checks import host_problem
 from rosproxy_operator.kubernetes.resources.model import VALUE_AT_RUNTIME, Name
@@ -275,7 +275,9 @@ STATUS = {
     "problems": [
         {"age": 3.0, "subject": "/talker", "text": "does not answer"},
         {"age": RECENT + 1, "subject": "/old", "text": "long ago"},
+        {"age": RECENT + 1, "subject": "published range", "text": "dead", "holds": True},
     ],
+    "range_probe": {"reached": False, "from_proxy": "refused", "from_master": "missed", "age": 9.0},
 }
 
 
@@ -285,7 +287,9 @@ def test_what_a_proxy_answers():
     assert (proxy_report.answered, proxy_report.master_up, proxy_report.error) == (True, True, "")
     assert proxy_report.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
     assert proxy_report.topics == {"/chatter", "/rosout"}
-    assert proxy_report.problems == ("/talker: does not answer",)
+    assert proxy_report.problems == ("/talker: does not answer", "published range: dead")
+    assert proxy_report.range_probe == RangeProbeStatus(False, "refused", "missed")
+    assert report(read_status({})).range_probe is None
 
 
 def test_a_proxy_without_its_master():

@@ -391,7 +391,7 @@ def test_what_users_are_told():
     assert "master" not in rosproxy_status
     assert rosproxy_status["perNode"][0]["participants"] == 2
     kinds = [condition["type"] for condition in rosproxy_status["conditions"]]
-    assert kinds == ["Ready", "PortsAllocated", "Degraded"]
+    assert kinds == ["Ready", "PortsAllocated", "PortsReachable", "Degraded"]
     assert "2 participants of domain 7" in rosproxy_status["conditions"][0]["message"]
     assert participants(seen) == {7: 2}
     again = read({**rosproxy_obj(), "status": rosproxy_status})

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from rosproxy.admin.status_document import RangeProbeStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.cluster import (
     Obstacle,
@@ -56,6 +57,7 @@ def test_all_is_well():
         ("Ready", "True", "Serving"),
         ("PortsAllocated", "True", "Allocated"),
         ("MasterReachable", "True", "Reached"),
+        ("PortsReachable", "True", "Reached"),
         ("Degraded", "False", "AsExpected"),
     ]
     assert message(rosproxy_status) == "2 of 2 proxies serve 3 ROS nodes"
@@ -116,6 +118,7 @@ def test_no_pod_is_selected():
     assert message(rosproxy_status) == "no pod is selected: label pods with rosproxy.io/inject=true"
     assert judged(rosproxy_status, "PortsAllocated") == ("True", "NoPods")
     assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NoProxies")
+    assert judged(rosproxy_status, "PortsReachable") == ("Unknown", "NoProxies")
     assert (rosproxy_status["nodes"], rosproxy_status["proxies"], rosproxy_status["ports"]) == (
         0,
         "0/0",
@@ -242,6 +245,12 @@ _answers = st.none() | st.builds(
     st.just("refused"),
     st.dictionaries(st.just("10.0.0.1"), st.lists(st.text(), max_size=3).map(tuple)),
     problems=st.lists(st.text(max_size=9), max_size=2).map(tuple),
+    range_probe=st.none()
+    | st.builds(
+        RangeProbeStatus,
+        st.none() | st.booleans(),
+        st.sampled_from(["ok", "refused", "never heard of"]),
+    ),
 )
 _proxies = st.none() | st.builds(
     lambda ready, why, gone: proxy(ready=ready, stuck=why, pod={"deleting": gone}),
@@ -274,6 +283,7 @@ def test_every_status_is_one_that_the_api_server_takes(states):
         "Ready",
         "PortsAllocated",
         "MasterReachable",
+        "PortsReachable",
         "Degraded",
     ]
     for status_condition in rosproxy_status["conditions"]:
