@@ -71,6 +71,18 @@ def test_labels_that_do_not_wire(labels: dict[str, str], shared: Namespace, uri:
     assert warnings == ""
 
 
+def test_a_misspelt_label_is_told_on_the_pod(net: Namespace) -> None:
+    made = rosproxy(net.name, master=NOWHERE)
+    pod = net.idle(labels={"rosproxy.io/injekt": "true"})
+    wait_event(
+        net.name, pod.name, "Pod", "UnknownName", "did you mean the label rosproxy.io/inject"
+    )
+    condition = made.wait_for("Degraded", reason="UnknownName")
+    assert f"pod {net.name}/{pod.name}: has the label rosproxy.io/injekt" in condition["message"]
+    pod.remove()
+    made.wait_for("Degraded", "False")
+
+
 def test_unknown_rosproxy_is_warned_of(shared: Namespace, uri: str) -> None:
     made, warnings = api.dry_run(shared.pod_body("pod", "true", labels={INJECT: "elsewhere"}))
     assert variables(made) == {}

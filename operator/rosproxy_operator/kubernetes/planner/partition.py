@@ -84,6 +84,7 @@ def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> Clust
         pods=tuple(
             p for p in observed.pods if p.id.namespace in namespaces or p.node in partition.nodes
         ),
+        misspelt_pods=tuple(p for p in observed.misspelt_pods if p.id.namespace in namespaces),
         proxies=tuple(p for p in observed.proxies if p.of.namespace in namespaces),
         ears=tuple(ear for ear in observed.ears if ear.of.namespace in namespaces),
         services={id: s for id, s in observed.services.items() if id.namespace in namespaces},

@@ -23,6 +23,7 @@ from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.cluster_view import view
 from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
+from rosproxy_operator.kubernetes.planner.misspellings import misspellings
 from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
@@ -199,6 +200,7 @@ def _problems(
         ),
         *(f for pod in pods for f in ros2_findings(pod, rosproxy, address)),
         *ear_findings(context, rosproxy),
+        *misspellings(context.view, rosproxy),
     )
 
 

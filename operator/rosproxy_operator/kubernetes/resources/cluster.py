@@ -85,7 +85,7 @@ class MasterService(msgspec.Struct, frozen=True):
     """Any other Service, which may be that of a master.
 
     ``address`` is its cluster IP as it stands there, ``type`` its type; ``allowed`` are the
-    namespaces whose RosProxies may name it, besides its own.
+    namespaces whose RosProxies may name it, besides its own; ``misspelt`` is as that of a pod.
     """
 
     id: Name
@@ -93,6 +93,7 @@ class MasterService(msgspec.Struct, frozen=True):
     type: str = ""
     ports: frozenset[int] = frozenset()
     allowed: frozenset[str] = frozenset()
+    misspelt: tuple[str, ...] = ()
 
 
 class ProxyPolicy(msgspec.Struct, frozen=True):
@@ -169,7 +170,9 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     all others of the namespaces that have such, and any that take ports there. ``masters`` gives,
     for each Service that a RosProxy names as its master, its address and what is wrong; one of them
     is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it, besides
-    its own. ``selected`` are the uids of the pods that a RosProxy selects. ``policies`` are the
+    its own. ``selected`` are the uids of the pods that a RosProxy selects; ``misspelt_pods`` are
+    those of the RosProxies' namespaces that have a misspelt label or annotation,
+    ``misspelt_services`` says what is wrong with those of ``masters``. ``policies`` are the
     operator's own NetworkPolicies by their names; ``policies_error`` is why they can't be listed.
     ``key`` is that from which the proxies' tokens are made. ``unusable`` are the RosProxies that
     can't be read at all: what they have is left as it is. ``reports`` are what the proxies say of
@@ -186,6 +189,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     masters: Mapping[Name, tuple[str, str]] = {}
     consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()
+    misspelt_pods: tuple[Pod, ...] = ()
+    misspelt_services: Mapping[Name, tuple[str, ...]] = {}
     policies: Mapping[Name, ProxyPolicy] = {}
     policies_error: str = ""
     key: bytes = b""

@@ -135,7 +135,8 @@ class RosProxy(msgspec.Struct, frozen=True):
 
     ``former_ranges`` are the ranges by node name that its status holds; ``cluster_ip`` is the
     address that its Service has, or had; ``status`` is its status as it is now. ``remakes``:
-    whether pods that came by unwired are to be made anew.
+    whether pods that came by unwired are to be made anew. ``misspelt``: what is wrong with the
+    names of its annotations and labels, as for nodes and pods (`misspelt_names`).
     """
 
     id: Name
@@ -147,6 +148,7 @@ class RosProxy(msgspec.Struct, frozen=True):
     status: Json = {}
     deleting: bool = False
     remakes: bool = False
+    misspelt: tuple[str, ...] = ()
 
 
 class ClusterNode(msgspec.Struct, frozen=True):
@@ -163,6 +165,7 @@ class ClusterNode(msgspec.Struct, frozen=True):
     pod_networks: tuple[str, ...] = ()
     ready: bool = True
     deleting: bool = False
+    misspelt: tuple[str, ...] = ()
 
 
 VALUE_AT_RUNTIME = "$()"
@@ -203,6 +206,7 @@ class Pod(msgspec.Struct, frozen=True):
     static_peers: str = ""
     containers: tuple[PodContainer, ...] = ()
     controller: str = ""
+    misspelt: tuple[str, ...] = ()
 
     @property
     def every_port(self) -> frozenset[int]:

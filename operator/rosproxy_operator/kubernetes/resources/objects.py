@@ -23,6 +23,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ProxyPolicy,
     ProxyService,
 )
+from rosproxy_operator.kubernetes.resources.misspelt_names import misspelt_names
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,
     ClusterNode,
@@ -61,6 +62,7 @@ def node(obj: Json) -> ClusterNode:
         pod_networks=tuple(network for network in networks if network and isinstance(network, str)),
         ready=_is_ready(status),
         deleting=is_deleted(meta),
+        misspelt=misspelt_names(meta, "nodes"),
     )
 
 
@@ -85,6 +87,7 @@ def pod(obj: Json) -> Pod:
         containers=tuple(map(_container, submaps(spec, "containers"))),
         ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),
         controller=_controller(meta),
+        misspelt=misspelt_names(meta, "pods"),
     )
 
 
@@ -166,6 +169,7 @@ def master_service(obj: Json) -> MasterService:
         type=text_at(spec, "type"),
         ports=frozenset(int_at(port, "port") for port in ports),
         allowed=allowed_from(obj),
+        misspelt=misspelt_names(submap(obj, "metadata"), "Services of masters"),
     )
 
 

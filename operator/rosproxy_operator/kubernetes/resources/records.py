@@ -93,4 +93,5 @@ def _shared(pod: Pod) -> Pod:
         # One address is most often all.
         ips=(pod.ip,) if pod.ips == (pod.ip,) else pod.ips,
         containers=tuple(replace(c, image=intern(c.image)) for c in pod.containers),
+        misspelt=tuple(map(intern, pod.misspelt)),
     )

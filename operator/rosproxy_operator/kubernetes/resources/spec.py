@@ -29,6 +29,7 @@ from rosproxy_operator.kubernetes.resources.checks import (
     texts_at,
 )
 from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, stripped
+from rosproxy_operator.kubernetes.resources.misspelt_names import misspelt_names
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
@@ -115,6 +116,7 @@ def rosproxy(obj: Json) -> RosProxy:
         status=status,
         deleting=is_deleted(meta),
         remakes=texts_at(meta, "annotations").get(REMAKE) == "true",
+        misspelt=misspelt_names(meta, "RosProxies"),
     )
 
 

@@ -150,6 +150,7 @@ class ClusterStore:
             services={s.of: s for s in services if self._is_looked_after(s.of.namespace)},
             masters={id: read_master(s, id, ports) for id, (s, ports) in masters.items()},
             consents={id: s.allowed if s else frozenset() for id, (s, _) in masters.items()},
+            misspelt_services={id: s.misspelt for id, (s, _) in masters.items() if s},
             policies={policy.id: policy for policy in self._records_of(POLICIES, ProxyPolicy)},
             policies_error=next((str(error) for error in self._errors_of(POLICIES)), ""),
             key=key,
@@ -175,6 +176,7 @@ class ClusterStore:
             proxies=tuple(proxies),
             ears=tuple(ears),
             selected=frozenset(pod.uid for pod in selected if not pod.ended),
+            misspelt_pods=tuple(pod for pod in candidates if pod.misspelt),
         )
 
     def _masters(
@@ -266,11 +268,12 @@ class ClusterStore:
         self._wake()
 
     def _touch_pod(self, pod: Pod) -> None:
-        """A pod of others matters if a RosProxy selects it, or if it takes ports."""
+        """A pod of others matters if a RosProxy selects it or is meant to, or if it takes ports."""
         selected = self._is_selected(pod)
-        if selected:
+        misspelt = bool(pod.misspelt) and pod.id.namespace in self._rosproxies
+        if selected or misspelt:
             self._touched.namespaces.add(pod.id.namespace)
-        if selected or pod.every_port:
+        if selected or misspelt or pod.every_port:
             self._touched.nodes.add(pod.node)
             self._wake()
 
@@ -285,7 +288,8 @@ class ClusterStore:
 def _requested(record: Record | None) -> object:
     """What a RosProxy asks for, without its status."""
     if isinstance(record, RosProxy):
-        return record.uid, record.generation, record.deleting, record.spec, record.remakes
+        asked = record.uid, record.generation, record.deleting, record.spec, record.remakes
+        return *asked, record.misspelt
     if isinstance(record, InvalidRosProxy):
         return record.uid, record.generation, record.text
     return None

@@ -51,7 +51,8 @@ CHANGES: tuple[dict[str, Any], ...] = (
     {"ros": "1,2", "multicast": True},
     {"ros": 1},
 )
-LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"})
+LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"},
+          {"rosproxy.io/injekt": "true"})  # fmt: skip
 T = TypeVar("T")
 
 

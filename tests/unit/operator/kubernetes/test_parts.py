@@ -51,6 +51,7 @@ class Together:
             rosproxies=first.rosproxies + second.rosproxies,
             nodes={**second.nodes, **first.nodes},
             pods=first.pods + second.pods,
+            misspelt_pods=first.misspelt_pods + second.misspelt_pods,
             proxies=first.proxies + second.proxies,
             ears=first.ears + second.ears,
             services={**first.services, **second.services},

@@ -90,7 +90,11 @@ class World:
         selected = (
             pod for pod in snapshot.pods if any(selects(of, pod) for of in snapshot.rosproxies)
         )
-        return replace(snapshot, selected=frozenset(pod.uid for pod in selected))
+        return replace(
+            snapshot,
+            selected=frozenset(pod.uid for pod in selected),
+            misspelt_pods=tuple(pod for pod in snapshot.pods if pod.misspelt),
+        )
 
     def in_status(self, place: ProxyPlace) -> PortRange | None:
         rosproxy = self.cluster.state.rosproxies.get(place.of)

@@ -1,12 +1,11 @@
 """From the labels of containers to what they want of a proxy."""
 
-import difflib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.spelling import NEAR, VERY_NEAR, nearest
 from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
 from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
 from rosproxy_operator.docker.planner.labels.readers import (
@@ -23,8 +22,6 @@ from rosproxy_operator.docker.settings import PlanSettings
 _PREFIX = "rosproxy"
 # One that has exited may come back: for the grace its proxy stays on its networks (see `desire`).
 _COUNTED = ALIVE | {"exited"}
-_LONGEST = 2 * max(map(len, LABELS))
-"""Characters of a name that may be a misspelt label; the ratio of a longer one is below 0.67."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +201,7 @@ def _own(container: Container) -> list[str]:
         # Without the prefix only a name that is very near counts, as it may be another program's.
         # io.rosproxy.domain, the operator's own, is 0.91 near to rosproxy.domain.
         if name.lower().startswith(f"{_PREFIX}.")
-        or (_near(name, 0.9) and not name.startswith(f"io.{_PREFIX}."))
+        or (nearest(name, LABELS, VERY_NEAR) and not name.startswith(f"io.{_PREFIX}."))
     )
 
 
@@ -226,23 +223,12 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
         return
     for name in own:
         if name not in LABELS:
-            near = _near(name, 0.75)
+            near = nearest(name, LABELS, NEAR)
             fix = f"did you mean {near}?" if near else f"there are {', '.join(LABELS)}"
             yield f"label {name} is unknown and ignored; {fix}"
-    misspelt = any(_near(name, 0.75) == ENABLE for name in own)  # warned of above
+    misspelt = any(nearest(name, LABELS, NEAR) == ENABLE for name in own)  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
         yield f"{listed(f'label {name}' for name in own)} ignored: add the label {ENABLE}=true"
-
-
-def _near(name: str, cutoff: float) -> str:
-    """The label that is spelt much like a name; empty if none is."""
-    return _nearest(name.lower(), cutoff) if len(name) <= _LONGEST else ""
-
-
-@lru_cache(maxsize=1024)
-def _nearest(name: str, cutoff: float) -> str:
-    """The same, cached: hundreds of containers have the same few names."""
-    return next(iter(difflib.get_close_matches(name, LABELS, n=1, cutoff=cutoff)), "")
 
 
 def _advertised(request: Member, observed: HostState) -> str:

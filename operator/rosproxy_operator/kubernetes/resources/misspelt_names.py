@@ -1,0 +1,79 @@
+"""Labels and annotations that are meant for the operator, and that it does not know.
+
+A pod whose label is misspelt is nobody's: no webhook sees it and no RosProxy selects it, and so
+nobody says anything. What is wrong is told with the name that was meant.
+"""
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from rosproxy.telemetry.text import clean, shorten
+from rosproxy_operator.common.spelling import VERY_NEAR, nearest
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.checks import texts_at
+from rosproxy_operator.kubernetes.resources.model import Json
+
+Kind = Literal["pods", "nodes", "Services of masters", "RosProxies"]
+
+
+class _Named(NamedTuple):
+    """A name that users set: a label or an annotation, and of what."""
+
+    name: str
+    place: str
+    kind: Kind
+
+    def __str__(self) -> str:
+        return f"{_ARTICLE[self.place]} {self.name} of {self.kind}"
+
+
+_USERS = (
+    _Named(names.INJECT, "label", "pods"),
+    _Named(names.ADVERTISE_HOST, "annotation", "nodes"),
+    _Named(names.ALLOW_FROM, "annotation", "Services of masters"),
+    _Named(names.REMAKE, "annotation", "RosProxies"),
+)
+_BY_NAME = {named.name: named for named in _USERS}
+_BY_END = {named.name.partition("/")[2]: named for named in _USERS}
+_NEAR_END = 0.6
+_OPERATORS = frozenset(
+    {
+        *(names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT),
+        *(names.MASTER_URI, names.STATIC_PEERS),
+    }
+)
+"""Those that the operator sets itself, some of them in users' pods: they may be copied."""
+_PREFIXES = (f"{names.GROUP}/", "rosproxy.", "rosproxy/")
+_ARTICLE = {"label": "the label", "annotation": "the annotation"}
+_PLACES = {"label": "labels", "annotation": "annotations"}
+MOST = 3
+"""Names of one object that are told."""
+
+
+def misspelt_names(metadata: Json, kind: Kind) -> tuple[str, ...]:
+    """What is wrong with the names of labels and annotations of an object, in short texts."""
+    if names.is_own(texts_at(metadata, "labels")):
+        return ()
+    return tuple(_texts(metadata, kind))[:MOST]
+
+
+def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
+    for place, key in _PLACES.items():
+        for name in sorted(texts_at(metadata, key)):
+            named = _BY_NAME.get(name)
+            if name in _OPERATORS or (named and (named.place, named.kind) == (place, kind)):
+                continue
+            shown = f"{_ARTICLE[place]} {shorten(clean(name), 100)}"
+            if named:
+                yield f"{shown} means nothing here: there is {named}"
+            elif name.lower().startswith(_PREFIXES) or nearest(name, tuple(_BY_NAME), VERY_NEAR):
+                yield f"{shown} is unknown and ignored: {_meant(name, kind)}"
+
+
+def _meant(name: str, kind: Kind) -> str:
+    # All begin alike, so that what follows is compared.
+    _, slash, last = name.rpartition("/")
+    near = nearest(last if slash else name.partition(".")[2], tuple(_BY_END), _NEAR_END)
+    if near:
+        return f"did you mean {_BY_END[near]}?"
+    return f"there is {' and '.join(str(named) for named in _USERS if named.kind == kind)}"
