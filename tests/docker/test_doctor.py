@@ -168,5 +168,7 @@ def test_a_proxy_that_outside_does_not_reach(process: Process, net: Inside) -> N
             lambda: "published range: 192.0.2.1" in process.once("status", check=False), 60,
             lambda: process.once("status", check=False),
         )  # fmt: skip
+        assert process.process is not None
+        assert process.process.returncode == 1, "a script is told as well"
     finally:
         remove_proxies()

@@ -51,7 +51,8 @@ def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> 
 
     The running operator tells it. Where none answers at --admin-bind, or options are given before
     this command, it is what an operator with those options would see. Exits with 0 if all is as
-    wanted: nothing is wrong or left to be done, and every proxy answers; else with 1.
+    wanted: nothing is wrong or left to be done, every proxy answers and has its master, and none is
+    cut off from outside; else with 1.
     """
     if as_json and watch:
         raise click.UsageError("--json or --watch, not both")

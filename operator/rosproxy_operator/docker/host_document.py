@@ -98,6 +98,7 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
         "data_plane": status.data_plane.plane if status and status.data_plane else None,
         "used": status.ports.used if status else None,
         "free": status.ports.free if status else None,
+        "reached": status.range_probe.reached if status and status.range_probe else None,
         "problems": problems,
     }
 

@@ -119,9 +119,14 @@ def _await(host: HostStatus, seconds: float, good: Callable[[Json], bool]) -> Js
 
 
 def _is_as_wanted(status: Json) -> bool:
-    """Whether nothing is left to do, nothing is wrong, and every proxy answers."""
-    silent = [proxy for proxy in status["proxies"] if not proxy["reachable"]]
-    return not status["actions"] and not silent and not _is_wrong(status)
+    """Whether nothing is left to do, nothing is wrong, and every proxy can do its work."""
+    works = all(map(_works, status["proxies"]))
+    return works and not status["actions"] and not _is_wrong(status)
+
+
+def _works(proxy: Json) -> bool:
+    """Whether a proxy answers, and nothing shows that its master or outside is cut off from it."""
+    return proxy["reachable"] and False not in (proxy["master_up"], proxy["reached"])
 
 
 def _is_wrong(status: Json) -> bool:

@@ -40,6 +40,7 @@ PROXY = {
     "state": "running",
     "reachable": True,
     "master_up": True,
+    "reached": True,
     "networks": ["app"],
     "data_plane": "splice",
     "used": 2,
@@ -148,6 +149,27 @@ def test_a_plan_is_its_lines_and_its_exit_code(
     assert capsys.readouterr().out.splitlines() == lines
     assert host_status.show_plan(host, as_json=True, wait=0) == code
     assert json.loads(capsys.readouterr().out) == {"actions": actions, "problems": problems}
+
+
+@pytest.mark.parametrize(
+    ("proxy", "code"),
+    [
+        ({}, 0),
+        ({"reached": None}, 0),
+        ({"reached": False}, 1),
+        ({"master_up": False}, 1),
+        ({"reachable": False, "master_up": None, "reached": None}, 1),
+    ],
+)
+def test_the_status_is_good_if_every_proxy_can_do_its_work(
+    proxy: dict[str, Any], code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def survey(settings: PlanSettings) -> dict[str, Any]:
+        return {**STATUS, "proxies": [{**PROXY, **proxy}]}
+
+    monkeypatch.setattr(host_status, "survey", survey)
+    host = HostStatus(PlanSettings(), operator=None)
+    assert host_status.show_status(host, as_json=True, wait=0) == code
 
 
 def test_the_whole_status() -> None:
