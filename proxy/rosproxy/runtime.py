@@ -18,7 +18,8 @@ class Runtime:
     """The tools of one proxy; needs a running event loop.
 
     ``instance`` is a random name of this process. ``refusals`` tells what is over some bound;
-    ``policy``: what outside may see and do.
+    ``policy``: what outside may see and do. ``outside_changed`` is to be set when what was proven
+    of the way from outside may not hold any more.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -26,6 +27,7 @@ class Runtime:
         self._loop = asyncio.get_running_loop()
         self._started = self.now()
         self.metrics, self.tasks, self.problems = Metrics(), Tasks(), Problems()
+        self.outside_changed = asyncio.Event()
         self.refusals = Refusals(self.metrics, self.problems, self.now)
         self.policy = AccessPolicy(
             settings.policy, settings.policy_layers, self.metrics, self.refusals

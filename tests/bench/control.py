@@ -172,7 +172,7 @@ def proxy(machines: World, loop: str) -> Iterator[Way]:
     ros = machines.ros_environment("inside") | {"ROS_MASTER_URI": f"http://{GATEWAY}:{port}/"}
     node = "/usr/bin/python3", "-c", NODE, f"__name:={name[1:]}", name[1:]
     with machines.running("host", *argv, env=environment(machines, loop)) as process:
-        process.wait_for("ready: ", timeout=60)
+        process.wait_for("listening: ", timeout=60)
         with machines.running("inside", *node, env=ros) as rospy:
             uri = rospy.wait_for(r"^uri (\S+)", timeout=30)[1]
             process.wait_for(rf"{name} at \S+ is advertised as http://{HOST}:(\d+)/")

@@ -140,7 +140,7 @@ def proxy(place: World, plane: str) -> Iterator[int]:
     argv += ["--advertise-host", HOST, "--port-range", f"{FIRST_PORT}-{FIRST_PORT + 999}"]
     argv += ["--inside-network", NETWORK, "--ros2-peer", OUTSIDE]
     with place.running("host", *argv) as process:
-        process.wait_for("ready: ", timeout=60)
+        process.wait_for("listening: ", timeout=60)
         yield process.pid
 
 

@@ -166,7 +166,7 @@ class World:
         argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER]
         argv += ["--advertise-host", HOST, "--data-plane", data_plane, *options]
         with self.running("host", *argv) as process:
-            process.wait_for("ready: ", timeout=60)
+            process.wait_for("listening: ", timeout=60)
             yield Proxy(process, process.pid, PROXY)
 
     def wait_listening(self, process: Process, address: str, port: int) -> None:

@@ -71,7 +71,7 @@ def test_writes_no_file(proxy_image: str, container_name: str) -> None:
 
 def test_stops_at_once_and_cleanly(proxy_image: str, container_name: str) -> None:
     start(proxy_image, container_name)
-    wait_until(lambda: "ready" in logs(container_name), 60, "it logs that it is ready")
+    wait_until(lambda: "listening: " in logs(container_name), 60, "it logs that it is ready")
 
     docker("stop", "--time", "50", container_name)  # afterwards it would be killed: 137
 

@@ -49,7 +49,7 @@ class Process:
         )
         self._reader = threading.Thread(target=self._read, args=(self._process,))
         self._reader.start()
-        self.wait_for_log("ready: ")
+        self.wait_for_log("listening: ")
 
     @property
     def pid(self) -> int:

@@ -112,7 +112,7 @@ class Lab:
             for number in range(1, len(plan.networks) + 1):
                 argv += ["--inside-network", f"172.30.{number}.0/24"]
         self.proxy = self.spawn_proxy("px", [*argv, *self.proxy_options])
-        self.proxy.wait_for(r"ready: ")
+        self.proxy.wait_for(r"listening: ")
 
     def _upstream(self) -> str:
         """The real master, as the proxy reaches it."""

@@ -51,7 +51,7 @@ def beside(lab: Lab) -> Iterator[dict[str, str]]:
     argv += ["--advertise-host", OUT_HOST, "--port-range", "48000-48019", "--direction", "both"]
     argv += ["--inside-network", "172.30.1.0/24"]
     proxy = lab.spawn_proxy("host", argv)
-    proxy.wait_for("ready: ")
+    proxy.wait_for("listening: ")
     yield {"ROS_MASTER_URI": f"http://{gateway}:{MASTER_PORT}"}
     log = proxy.output()
     assert "Traceback" not in log, log

@@ -48,7 +48,7 @@ class Second:
         argv += ["--advertise-host", self._host, "--port-range", PORTS.bound]
         argv += ["--direction", "both", "--udp"]
         process = self._lab.spawn_proxy("px2", argv)
-        process.wait_for("ready: ")
+        process.wait_for("listening: ")
         return process
 
     def restart(self) -> None:

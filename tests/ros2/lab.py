@@ -65,7 +65,7 @@ class Lab:
         argv = [*self.proxy_prefix, sys.executable, "-m", "rosproxy", "run", "--ros", "2"]
         argv += ["--advertise-host", self.host, "--port-range", PORTS.bound, *self.options]
         self.proxy = self._spawn("rosproxy", "px", argv, self._own_environment())
-        self.proxy.wait_for("ready: ")
+        self.proxy.wait_for("listening: ")
 
     def start_ear(self) -> None:
         """Start the ear on the host."""

@@ -85,7 +85,7 @@ class App:
         ports = settings.ports.listen
         self._sign = proxy_signs.publish_sign(settings.ros, ports.first, ports.last, settings.admin)
         await self._check.start()
-        log.info("ready: %s", "; ".join(stack.greeting for stack in self.stacks))
+        log.info("listening: %s", "; ".join(stack.greeting for stack in self.stacks))
 
     async def stop(self) -> None:
         """End everything."""

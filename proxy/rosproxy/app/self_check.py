@@ -1,14 +1,17 @@
-"""What a proxy finds out about itself at its start: whether outside can reach it as it is told to.
+"""What a proxy finds out about itself: whether outside can reach it as it is told to.
 
-The advertised host is looked up before the proxy says that it is ready. Then, once the rush of a
-start is over and the master answers, the range is tried from outside (`rosproxy.ros1.range_probe`;
-of ROS 2 by UDP, which can prove that all is well, and not that it is not). What is wrong is told in
-the log and in ``rosproxy status``, in the doctor's words, and tried again at times until it is
-mended. It keeps nothing from working: who can reach the proxy does. How the last try ended is a
-field of the status of its own (``range_probe``).
+At its start the advertised host is looked up first. Then, once the rush of a start is over and the
+master answers, the range is tried from outside (`rosproxy.ros1.range_probe`; of ROS 2 by UDP, which
+can prove that all is well, and not that it is not). Only after that the log says ``ready``. What is
+wrong is told in the log and in ``rosproxy status``, in the doctor's words, and tried again at times
+until it is mended. What was proven is tried again when it may have changed: the master was away or
+is elsewhere now, or the advertised host's name leads to other addresses. None of this keeps
+anything from working: who can reach the proxy does. How the last try ended is a field of the status
+of its own (``range_probe``).
 """
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -37,6 +40,8 @@ SETTLE_TIME = 3.0
 RETRY_INTERVAL = 300.0
 """Seconds between tries while something is wrong. A master that does not get through holds one of
 its three threads for two minutes."""
+LEAST_INTERVAL = 30.0
+"""Seconds between tries however often something changes."""
 
 
 class SelfCheck:
@@ -49,8 +54,7 @@ class SelfCheck:
         self._addresses: list[str] = []
         self._result: RangeProbeStatus | None = None
         self._tried_at = 0.0
-        self._unproven = asyncio.Event()
-        self._unproven.set()
+        self._is_ready = False
 
     @property
     def findings(self) -> list[DoctorFinding]:
@@ -78,13 +82,30 @@ class SelfCheck:
         for stack in self._stacks:
             await stack.settle()
         while not any(stack.retired for stack in self._stacks):
+            self._runtime.outside_changed.clear()
             try:
                 await self._try_range(or_fast=False)
             except OSError as error:  # a port that was free a moment ago
                 log.debug("the range could not be tried: %s", error)
-            await self._unproven.wait()
-            await asyncio.sleep(RETRY_INTERVAL)
+            await self._until_due()
+
+    async def _until_due(self) -> None:
+        """Wait until it is time for another try."""
+        changed = self._runtime.outside_changed
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(RETRY_INTERVAL):
+                    await changed.wait()
+                    await asyncio.sleep(LEAST_INTERVAL)
+            former_addresses = self._addresses
             await self._look_at_host()
+            if changed.is_set() or self._addresses != former_addresses or not self._is_proven:
+                return
+
+    @property
+    def _is_proven(self) -> bool:
+        """Whether outside was seen to get in, and nothing is wrong."""
+        return not self.findings and self._result is not None and self._result.reached is True
 
     async def _look_at_host(self) -> None:
         host = self._runtime.settings.advertise_host
@@ -115,8 +136,16 @@ class SelfCheck:
         # that is reported.
         if self._addresses and result is not None:
             self._result, self._tried_at = result, self._runtime.now()
-            self._note(RANGE, published_range(probed, settings.advertise_host, ports))
+            findings = list(published_range(probed, settings.advertise_host, ports))
+            self._note(RANGE, findings)
+            self._tell_ready(findings)
         return probed
+
+    def _tell_ready(self, findings: Sequence[DoctorFinding]) -> None:
+        """Log once, when nothing is wrong for the first time, how far outside was seen to get."""
+        if not self._is_ready and not self.findings:
+            self._is_ready = True
+            log.info("ready: %s", "; ".join(finding.text for finding in findings))
 
     def _note(self, subject: str, findings: Iterable[DoctorFinding]) -> None:
         """Report what is wrong, once for as long as it is."""
@@ -124,10 +153,6 @@ class SelfCheck:
         previous = self._findings.get(subject, [])
         self._findings[subject] = wrong
         self._runtime.metrics.setup_faults.set(len(self.findings))
-        if self.findings or self._result is None or not self._result.reached:
-            self._unproven.set()
-        else:
-            self._unproven.clear()
         if wrong == previous:
             return
         self._runtime.problems.solved(subject)

@@ -51,6 +51,7 @@ class Context:
         self.instance, self._runtime = runtime.instance, runtime
         self.metrics, self.tasks = runtime.metrics, runtime.tasks
         self.problems, self.refusals = runtime.problems, runtime.refusals
+        self.outside_changed = runtime.outside_changed
         self.policy = runtime.policy
         self.gate = Gate(
             settings.max_connections_per_source,

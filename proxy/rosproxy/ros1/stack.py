@@ -272,6 +272,7 @@ class Ros1:
         if address != upstream.master_address:
             log.info("master %s is looked for at %s", self.settings.master_uri, address)
             upstream.master_address = address
+            self.context.outside_changed.set()
             self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
         return {"address": address}
 

@@ -7,19 +7,22 @@ from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import free_ports
+from examples.demo.fake_http import FakeHttpServer, FakeRequest, free_ports, value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.proxy_process import clean_environment
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.admin.requests import PortProbe
 from rosproxy.ros1.range_probe import probe_range
 from tests.clock import pass_time
+from tests.integration.admin_calls import tell
 from tests.integration.commands import run
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.doctor.test_doctor import examine
-from tests.integration.net import rpc, until
+from tests.integration.net import MASTER, rpc, until
 from tests.integration.process import Process, command_line
 from tests.integration.proxy import Proxy, options_for
+
+NOT_FOUND = b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
 
 
 def started(options: dict[str, Any]) -> "subprocess.CompletedProcess[str]":
@@ -114,13 +117,14 @@ async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
         ("localhost", "localhost is a loopback address", "the address of this host"),
     ],
 )
-async def test_an_advertised_host_that_leads_nowhere_is_told_before_ready(
+async def test_an_advertised_host_that_leads_nowhere_is_told_and_ready_is_not(
     start_process, host, text, cure
 ):
     process: Process = start_process(advertise_host=host, master_uri="http://192.0.2.7:11311")
     log = process.text
-    assert log.index(text) < log.index("ready: ")
-    assert "ERROR" in log[: log.index("ready: ")]
+    assert log.index(text) < log.index("listening: ")
+    assert "ERROR" in log[: log.index("listening: ")]
+    assert "ready: " not in log
     (told,) = [
         problem for problem in await problems(process) if problem.startswith("advertised host: ")
     ]
@@ -148,6 +152,14 @@ async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(sta
     assert document["range_probe"]["reached"] is False
     assert [p["holds"] for p in document["problems"] if p["subject"] == "published range"] == [True]
     assert process.text.count("published range: ") == 1
+    assert "ready: " not in process.text
+
+
+async def test_ready_is_said_once_outside_was_seen_to_get_in(start_process):
+    process: Process = start_process()
+    await until(lambda: "ready: " in process.text, "the range was tried", 60)
+    (line,) = [line for line in process.text.splitlines() if "ready: " in line]
+    assert f"ready: the master reaches {process.options['advertise_host']}, port " in line
 
 
 async def test_the_range_is_tried_until_outside_gets_in(
@@ -173,6 +185,45 @@ async def test_the_range_is_tried_until_outside_gets_in(
         assert ["published range"] * (not reached) == [p.subject for p in state.problems]
     await pass_time(9)
     assert len(tries) == 3, "outside gets in: nothing is tried any more"
+
+
+@pytest.mark.parametrize("change", ["the master was away", "its address", "the host's name"])
+async def test_what_was_proven_is_tried_again_when_it_may_have_changed(
+    change: str, make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Outside got in, and then does not any more."""
+    dead, sound = PortProbe(1, "h:1", "refused", "missed"), PortProbe(1, "h:1", "ok", "ok")
+    outcome, tries, addresses = [sound], [0], ["127.0.0.1"]
+
+    async def probe(*_: Any) -> tuple[PortProbe, ...]:
+        tries[0] += 1
+        return tuple(outcome)
+
+    async def resolve(host: str) -> list[str]:
+        return list(addresses)
+
+    monkeypatch.setattr("rosproxy.ros1.stack.probe_range", probe)
+    monkeypatch.setattr("rosproxy.app.self_check.resolve", resolve)
+    monkeypatch.setattr("rosproxy.app.self_check.RETRY_INTERVAL", 40.0)
+    proxy = await make_proxy()
+    await pass_time(3.1)
+    await pass_time(100)
+    assert (tries, proxy.app.state().problems) == ([1], ())
+
+    outcome[0] = dead
+    if change == "the master was away":
+        await master.stop()
+        await pass_time(5)
+        assert tries == [1], "not while it is away"
+        await master.start()
+    elif change == "its address":
+        await tell(proxy, "/master-address", address="127.0.0.2")
+        await tell(proxy, "/master-address", address="127.0.0.1")
+    else:
+        addresses[0] = "127.0.0.3"
+    await pass_time(45)
+    assert tries == [2]
+    assert "published range" in {p.subject for p in proxy.app.state().problems}
 
 
 def findings(text: str) -> list[DoctorFinding]:
@@ -212,6 +263,20 @@ async def test_the_deep_check_finds(master, options, text):
     code, told = await deep(options_for(**{"master_uri": master.uri, **options}))
     assert code == (2 if "policy_file" in options else 1), told
     assert text in " ".join(told.split())
+
+
+async def test_the_deep_check_finds_a_master_at_another_path():
+    async def respond(request: FakeRequest) -> bytes:
+        return value([1, "", 7]) if request.path == "/" else NOT_FOUND
+
+    fake = FakeHttpServer(respond)
+    await fake.start(MASTER)
+    at = f"{MASTER}:{fake.address[1]}"
+    code, told = await deep(options_for(master_uri=f"http://{at}/ros"))
+    await fake.stop()
+    assert code == 1
+    assert "not at the path /ros" in " ".join(told.split())
+    assert f"--master-uri http://{at}/" in told
 
 
 async def test_the_deep_check_names_another_proxy(start_process):

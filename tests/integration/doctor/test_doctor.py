@@ -154,9 +154,12 @@ async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
     await fake.start(MASTER)
     proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/ros")
     findings = [f for f in await faults(proxy) if f.check == "master"]
+    await until(lambda: proxy.app.state().master.error, "the master was asked")
+    error = proxy.app.state().master.error
     await proxy.stop()
     await fake.stop()
     assert "not at the path /ros" in findings[0].text
+    assert f"rather --master-uri http://{MASTER}:{fake.address[1]} " in error
 
 
 async def test_something_else_answers_for_the_master(make_proxy: MakeProxy) -> None:

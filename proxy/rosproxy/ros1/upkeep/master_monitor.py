@@ -8,6 +8,7 @@ that for themselves.
 
 import asyncio
 import logging
+from urllib.parse import urlsplit
 
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
@@ -21,6 +22,10 @@ LOOK_TIMEOUT = 5.0
 """Seconds in which a sound master answers getPid."""
 LOOKS_PER_CHECK = 5
 """How many looks at the master go by between two checks of what it knows."""
+
+
+MASTER_PATHS = ("", "/", "/RPC2")
+"""Where ROS masters answer: both XML-RPC libraries of ROS 1 take no other."""
 
 
 class MasterMonitor:
@@ -60,15 +65,27 @@ class MasterMonitor:
                 await self._registrar.register_lost()
             self._mark(True)
         except (Unreachable, MasterError) as error:
-            self._mark(False, str(error))
+            self._mark(False, str(error) + self._path_hint(error))
         except TimeoutError:
             uri = self._context.settings.master_uri
             self._mark(False, f"master {uri}: no answer in {LOOK_TIMEOUT:g} s")
+
+    def _path_hint(self, error: Exception) -> str:
+        """What to do where something answers, but not at the path that was given."""
+        uri = urlsplit(self._context.settings.master_uri)
+        if uri.path in MASTER_PATHS or "HTTP status 404" not in str(error):
+            return ""
+        return (
+            f": a ROS master knows the paths / and /RPC2 alone, so rather --master-uri "
+            f"http://{uri.netloc} (ROSPROXY_MASTER_URI)"
+        )
 
     def _mark(self, up: bool, error: str = "") -> None:
         if up != self.up:
             self.since = self._context.now()
             if up:
+                if self.answered.is_set():  # it was away, and may be elsewhere, as may this host
+                    self._context.outside_changed.set()
                 self.answered.set()
                 log.info("master %s answers (pid %s)", self._context.settings.master_uri, self.pid)
                 self._context.problems.solved("master")
