@@ -1,12 +1,14 @@
 """What the proxy has the master remember of its leases: kept up, bounded, and only a claim."""
 
+from asyncio import StreamReader, StreamWriter
 from functools import partial
 
 import pytest
 
 from examples.demo.fake_http import value
 from examples.demo.fake_master import FakeMaster
-from examples.demo.fake_node import FakeNode
+from examples.demo.fake_node import FakeNode, Header
+from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import HOST, NODE, OTHER_NODE, looks, refuses, rpc, until
 from tests.integration.proxy import Proxy
@@ -104,6 +106,35 @@ async def test_a_node_does_not_answer_for_the_one_before_at_its_port(
     reason = "[/former] Reason: new node registered with same name"
     assert (await rpc(uri, "shutdown", "/master", reason))[0] == 1
     assert "shutdown" not in [method for method, _ in node.calls]
+
+
+async def only_own_services(
+    node: FakeNode, reader: StreamReader, writer: StreamWriter, header: Header
+) -> None:
+    """As nodes do: for a service of another name there is an error and no name."""
+    known = header.get("service", node.name).startswith(node.name)
+    answer = {"callerid": node.name} if known else {"error": "no such service"}
+    writer.write(encode_header(answer))
+
+
+async def test_rosout_alone_bears_out_no_name_beside_another(
+    proxy: Proxy, master: FakeMaster, node: FakeNode
+) -> None:
+    """Every node has it. What the master does not know is then registered for the right one."""
+    node.stream = only_own_services
+    await node.publish(proxy.master, "/rosout")
+    await node.serve(proxy.master, f"{node.name}/get_loggers")
+    node.published["/unknown"] = "std_msgs/String"
+    uri = proxy.uri(node)
+    await rpc(master.uri, "registerPublisher", "/former", "/rosout", "rosgraph_msgs/Log", uri)
+    service = uri.replace("http://", "rosrpc://").rstrip("/")
+    await rpc(master.uri, "registerService", "/former", "/former/get_loggers", service, uri)
+
+    await proxy.restart()
+
+    await until(lambda: "/former" not in master.nodes, "the other is taken back")
+    await until(lambda: master.holds("publishers", "/unknown") == [uri], "it is registered")
+    assert await proxy.serves(node)
 
 
 async def test_what_was_left_at_a_port_is_taken_back_though_another_node_has_it(

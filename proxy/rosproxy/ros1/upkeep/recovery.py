@@ -277,9 +277,8 @@ class Recovery:
         # Neighbours can use the host's name if it leads here.
         if endpoint.location.address == address:
             endpoint.note_named(address in addresses)
-        await self._registrar.disown(
-            endpoint, recovery_claims.unconfirmed_registrations(registrations, info)
-        )
+        refuted = await self._verifier.refuted(endpoint.slave, registrations, info, ports)
+        await self._registrar.disown(endpoint, refuted)
         # The master has it by a former version's URI: it is registered by that of this one.
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
             current = list(endpoint.registrations.values())

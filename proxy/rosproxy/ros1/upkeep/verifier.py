@@ -6,6 +6,9 @@ topics that it names. A library that does not tell them (ROS makes none implemen
 API) is asked for one of the topics that are registered for it: where it names a TCPROS port for
 that, and is called there by a name that is registered, it is the one; so it is where it answers for
 a service under that name.
+
+Several names at one address are left by several processes, as a rule. Every node has /rosout, so of
+names that have no other topic those count that it answers for by a service.
 """
 
 from collections.abc import Collection, Iterable
@@ -60,6 +63,27 @@ class Verifier:
             return True
         return None if undecided or not registrations else False
 
+    async def refuted(
+        self,
+        slave: HostPort,
+        registrations: Collection[Registration],
+        info: NodeInfo,
+        service_ports: Iterable[int] = (),
+    ) -> list[Registration]:
+        """The registrations of names that are not the node's, which is one of several names."""
+        by_name = recovery_claims.by_name(registrations)
+        refuted = recovery_claims.unconfirmed_registrations(registrations, info)
+        borne_out = by_name.keys() - {r.caller_id for r in refuted}
+        doubtful = {n for n in borne_out if not recovery_claims.has_own_topic(by_name[n])}
+        if len(borne_out) > 1 and doubtful:
+            ports = {*info.topic_ports.values(), *service_ports}
+            groups = (by_name[name] for name in doubtful)
+            proven = {r[0].caller_id for r in groups if await self._serves(slave, r, ports)}
+            # Where no name is better than the others, none is refuted.
+            if proven or borne_out > doubtful:
+                refuted += [r for name in doubtful - proven for r in by_name[name]]
+        return refuted
+
     async def _answers_for(
         self, slave: HostPort, undecided: Collection[Registration], info: NodeInfo, ports: set[int]
     ) -> bool:
@@ -76,6 +100,14 @@ class Verifier:
             # port for the topic has to do. Of everybody's /rosout it shows nothing.
             if name in callers or (name is None and topic != ROSOUT):
                 return True
+        return await self._serves(slave, services, ports)
+
+    async def _serves(
+        self, slave: HostPort, registrations: Collection[Registration], ports: Collection[int]
+    ) -> bool:
+        """Whether it answers for a service, by a name that has registered one."""
+        callers = {r.caller_id for r in registrations}
+        _, services = recovery_claims.topics_and_services_to_ask(registrations)
         for service in services:
             provider = parse_service_uri(service.service_api or "")
             for port in {provider.port} if provider else ports:

@@ -115,6 +115,11 @@ def confirmed_by(registrations: Iterable[Registration], info: NodeInfo) -> bool 
     return False if answers and None not in answers else None
 
 
+def has_own_topic(registrations: Iterable[Registration]) -> bool:
+    """Whether a topic is registered that not every node has."""
+    return any(r.kind in TOPIC_KINDS and r.name != ROSOUT for r in registrations)
+
+
 def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registration]]:
     """Registrations by the node names that have made them.
 
