@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from tests.docker.engine import wait_until
-from tests.kubernetes import release
+from tests.kubernetes import api, release
+from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.cluster.layout import KUBECONFIG
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
-from tests.kubernetes.rosproxies import rosproxy
+from tests.kubernetes.rosproxies import NOWHERE, rosproxy
 from tests.kubernetes.traffic import START, wait_for_service
 
+WEBHOOKS = "mutatingwebhookconfigurations"
 PROGRAM = Path(sys.executable).with_name("rosproxy-operator")
 
 
-def doctor(namespace: str) -> tuple[int, list[dict[str, Any]]]:
+def doctor(namespace: str, kubeconfig: Path = KUBECONFIG) -> tuple[int, list[dict[str, Any]]]:
     """The exit code, and what is found in a namespace."""
     ended = subprocess.run(
         [PROGRAM, "kubernetes", "--namespace", namespace, "doctor", "--json"],
@@ -26,7 +28,7 @@ def doctor(namespace: str) -> tuple[int, list[dict[str, Any]]]:
         text=True,
         check=False,
         timeout=120,
-        env={**os.environ, "KUBECONFIG": str(KUBECONFIG)},
+        env={**os.environ, "KUBECONFIG": str(kubeconfig)},
     )
     assert "Traceback" not in ended.stderr
     findings: list[dict[str, Any]] = json.loads(ended.stdout)["findings"]
@@ -75,4 +77,49 @@ def test_a_master_that_is_not_there_is_the_first_cause(net: Namespace) -> None:
     code, findings = doctor(net.name)
     assert code == 1
     assert findings[0]["text"].startswith("MasterReachable is False: ")
-    assert "describe rosproxy" in findings[0]["fix"]
+    assert "edit rosproxy robot: spec.master" in findings[0]["fix"]
+
+
+def test_a_webhook_whose_configuration_is_gone_is_told(net: Namespace) -> None:
+    """Labelled pods are made unwired then, and nobody else says why."""
+
+    def about_webhook() -> list[tuple[str, str]]:
+        found = [finding for finding in doctor(net.name)[1] if finding["check"] == "webhook"]
+        return [(finding["severity"], finding["text"]) for finding in found]
+
+    rosproxy(net.name, master=NOWHERE)
+    assert [severity for severity, _ in about_webhook()] == ["ok"]
+    configuration = api.get(WEBHOOKS, "", release.FULL_NAME)
+    api.delete(WEBHOOKS, "", release.FULL_NAME)
+    try:
+        ((severity, text),) = about_webhook()
+    finally:
+        kept = {key: configuration["metadata"].get(key, {}) for key in ("labels", "annotations")}
+        metadata = {**kept, "name": release.FULL_NAME}
+        api.json_call("POST", api.path(WEBHOOKS), {**configuration, "metadata": metadata})
+    assert severity == "error"
+    assert "no MutatingWebhookConfiguration has wire.rosproxy.io" in text
+    release.wait_operator()
+
+
+def test_who_may_not_look_is_told_which_right_is_missing(net: Namespace, tmp_path: Path) -> None:
+    """Somebody with the rights to RosProxies and pods of one namespace alone."""
+    made = rosproxy(net.name, master=NOWHERE)
+    made.wait_status(lambda s: s.get("nodes") == 0, "it was looked at")
+    rights = ("--verb=list", "--resource=rosproxies.rosproxy.io,pods")
+    kubectl("create", "role", "looker", *rights, "-n", net.name)
+    whom = ("--role=looker", f"--serviceaccount={net.name}:default")
+    kubectl("create", "rolebinding", "looker", *whom, "-n", net.name)
+    token = kubectl("create", "token", "default", "-n", net.name)
+    config = json.loads(KUBECONFIG.read_text())
+    config["users"][0]["user"] = {"token": token.strip()}
+    kubeconfig = tmp_path / "kubeconfig"
+    kubeconfig.write_text(json.dumps(config))
+    code, findings = doctor(net.name, kubeconfig)
+    assert code == 0, findings
+    refused = [f["text"] for f in findings if f["text"].startswith("not looked at")]
+    assert refused == [
+        "not looked at: you lack the right to list "
+        "mutatingwebhookconfigurations.admissionregistration.k8s.io -A",
+        f"not looked at: you lack the right to list events -n {net.name}",
+    ]

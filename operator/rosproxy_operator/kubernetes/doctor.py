@@ -1,8 +1,9 @@
 """``rosproxy-operator kubernetes doctor``: what is wrong in a cluster, the first cause first.
 
-First what the operator has written into the status of each RosProxy; then each proxy is asked by
-the doctor of its own pod (``kubectl exec``), which looks from where the proxy is. That takes the
-right to ``create`` ``pods/exec``, which whoever looks needs and the operator has not.
+First what the operator has written into the status of each RosProxy; then whether the webhook can
+work, and which Events there were (`doctor_facts`); then each proxy is asked by the doctor of its
+own pod (``kubectl exec``), which looks from where the proxy is. All of that takes rights that
+whoever looks needs: what is missing is told, and the rest looked at.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,9 +18,12 @@ from rosproxy.admin.doctor_finding import DoctorFinding, warning
 from rosproxy_operator.common.proxy_doctor import command, read_findings
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
+from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
+from rosproxy_operator.kubernetes.status.event_findings import event_findings
 from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_CURE, PORTS_CURE
+from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""
@@ -37,10 +41,17 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     """All findings; of proxies about these nodes and topics, if any. Raises ApiError."""
     api = Api(namespaces)
     try:
-        findings = cluster_findings(api.rosproxies())
-        pods = [pod for pod in api.own_pods() if pod["status"].get("phase") == "Running"]
+        rosproxies, own_pods = api.rosproxies(), api.own_pods()
+        facts = DoctorFacts(api, namespaces)
+        findings = [
+            *cluster_findings(rosproxies),
+            *webhook_findings(facts.webhook()),
+            *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),
+            *facts.refused,
+        ]
     finally:
         api.close()
+    pods = [pod for pod in own_pods if pod["status"].get("phase") == "Running"]
     with ThreadPoolExecutor(AT_ONCE) as threads:
         answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], pods)
         return [*findings, *(finding for answer in answers for finding in answer)]

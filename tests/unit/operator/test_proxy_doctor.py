@@ -95,6 +95,16 @@ def test_a_cluster_tells_the_cause_and_no_text_twice() -> None:
     assert findings[0].fix == "kubectl -n lab describe rosproxy robot"
 
 
+def test_each_reason_has_its_own_cure() -> None:
+    bad = {**condition("PortsAllocated", "False", "no ports"), "reason": "PortsExhausted"}
+    dead = {**condition("PortsReachable", "False", "dead"), "reason": "PortsUnreachable"}
+    findings = cluster_findings([rosproxy(conditions=[bad, dead])])
+    assert findings[0].fix.startswith("have the nodes' network plug-in do hostPorts")
+    assert findings[1].fix == (
+        "kubectl -n lab edit rosproxy robot: fewer spec.ports, or a wider spec.portWindow"
+    )
+
+
 def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:
     (sound,) = cluster_findings([rosproxy(proxies="1/1")])
     assert sound.severity is Severity.OK

@@ -59,13 +59,13 @@ TRIES = 4
 LONGEST_PAUSE = 10.0
 """Seconds that it may put it off at a time."""
 WEBHOOKS = "mutatingwebhookconfigurations"
-POLICIES = "networkpolicies"
-LEASES = "leases"
+POLICIES, LEASES, ENDPOINTS = "networkpolicies", "leases", "endpointslices"
 _ROOTS = {
     PLURAL: f"/apis/{GROUP}/{VERSION}",
     WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
     POLICIES: "/apis/networking.k8s.io/v1",
     LEASES: "/apis/coordination.k8s.io/v1",
+    ENDPOINTS: "/apis/discovery.k8s.io/v1",
 }
 """The API's paths for kinds that are not of the core group."""
 _TERMINATING = "because it is being terminated"
@@ -198,9 +198,8 @@ class Api:
 
     def own_pods(self) -> list[JsonObject]:
         """The pods that the operator has made."""
-        query = {"labelSelector": OWN_SELECTOR}
-        lists = (self._ask("GET", _path("pods", place), query) for place in self._places)
-        return [obj for listing in lists for obj in self._items(listing)]
+        lists = (self.list_fresh("pods", place, labels=OWN_SELECTOR) for place in self._places)
+        return [obj for objs in lists for obj in objs]
 
     def namespaces_of(self, kind: str) -> tuple[str, ...]:
         """The namespaces in which a kind is watched; an empty one stands for all of them.
@@ -211,7 +210,7 @@ class Api:
 
     def page(self, kind: str, place: str, token: str = "") -> Page:
         """A part of the list of a kind, as it is now. Raises ApiExpired, too."""
-        query = {"limit": str(PAGE), **_watched(kind), **({"continue": token} if token else {})}
+        query = {"limit": str(PAGE), **_watched(kind), "continue": token}
         listing = self._ask("GET", _path(kind, place), query)
         meta = submap(listing, "metadata")
         return Page(
@@ -227,11 +226,14 @@ class Api:
             raise refusal(int(answer.status), str(answer.reason or ""), self._body(answer))
         return Watch(answer.response)
 
-    def list_fresh(self, kind: str, namespace: str, selector: str) -> list[JsonObject]:
-        """The objects that a field selector fits, as they are now in the API server's store."""
+    def list_fresh(
+        self, kind: str, namespace: str, fields: str = "", labels: str = ""
+    ) -> list[JsonObject]:
+        """The objects that both selectors fit, as they are now in the API server's store."""
         # Without a resourceVersion a list is "most recent", as the docs of Kubernetes have it (API
         # Concepts). The operator has no right to `get` nodes and RosProxies.
-        return self._items(self._ask("GET", _path(kind, namespace), {"fieldSelector": selector}))
+        query = {"fieldSelector": fields, "labelSelector": labels}
+        return self._items(self._ask("GET", _path(kind, namespace), query))
 
     def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> JsonObject:
         """One object, for example of the kind ``services``."""
@@ -335,7 +337,7 @@ class Api:
             request = self._client.param_serialize(
                 method,
                 path,
-                query_params=[*(query or {}).items()],
+                query_params=[(name, value) for name, value in (query or {}).items() if value],
                 header_params=headers,
                 body=body,
                 auth_settings=["BearerToken"],

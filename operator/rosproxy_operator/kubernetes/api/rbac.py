@@ -19,3 +19,13 @@ def missing_rule(message: str) -> str:
         f'apiGroups ["{match["group"]}"], resources ["{match["resource"]}"], '
         f'verbs ["{match["verb"]}"]'
     )
+
+
+def missing_right(message: str) -> str:
+    """The right that whoever asks lacks, as ``kubectl auth can-i`` takes it; else empty."""
+    match = _RBAC.search(message)
+    if match is None:
+        return ""
+    group = f".{match['group']}" if match["group"] else ""
+    place = f" -n {match['namespace']}" if match["namespace"] else " -A"
+    return f"{match['verb']} {match['resource']}{group}{place}"

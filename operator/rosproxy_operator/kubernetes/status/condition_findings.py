@@ -4,8 +4,9 @@ from collections.abc import Iterable, Iterator
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
-from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.status.cures import cure
 
 _WRONG = {
     "MasterReachable": "False",
@@ -28,7 +29,8 @@ def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
 
 def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
     metadata, status = rosproxy["metadata"], rosproxy.get("status", {})
-    subject = f"rosproxy {metadata['namespace']}/{metadata['name']}"
+    id = Name(metadata["namespace"], metadata["name"])
+    subject = f"rosproxy {id}"
     conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}
     if int_at(status, "observedGeneration") < metadata.get("generation", 0):
         text = "the operator has not looked at its last change yet"
@@ -42,7 +44,7 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
         message = text_at(condition, "message")
         if text_at(condition, "status") == bad and message not in messages:
             messages.add(message)
-            fix = f"kubectl -n {metadata['namespace']} describe rosproxy {metadata['name']}"
+            fix = cure(text_at(condition, "reason"), id)
             yield error("rosproxy", subject, f"{kind} is {bad}: {message}", fix)
     if messages:
         return

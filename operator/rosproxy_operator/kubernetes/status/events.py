@@ -30,7 +30,8 @@ LONGEST = 1024
 """Bytes of an Event's message."""
 COUNT_EVERY = 60.0
 """Seconds in which the same Event is counted once at most."""
-_COMPONENT = "rosproxy-operator"
+COMPONENT = "rosproxy-operator"
+"""Who makes the Events, as they name it."""
 _LONGEST_NAME = 200
 _ENDED: Mapping[type, tuple[str, str]] = {
     DeleteProxy: ("ProxyDeleted", "deleted"),
@@ -122,9 +123,9 @@ def event_body(event: Emit, now: float) -> Json:
         "type": event.type,
         "reason": event.reason,
         "message": event.message,
-        "source": {"component": _COMPONENT},
-        "reportingComponent": _COMPONENT,
-        "reportingInstance": _COMPONENT,
+        "source": {"component": COMPONENT},
+        "reportingComponent": COMPONENT,
+        "reportingInstance": COMPONENT,
         "firstTimestamp": stamp(now),
         "lastTimestamp": stamp(now),
         "count": 1,

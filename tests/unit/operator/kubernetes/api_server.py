@@ -29,12 +29,14 @@ PLURALS = {
     "networkpolicies": "NetworkPolicy",
     "leases": "Lease",
     "mutatingwebhookconfigurations": "MutatingWebhookConfiguration",
+    "endpointslices": "EndpointSlice",
 }
 GROUPS = {
     "rosproxies": "rosproxy.io/v1alpha1",
     "networkpolicies": "networking.k8s.io/v1",
     "leases": "coordination.k8s.io/v1",
     "mutatingwebhookconfigurations": "admissionregistration.k8s.io/v1",
+    "endpointslices": "discovery.k8s.io/v1",
 }
 
 

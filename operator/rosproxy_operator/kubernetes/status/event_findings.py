@@ -1,0 +1,118 @@
+"""The last Warning Events of RosProxies and their pods, for the doctor: the newest first.
+
+What holds now the conditions say; an Event of the operator that they don't have is over. What the
+kubelet and the scheduler say of a proxy's pod matters while that is not ready.
+"""
+
+from collections.abc import Collection, Iterable, Iterator
+from datetime import datetime
+
+import msgspec
+
+from rosproxy.admin.doctor_finding import DoctorFinding, note, warning
+from rosproxy.telemetry.text import brief, duration
+from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
+from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.names import KIND
+from rosproxy_operator.kubernetes.status.events import COMPONENT
+
+MOST = 10
+"""Events that are told."""
+LONGEST = 400
+"""Characters of a message."""
+_CHECK = "events"
+
+
+class RecentEvent(msgspec.Struct, frozen=True):
+    """A Warning Event: about what, how many seconds ago, and how often.
+
+    ``own``: the operator has made it; else it is about a pod of the operator's.
+    """
+
+    kind: str
+    id: Name
+    uid: str
+    reason: str
+    message: str
+    age: float
+    count: int
+    own: bool
+
+
+def recent_events(
+    events: Iterable[Json], rosproxies: Iterable[Json], pods: Iterable[Json], now: float
+) -> list[RecentEvent]:
+    """The Events about these RosProxies, the operator's pods, and users' pods, the newest first.
+
+    Of users' pods those of the operator alone. Of several that are alike it is the last one;
+    without those that a condition tells. ``now`` is in seconds of Unix time.
+    """
+    uids = {text_at(submap(obj, "metadata"), "uid") for obj in rosproxies}
+    pod_uids = {text_at(submap(obj, "metadata"), "uid") for obj in pods}
+    told = [*_messages(rosproxies)]
+    found: dict[tuple[str, str, str], RecentEvent] = {}
+    for event in sorted((_read(e, now) for e in events), key=lambda e: e.age):
+        known = uids if event.kind == KIND else pod_uids
+        matters = event.uid in known or (event.kind == "Pod" and event.own)
+        if matters and not (event.own and _is_told(event, told)):
+            message = event.message if event.own else ""
+            found.setdefault((event.uid, event.reason, message), event)
+    return [*found.values()]
+
+
+def event_findings(
+    events: Iterable[RecentEvent], ready: Collection[str]
+) -> Iterator[DoctorFinding]:
+    """Findings about the first few; ``ready`` are the uids of pods that are."""
+    for event in [*events][:MOST]:
+        subject = f"{event.kind.lower()} {event.id}"
+        often = f", {event.count} times" if event.count > 1 else ""
+        text = f"{event.reason} {duration(event.age)} ago{often}: {brief(event.message, LONGEST)}"
+        if event.own:
+            yield note(_CHECK, subject, f"{text} (no condition says so now)")
+        elif event.uid in ready:
+            yield note(_CHECK, subject, f"{text} (it is ready now)")
+        else:
+            fix = f"kubectl -n {event.id.namespace} describe pod {event.id.name}"
+            yield warning(_CHECK, subject, text, fix)
+
+
+def _messages(rosproxies: Iterable[Json]) -> Iterator[str]:
+    for rosproxy in rosproxies:
+        for condition in submaps(submap(rosproxy, "status"), "conditions"):
+            yield text_at(condition, "message")
+
+
+def _is_told(event: RecentEvent, messages: Iterable[str]) -> bool:
+    text = event.message.removesuffix("…")
+    return any(text in message for message in messages)
+
+
+def _read(event: Json, now: float) -> RecentEvent:
+    about, series = submap(event, "involvedObject"), submap(event, "series")
+    source = text_at(submap(event, "source"), "component")
+    return RecentEvent(
+        kind=text_at(about, "kind"),
+        id=Name(text_at(about, "namespace"), text_at(about, "name")),
+        uid=text_at(about, "uid"),
+        reason=brief(text_at(event, "reason"), LONGEST),
+        message=text_at(event, "message"),
+        age=max(now - _time(event, series), 0.0),
+        count=int_at(series, "count") or int_at(event, "count") or 1,
+        own=COMPONENT in (source, text_at(event, "reportingComponent")),
+    )
+
+
+def _time(event: Json, series: Json) -> float:
+    """When it was seen last, in seconds of Unix time: the fields differ by who has made it."""
+    times = (
+        text_at(series, "lastObservedTime"),
+        *(text_at(event, key) for key in ("lastTimestamp", "eventTime", "firstTimestamp")),
+        text_at(submap(event, "metadata"), "creationTimestamp"),
+    )
+    for time in filter(None, times):
+        try:
+            return datetime.fromisoformat(time).timestamp()
+        except (ValueError, OverflowError):
+            continue
+    return 0.0

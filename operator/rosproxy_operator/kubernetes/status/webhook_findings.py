@@ -1,0 +1,112 @@
+"""Whether the webhook that wires pods can work, for the doctor: its configuration, CA and Service.
+
+It refuses no pod: where it fails, pods start as they are, and their nodes don't find the proxy.
+"""
+
+from collections.abc import Iterator, Mapping
+
+import msgspec
+
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.telemetry.text import plural
+from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
+from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.names import INJECT
+
+NAME = "wire.rosproxy.io"
+"""What the webhook is called in its configuration."""
+OPERATORS = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
+"""Label selector of the operators' pods."""
+_CHECK = "webhook"
+_ANEW = "then create the pods anew that came by unwired: kubectl rollout restart"
+_INSTALL = "helm upgrade, or kubectl apply -f manifests/install.yaml, makes it anew"
+
+
+class WebhookFacts(msgspec.Struct, frozen=True):
+    """What the cluster has of the webhook; None: it could not be looked at.
+
+    ``configurations`` are the MutatingWebhookConfigurations with our webhook, ``operators`` the
+    operators' pods; ``ready`` is how many endpoints of a Service take calls, None where there is no
+    such Service; those that could not be looked at are left out.
+    """
+
+    configurations: tuple[Json, ...] | None = None
+    operators: tuple[Json, ...] | None = None
+    ready: Mapping[Name, int | None] = {}
+
+
+def our_webhook(configuration: Json) -> Json:
+    """Our webhook in a configuration; empty if it is another one's."""
+    webhooks = submaps(configuration, "webhooks")
+    return next((w for w in webhooks if w.get("name") == NAME), {})
+
+
+def service_of(configuration: Json) -> Name:
+    """The Service that the API server calls."""
+    service = submap(our_webhook(configuration), "clientConfig", "service")
+    return Name(text_at(service, "namespace"), text_at(service, "name"))
+
+
+def webhook_findings(facts: WebhookFacts) -> Iterator[DoctorFinding]:
+    """What is wrong with the webhook, as far as could be looked at."""
+    if facts.configurations is None:
+        return
+    if not facts.configurations:
+        yield _missing(facts.operators)
+    for configuration in facts.configurations:
+        yield from _findings_of(configuration, facts)
+
+
+def _missing(operators: tuple[Json, ...] | None) -> DoctorFinding:
+    text = f"no MutatingWebhookConfiguration has {NAME}, so no pod with the label {INJECT} is wired"
+    if operators is None:
+        return warning(_CHECK, _CHECK, text, f"unless it is switched off, {_INSTALL}; {_ANEW}")
+    if not operators:
+        fix = "install the operator: helm install, or kubectl apply -f manifests/install.yaml"
+        return warning(_CHECK, _CHECK, f"{text}; and there is no pod of an operator", fix)
+    if any(_serves(pod) for pod in operators):
+        return error(_CHECK, _CHECK, f"{text}, though operators serve it", f"{_INSTALL}; {_ANEW}")
+    return note(_CHECK, _CHECK, f"{text}: the operators do not serve it (webhook.enabled=false)")
+
+
+def _serves(operator: Json) -> bool:
+    containers = submaps(submap(operator, "spec"), "containers")
+    arguments = (str(word) for c in containers for word in c.get("args") or ())
+    return any(word.startswith("--webhook-bind=") for word in arguments)
+
+
+def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFinding]:
+    metadata, service = submap(configuration, "metadata"), service_of(configuration)
+    subject = f"webhook {text_at(metadata, 'name')}"
+    lacks_ca = not text_at(submap(our_webhook(configuration), "clientConfig"), "caBundle")
+    if lacks_ca:
+        text = "it has no caBundle, so that the API server trusts no operator: no pod is wired"
+        yield error(_CHECK, subject, text, f"{_ca_cure(metadata, service)}; {_ANEW}")
+    if not service.name or service not in facts.ready:
+        return
+    ready = facts.ready[service]
+    if ready is None:
+        yield error(_CHECK, subject, f"its Service {service} is not there", f"{_INSTALL}; {_ANEW}")
+    elif not ready:
+        text = f"its Service {service} has no endpoint that is ready: no pod is wired"
+        yield error(_CHECK, subject, text, f"{_operators_at(service)}; {_ANEW}")
+    elif not lacks_ca:
+        text = f"{plural(ready, 'operator')} ready to wire pods"
+        yield ok(_CHECK, subject, text)
+
+
+def _ca_cure(metadata: Json, service: Name) -> str:
+    if "cert-manager.io/inject-ca-from" in texts_at(metadata, "annotations"):
+        source = f"kubectl -n {service.namespace} get certificates"
+        return f"cert-manager has to set it: does its cainjector run? {source}"
+    return (
+        "the operator that leads sets it within 20 s, where its role may patch that object: "
+        f"kubectl -n {service.namespace} logs -l app.kubernetes.io/component=operator --prefix"
+    )
+
+
+def _operators_at(service: Name) -> str:
+    return (
+        f"kubectl -n {service.namespace} describe pods -l app.kubernetes.io/component=operator; "
+        f"helm -n {service.namespace} list"
+    )

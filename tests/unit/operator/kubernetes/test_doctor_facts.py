@@ -1,0 +1,227 @@
+"""What the doctor finds about the webhook and in Events, and what it is not allowed to look at."""
+
+import time
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api.api_client import Api
+from rosproxy_operator.kubernetes.api.rbac import missing_right
+from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
+from rosproxy_operator.kubernetes.status.event_findings import MOST, event_findings, recent_events
+from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
+from tests.unit.operator.kubernetes.api_server import ApiServer
+from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, proxy_obj, rosproxy_obj
+
+Obj = dict[str, Any]
+NAME = "rosproxy-operator"
+OPERATOR = {"app.kubernetes.io/component": "operator", "app.kubernetes.io/part-of": "rosproxy"}
+
+
+def put_webhook(server: ApiServer, ca: str = "Q0E=", annotations: Obj | None = None) -> None:
+    client = {"service": {"namespace": "system", "name": NAME}, "caBundle": ca}
+    webhooks = [{"name": "wire.rosproxy.io", "clientConfig": client}]
+    meta = {"name": NAME, "annotations": annotations or {}}
+    server.put("mutatingwebhookconfigurations", {"metadata": meta, "webhooks": webhooks})
+
+
+def put_service(server: ApiServer, *ready: bool) -> None:
+    server.put("services", {"metadata": {"name": NAME}}, "system")
+    labels = {"kubernetes.io/service-name": NAME}
+    endpoints = [{"conditions": {"ready": is_ready}} for is_ready in ready]
+    endpoint_slice = {"metadata": {"name": "s", "labels": labels}, "endpoints": endpoints}
+    server.put("endpointslices", endpoint_slice, "system")
+
+
+def put_operator(server: ApiServer, *args: str) -> None:
+    spec = {"containers": [{"args": ["kubernetes", *args]}]}
+    server.put("pods", {"metadata": {"name": "o", "labels": OPERATOR}, "spec": spec}, "system")
+
+
+async def about_webhook(api: Api) -> list[DoctorFinding]:
+    def look() -> list[DoctorFinding]:
+        facts = DoctorFacts(api, ())
+        return [*webhook_findings(facts.webhook()), *facts.refused]
+
+    return await in_thread(look)
+
+
+async def test_a_webhook_that_can_work(server: ApiServer, api: Api) -> None:
+    other = {"metadata": {"name": "other"}, "webhooks": [{"name": "x.example"}]}
+    server.put("mutatingwebhookconfigurations", other)
+    put_webhook(server)
+    put_service(server, True, False, True)
+    (finding,) = await about_webhook(api)
+    assert (finding.severity, finding.text) == (Severity.OK, "2 operators ready to wire pods")
+
+
+CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}
+
+
+@pytest.mark.parametrize(
+    ("webhook", "ready", "text", "cure"),
+    [
+        ({"ca": ""}, (True,), "no caBundle", "within 20 s"),
+        ({"ca": "", "annotations": CERT_MANAGER}, (True,), "no caBundle", "its cainjector run?"),
+        ({}, None, "its Service system/rosproxy-operator is not there", "helm upgrade"),
+        ({}, (False,), "no endpoint that is ready", "kubectl -n system describe pods"),
+        (None, (True,), "though operators serve it", "helm upgrade"),
+    ],
+)
+async def test_a_webhook_that_can_not_work(
+    server: ApiServer, api: Api, webhook: Obj | None, ready: Any, text: str, cure: str
+) -> None:
+    put_operator(server, "--webhook-bind=x:1")
+    if webhook is not None:
+        put_webhook(server, **webhook)
+    if ready is not None:
+        put_service(server, *ready)
+    (finding,) = await about_webhook(api)
+    assert finding.severity is Severity.ERROR
+    assert text in finding.text
+    assert cure in finding.fix
+    assert "rollout restart" in finding.fix
+
+
+@pytest.mark.parametrize(("operators", "severity"), [([()], Severity.INFO), ([], Severity.WARNING)])
+async def test_a_webhook_that_nobody_serves(
+    server: ApiServer, api: Api, operators: list[tuple[str, ...]], severity: Severity
+) -> None:
+    for args in operators:
+        put_operator(server, *args)
+    (finding,) = await about_webhook(api)
+    assert finding.severity is severity
+    assert "no MutatingWebhookConfiguration has wire.rosproxy.io" in finding.text
+
+
+def forbid(server: ApiServer, kind: str, group: str, place: str = "at the cluster scope") -> None:
+    words = f'{kind} is forbidden: User "me" cannot list resource "{kind}" in API group "{group}"'
+    server.refuse("GET", kind, 403, f"{words} {place}")
+
+
+async def test_rights_that_are_missing_are_named_and_the_rest_is_looked_at(
+    server: ApiServer, api: Api
+) -> None:
+    forbid(server, "endpointslices", "discovery.k8s.io", 'in the namespace "system"')
+    put_webhook(server, "")
+    put_service(server)
+    found, refused = await about_webhook(api)
+    assert "no caBundle" in found.text
+    assert refused.severity is Severity.WARNING
+    right = "list endpointslices.discovery.k8s.io -n system"
+    assert refused.text == f"not looked at: you lack the right to {right}"
+    assert refused.fix.startswith(f"kubectl auth can-i {right};")
+    forbid(server, "mutatingwebhookconfigurations", "admissionregistration.k8s.io")
+    (refused,) = await about_webhook(api)
+    assert "list mutatingwebhookconfigurations.admissionregistration.k8s.io -A" in refused.text
+
+
+async def test_without_the_right_to_pods_it_is_not_known_whether_the_webhook_is_meant(
+    server: ApiServer, api: Api
+) -> None:
+    forbid(server, "pods", "")
+    found, refused = await about_webhook(api)
+    assert (found.severity, "unless it is switched off" in found.fix) == (Severity.WARNING, True)
+    assert "list pods -A" in refused.text
+
+
+def test_what_is_no_right() -> None:
+    assert missing_right("etcd is away") == ""
+
+
+NOW = 1_800_000_000.0
+
+
+def event(about: Obj, reason: str = "R", message: str = "m", ago: float = 60, **more: Any) -> Obj:
+    meta = about["metadata"]
+    names = {"namespace": meta["namespace"], "name": meta["name"], "uid": meta["uid"]}
+    kind = about.get("kind", "Pod")
+    when = datetime.fromtimestamp(NOW - ago, UTC).isoformat().replace("+00:00", "Z")
+    return {
+        "metadata": {"name": f"{meta['name']}.{reason}.{message}.{ago}"},
+        "involvedObject": {"kind": kind, **names},
+        "type": "Warning",
+        "reason": reason,
+        "message": message,
+        "lastTimestamp": when,
+        **more,
+    }
+
+
+OWN: Obj = {"source": {"component": NAME}}
+
+
+def found(events: list[Obj], rosproxy: Obj | None = None, ready: bool = False) -> list[str]:
+    proxy, of = proxy_obj(), rosproxy or rosproxy_obj()
+    recent = recent_events(events, [of], [proxy], NOW)
+    uids = {proxy["metadata"]["uid"]} if ready else set()
+    return [f"{f.severity.name} {f.subject}: {f.text}" for f in event_findings(recent, uids)]
+
+
+def test_events_of_rosproxies_and_their_pods_the_newest_first() -> None:
+    proxy, stranger = proxy_obj(), pod_obj("stranger")
+    name = f"pod {NAMESPACE}/{proxy['metadata']['name']}"
+    events = [
+        event(proxy, "BackOff", "older", 300),
+        event(proxy, "BackOff", "pulling", 60, count=7),
+        event(rosproxy_obj(), "MasterUnreachable", "refused", 120, **OWN),
+        event(pod_obj(), "NotWired", "has no", 30, **OWN),
+        event(stranger, "Failed", "is no business of ours", 1),
+        event({**rosproxy_obj(name="gone"), "kind": "RosProxy"}, "R", "m", 1, **OWN),
+    ]
+    assert found(events) == [
+        f"INFO pod {NAMESPACE}/talker: NotWired 30 s ago: has no (no condition says so now)",
+        f"WARNING {name}: BackOff 1 min ago, 7 times: pulling",
+        f"INFO rosproxy {NAMESPACE}/arm: MasterUnreachable 2 min ago: refused (no condition says "
+        "so now)",
+    ]
+    assert "WARNING" not in "".join(found(events, ready=True))
+    assert f"INFO {name}: BackOff 1 min ago, 7 times: pulling (it is ready now)" in found(
+        events, ready=True
+    )
+
+
+def test_what_a_condition_says_is_not_told_twice() -> None:
+    text = "pod robots/talker: has no ROS_MASTER_URI; and more"
+    of = rosproxy_obj(status={"conditions": [{"type": "Degraded", "message": text}]})
+    assert found([event(pod_obj(), "NotWired", "has no ROS_MASTER_URI", **OWN)], of) == []
+
+
+def test_events_are_bounded_and_harmless() -> None:
+    proxy = proxy_obj()
+    events = [event(proxy, f"R{n}", "x" * 9000 + "\x1b", float(n)) for n in range(MOST + 5)]
+    texts = found(events)
+    assert len(texts) == MOST
+    assert all(len(text) < 600 and "\x1b" not in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"lastTimestamp": None, "eventTime": "2027-01-15T07:59:00.000000Z"},
+        {"series": {"lastObservedTime": "2027-01-15T07:59:00.000000Z", "count": 1}},
+        {"lastTimestamp": "nonsense", "firstTimestamp": "2027-01-15T07:59:00Z"},
+    ],
+)
+def test_whoever_made_it_its_time_is_found(more: Obj) -> None:
+    (text,) = found([event(proxy_obj(), "R", "m", 9999, **more)])
+    assert "R 1 min ago: m" in text
+
+
+async def test_of_pods_that_are_gone_nothing_is_told(server: ApiServer, api: Api) -> None:
+    there, gone, other = (pod_obj(name) for name in ("there", "gone", "other"))
+    of, proxy = rosproxy_obj(), proxy_obj(status={"conditions": [{"type": "Ready"}]})
+    server.put("pods", there, NAMESPACE)
+    server.put("pods", {**other, "metadata": {**other["metadata"], "uid": "anew"}}, NAMESPACE)
+    for obj in (there, gone, other, proxy):
+        server.put("events", event(obj, "NotWired", "m", NOW - time.time(), **OWN), NAMESPACE)
+    facts = DoctorFacts(api, ())
+    events = await in_thread(facts.events, [of], [proxy])
+    assert {e.id.name for e in events} == {"there", proxy["metadata"]["name"]}
+    assert ready_pods([proxy]) == frozenset()
+    forbid(server, "events", "")
+    assert await in_thread(facts.events, [of], [proxy]) == []
+    assert "list events -A" in facts.refused[0].text
