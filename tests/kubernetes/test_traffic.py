@@ -45,8 +45,11 @@ def world(_release: None, robot: Robot) -> Iterator[World]:
 def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> None:
     place, mark = (library, on), f"{library}_{on}"
     other = NODES[1 - NODES.index(on)]
+    # As in a tutorial: with the URI of the robot's master, and the label.
     made.talkers[place] = net.node(
-        library, "pub", "--topic", f"/from_{mark}", "--word", "inside", on=on
+        *(library, "pub", "--topic", f"/from_{mark}", "--word", "inside"),
+        on=on,
+        env={"ROS_MASTER_URI": robot.master_uri},
     )
     made.servers[place] = net.node(library, "serve", "--service", f"/serve_{mark}", on=on)
     # What the pods of the other node publish, and the robot.

@@ -137,7 +137,9 @@ def test_no_pod_gets_a_finalizer(shared: Namespace, uri: str) -> None:
 
 
 def test_pods_of_a_deployment_are_wired(shared: Namespace, uri: str) -> None:
-    template = shared.pod_body("unused", "sleep", "infinity")
+    """As it stands in a tutorial: with the master's own URI, and nothing but the label added."""
+    env = {"ROS_MASTER_URI": f"{NOWHERE['uri']}/"}
+    template = shared.pod_body("unused", "sleep", "infinity", env=env)
     labels = {"app": "many", INJECT: "true"}
     api.create({
         "apiVersion": "apps/v1", "kind": "Deployment",
@@ -148,6 +150,10 @@ def test_pods_of_a_deployment_are_wired(shared: Namespace, uri: str) -> None:
     wait_until(lambda: len(shared.pods("app=many")) == 2, 60, "two pods")
     for body in shared.pods("app=many"):
         assert variables(body)["ROS_MASTER_URI"] == uri
+        assert body["metadata"]["annotations"] == {
+            "rosproxy.io/master-uri": uri,
+            "rosproxy.io/replaced-master-uri": f"{NOWHERE['uri']}/",
+        }
 
 
 def test_pod_that_sets_the_right_master_itself_is_served(net: Namespace) -> None:

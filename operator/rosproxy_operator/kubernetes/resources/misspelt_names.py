@@ -39,7 +39,7 @@ _NEAR_END = 0.6
 _OPERATORS = frozenset(
     {
         *(names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT),
-        *(names.MASTER_URI, names.STATIC_PEERS),
+        *(names.MASTER_URI, names.REPLACED_URI, names.STATIC_PEERS),
     }
 )
 """Those that the operator sets itself, some of them in users' pods: they may be copied."""

@@ -25,6 +25,8 @@ ADVERTISE_HOST = "rosproxy.io/advertise-host"
 """Annotation of nodes, which users set, and of proxies' pods."""
 MASTER_URI = "rosproxy.io/master-uri"
 """Annotation of users' pods: the ROS_MASTER_URI that the webhook has set."""
+REPLACED_URI = "rosproxy.io/replaced-master-uri"
+"""Annotation of users' pods: the ROS_MASTER_URI of their template that the webhook has replaced."""
 ALLOW_FROM = "rosproxy.io/allow-from"
 """Annotation of masters' Services: namespaces whose RosProxies may name them."""
 

@@ -6,19 +6,29 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner.pods.injection import (
     MIRROR,
     Target,
     Wiring,
+    has_come_unwired,
+    target_of,
     wire,
     wiring_finding,
 )
 from rosproxy_operator.kubernetes.resources import objects
-from rosproxy_operator.kubernetes.resources.model import VALUE_AT_RUNTIME
+from rosproxy_operator.kubernetes.resources.model import (
+    VALUE_AT_RUNTIME,
+    MasterSpec,
+    Name,
+    Ros2Spec,
+)
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, URI, pod, rosproxy
 
 TO = Target(URI)
+TO_ROBOT = Target(URI, masters=frozenset({HostPort("robot", 11311)}))
 MASTER = {"name": "ROS_MASTER_URI", "value": URI}
 IP = {
     "name": "ROS_IP",
@@ -103,6 +113,75 @@ def test_a_pod_that_sets_all_itself_stays_as_it_is():
     assert wire(admitted(container(*own)), TO) == Wiring()
 
 
+def own(uri: str) -> dict[str, str]:
+    return {"name": "ROS_MASTER_URI", "value": uri}
+
+
+MASTERS = {
+    "address": MasterSpec("http://192.168.1.10:11311"),
+    "name": MasterSpec("http://Robot:11311/", "192.168.1.10"),
+    "service": MasterSpec(service=Name("robots", "roscore"), service_port=11322),
+    "other namespace's": MasterSpec(service=Name("other", "roscore")),
+}
+
+
+@pytest.mark.parametrize(
+    ("master", "uri", "names_it"),
+    [
+        ("address", "http://192.168.1.10:11311", True),
+        ("address", "http://192.168.1.10:11311/", True),
+        ("address", " HTTP://192.168.1.10:11311", True),
+        ("address", "http://192.168.1.10:11312", False),
+        ("address", "http://192.168.1.11:11311", False),
+        ("address", "http://192.168.1.10:11311/other", False),
+        ("address", "http://$(HOST):11311", False),
+        ("address", "http://:11311", False),
+        ("address", "", False),
+        ("name", "http://ROBOT:11311", True),
+        ("name", "http://robot.:11311", True),
+        ("name", "http://192.168.1.10:11311", True),
+        ("name", "http://robot2:11311", False),
+        ("service", "http://roscore:11322", True),
+        ("service", "http://roscore.robots.svc.cluster.local:11322/", True),
+        ("service", "http://roscore:11311", False),
+        ("other namespace's", "http://roscore.other:11311", True),
+        ("other namespace's", "http://roscore:11311", False),
+    ],
+)
+def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_it):
+    of = rosproxy(master=MASTERS[master])
+    obj = admitted(container({"name": "A", "value": "b"}, own(uri)))
+
+    wiring = wire(obj, target_of(of, CLUSTER_IP))
+
+    assert env_of(wiring) == [IP, {"name": "A", "value": "b"}, MASTER if names_it else own(uri)]
+    notes = {ANNOTATION: URI, "rosproxy.io/replaced-master-uri": uri}
+    assert wiring.annotations == (notes if names_it else {})
+    finding = wiring_finding(objects.pod(applied(obj, wiring)), of, CLUSTER_IP)
+    assert bool(finding) == (not names_it and "$" not in uri)
+    unwired = objects.pod({**obj, "metadata": {"labels": {INJECT: "true"}}})
+    assert has_come_unwired(unwired, of, CLUSTER_IP) == names_it
+    finding = wiring_finding(unwired, of, CLUSTER_IP)
+    assert finding is None or "create the pod anew" in finding.text
+    assert finding is None or ("take the variable out" in finding.text) == (not names_it)
+
+
+def test_what_was_replaced_stays_visible_when_it_is_wired_again():
+    target = target_of(rosproxy(), CLUSTER_IP)
+    obj = admitted(container(own("http://robot:11311")))
+    first = wire(obj, target)
+
+    second = wire(applied(obj, first), target)
+
+    assert (second.spec, second.annotations) == (None, first.annotations)
+
+
+def test_ros_2_alone_replaces_nothing():
+    of = replace(rosproxy(), spec=replace(rosproxy().spec, ros1=False, ros2=Ros2Spec()))
+
+    assert target_of(of, CLUSTER_IP).masters == frozenset()
+
+
 def test_a_pod_of_which_one_container_sets_it_is_still_wired():
     own = {"name": "ROS_MASTER_URI", "value": "http://robot:11311"}
 
@@ -184,10 +263,10 @@ _pods = st.builds(
 )
 
 
-@given(_pods, _aliases)
-def test_wiring_twice_changes_nothing_more(obj, aliases):
-    first = wire(obj, TO, aliases)
-    second = wire(applied(obj, first), TO, aliases)
+@given(_pods, _aliases, st.sampled_from([TO, TO_ROBOT]))
+def test_wiring_twice_changes_nothing_more(obj, aliases, target):
+    first = wire(obj, target, aliases)
+    second = wire(applied(obj, first), target, aliases)
 
     assert second.spec is None
     assert second.annotations == first.annotations
@@ -247,7 +326,7 @@ def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
 @pytest.mark.parametrize(
     "master",
     [
-        "http://robot:11311",
+        "http://robot:11312",
         "http://rosproxy-leg:11311",
         "http://rosproxy-arm.other:11311",
         "http://rosproxy-arm:11312",

@@ -6,11 +6,12 @@ webhook, `wiring_finding` (and for ROS 2 `ros2_pods`) for the planner, which fin
 webhook has seen.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import msgspec
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
@@ -26,6 +27,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     INJECT,
     MASTER_PORT,
     MASTER_URI,
+    REPLACED_URI,
     STATIC_PEERS,
     master_uri,
     service_id,
@@ -47,11 +49,15 @@ class Wiring(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """What a pod is to be told: the master's URI, peers and domain, unless they are empty."""
+    """What a pod is to be told: the master's URI, peers and domain, unless they are empty.
+
+    ``masters`` are hosts and ports of the real master: a ROS_MASTER_URI that names it is replaced.
+    """
 
     uri: str = ""
     static_peers: str = ""
     domain: int | None = None
+    masters: frozenset[HostPort] = frozenset()
 
 
 def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
@@ -61,6 +67,7 @@ def target_of(rosproxy: RosProxy, cluster_ip: str) -> Target:
         master_uri(cluster_ip) if rosproxy.spec.ros1 else "",
         cluster_ip if ros2 else "",
         ros2.domain if ros2 else None,
+        _masters_of(rosproxy) if rosproxy.spec.ros1 else frozenset(),
     )
 
 
@@ -69,9 +76,10 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
 
     Every container and init container that does not set them gets ROS_MASTER_URI, and ROS_IP where
     it sets no ROS_HOSTNAME either. They come first, so that variables of the template can use them
-    (``$(ROS_MASTER_URI)``). For ROS 2 these are ROS_STATIC_PEERS, and ROS_DOMAIN_ID if the RosProxy
-    names a domain. An address that this webhook has set before, as in a copy of a wired pod, is set
-    anew. Wiring a wired pod changes nothing.
+    (``$(ROS_MASTER_URI)``). A ROS_MASTER_URI that names the RosProxy's own master is what nodes use
+    without a proxy: it is replaced, and kept in an annotation. For ROS 2 it is ROS_STATIC_PEERS,
+    and ROS_DOMAIN_ID if the RosProxy names a domain. An address that this webhook has set before,
+    as in a copy of a wired pod, is set anew. Wiring a wired pod changes nothing.
 
     A pod in its node's own network must not be passed here: see `selection.select_rosproxy`.
     """
@@ -93,11 +101,14 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
     if aliases:
         wired["hostAliases"] = aliases
     changed = any(spec.get(key) != value for key, value in wired.items())
+    replaced = _replaced(spec, target) or annotations.get(REPLACED_URI, "")
     new_annotations = {
         annotation: value
         for annotation, variable, value in _addresses(target)
         if any(_value(c, variable) == value for kind in _KINDS for c in wired.get(kind, ()))
     }
+    if replaced and MASTER_URI in new_annotations:
+        new_annotations[REPLACED_URI] = replaced
     return Wiring({**spec, **wired} if changed else None, new_annotations)
 
 
@@ -106,24 +117,28 @@ def wiring_finding(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFind
 
     ``cluster_ip`` is that of the RosProxy's Service.
     """
-    text = _wrong_master(pod, rosproxy.id, cluster_ip)
+    text = _wrong_master(pod, rosproxy, cluster_ip)
     return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
 
 
-def has_come_unwired(pod: Pod, cluster_ip: str) -> bool:
+def has_come_unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     """Whether a pod is not wired, or to another address, and would be wired if it were made anew.
 
-    A pod whose template sets ROS_MASTER_URI itself would not, nor would a pod without the label.
+    A pod whose template sets another ROS_MASTER_URI than that of its RosProxy's master would not,
+    nor would a pod without the label.
     """
+    masters = _masters_of(rosproxy)
     return (
         INJECT in pod.labels
-        and not pod.own_masters
+        and all(_names_one(uri, masters) for uri in pod.own_masters)
         and pod.wired_master_uri != master_uri(cluster_ip)
     )
 
 
-def _wrong_master(pod: Pod, rosproxy_id: Name, cluster_ip: str) -> str:
-    foreign = [uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy_id, cluster_ip)]
+def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
+    masters = _masters_of(rosproxy)
+    around = [uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)]
+    foreign = [uri for uri in around if not _names_one(uri, masters)]
     if foreign:
         return (
             f"sets ROS_MASTER_URI={clean(foreign[0])[:200]} itself, which is not its proxy: take "
@@ -134,9 +149,9 @@ def _wrong_master(pod: Pod, rosproxy_id: Name, cluster_ip: str) -> str:
             f"was wired to {clean(pod.wired_master_uri)[:200]}, but its proxy is at "
             f"{master_uri(cluster_ip)} now: create the pod anew"
         )
-    if pod.wired_master_uri or pod.own_masters:
+    if not around and (pod.wired_master_uri or pod.own_masters):
         return ""
-    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy_id)
+    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy.id)
 
 
 def missing_variable_text(variable: str, pod: Pod, rosproxy_id: Name) -> str:
@@ -160,6 +175,37 @@ def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
+def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
+    """How the pods of a RosProxy may name its real master; hosts in lower case."""
+    master, service = rosproxy.spec.master, rosproxy.spec.master.service
+    if service is None:
+        named = parse_slave_uri(master.uri)
+        hosts = {named.host, master.address} - {""} if named else set[str]()
+        return frozenset(HostPort(host.lower(), named.port) for host in hosts if named)
+    long_name = f"{service.name}.{service.namespace}"
+    hosts = {long_name, f"{long_name}.svc", f"{long_name}.svc.cluster.local"}
+    if service.namespace == rosproxy.id.namespace:
+        hosts.add(service.name)
+    return frozenset(HostPort(host, master.service_port) for host in hosts)
+
+
+def _names_one(uri: str, masters: Collection[HostPort]) -> bool:
+    """Whether a ROS_MASTER_URI names one of these masters, whatever its case."""
+    plain = uri.strip().lower()
+    named = parse_slave_uri(plain)
+    if named is None or plain.removesuffix("/").count("/") != 2:  # a path is another's
+        return False
+    return HostPort(named.host.rstrip("."), named.port) in masters
+
+
+def _replaced(spec: Json, target: Target) -> str:
+    """The first ROS_MASTER_URI of a pod's template that is replaced; empty if none is."""
+    containers = (container for kind in _KINDS for container in submaps(spec, kind))
+    own = (v for c in containers for v in submaps(c, "env") if v.get("name") == VARIABLE)
+    values = (text_at(variable, "value") for variable in own)
+    return next((value for value in values if _names_one(value, target.masters)), "")
+
+
 def _addresses(target: Target) -> list[tuple[str, str, str]]:
     """The annotation, the variable and the value of each address that a pod is to be told."""
     variables = (
@@ -175,8 +221,11 @@ def _wired(container: Json, target: Target, annotations: Mapping[str, str]) -> J
     added: list[Json] = []
     for annotation, name, value in _addresses(target):
         former = annotations.get(annotation)
+        masters = target.masters if name == VARIABLE else frozenset[HostPort]()
         for index, variable in enumerate(variables):
-            if variable.get("name") == name and former and variable.get("value") == former:
+            own = text_at(variable, "value")
+            is_ours = bool(former) and own == former
+            if variable.get("name") == name and (is_ours or _names_one(own, masters)):
                 variables[index] = {**variable, "value": value}
         if name not in names:
             added.append({"name": name, "value": value})
