@@ -135,7 +135,7 @@ def test_a_masters_name_that_leads_nowhere_and_its_cure(
     blind = Process(tmp_path, "--proxy-image", process.options[-1])
     blind._names.clear()
     blind._hosts.write_text("")
-    node = net.idle(net.network())
+    node = net.node(net.network(), "rospy", "pub", "--topic", "/out")
     code, findings = wrong(blind)
     assert code == 1
     assert findings[0]["subject"] == f"master {named.name}"
@@ -150,6 +150,8 @@ def test_a_masters_name_that_leads_nowhere_and_its_cure(
         assert [proxy.running for proxy in proxies()] == [True]
         assert not [finding for finding in wrong(blind)[1] if "container" in finding["subject"]]
         assert not [finding for finding in wrong(blind)[1] if "master" in finding["check"]]
+        wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
+        assert named.run("rostopic", "echo", "-n", "1", "/out")
     finally:
         remove_proxies()
 

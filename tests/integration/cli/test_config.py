@@ -3,6 +3,7 @@
 import fcntl
 import os
 import pty
+import re
 import shutil
 import struct
 import subprocess
@@ -113,6 +114,17 @@ def test_the_operators_take_a_file(tmp_path: Path, program: str):
     assert "unknown key 'max-port'; did you mean max-ports?" in ended.stderr
 
 
+@pytest.mark.parametrize("engine", ["docker", "kubernetes"])
+def test_the_operators_use_what_the_file_says(tmp_path: Path, engine: str):
+    from rosproxy_operator.cli import main
+
+    file = tmp_path / "operator.toml"
+    file.write_text('max-ports = "7"\nproxy-image = "rosproxy:1"\n')
+    words = ["--config", str(file), "--proxy-image=rosproxy:2", "doctor"]
+    params = main.commands[engine].make_context(engine, words).params
+    assert (params["max_ports"], params["proxy_image"]) == (7, "rosproxy:2")
+
+
 async def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(start_process, monkeypatch):
     code, said = await check(*GOOD, ROSPROXY_PORT_RANG="11000-11005")
     assert code == 0
@@ -179,11 +191,18 @@ async def test_help_names_the_variable_of_each_option(words: tuple[str, ...]):
     assert "ROSPROXY_CHECK" not in text
 
 
-def test_help_of_the_operators_names_the_variables():
-    for command, variable in (("docker", "ROSPROXY_GRACE"), ("kubernetes", "ROSPROXY_NAMESPACE")):
-        words = (PROGRAMS / "rosproxy-operator", command, "--help")
-        text = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-        assert variable in text
+@pytest.mark.parametrize("engine", ["docker", "kubernetes"])
+def test_help_of_the_operators_names_the_variables(engine: str):
+    from rosproxy.cli.options import variables_of
+    from rosproxy_operator.cli import main
+
+    words = (PROGRAMS / "rosproxy-operator", engine, "--help")
+    text = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    options = [p for p in main.commands[engine].params if isinstance(p, click.Option)]
+    assert len(options) > 10
+    for option in options:
+        for variable in variables_of(option, "ROSPROXY"):
+            assert re.search(rf"\b{variable}\b", text), variable
 
 
 async def test_status_waits_until_the_proxy_is_ready(start_process, master):
