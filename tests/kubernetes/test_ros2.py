@@ -133,6 +133,7 @@ def test_what_users_are_told(world: World) -> None:
     of, count = world.rosproxy, len(world.pods)
 
     of.wait_for("Ready", reason="Serving")
+    of.wait_for("PortsReachable")
     status = of.wait_status(lambda told: told.get("participants") == count, "all participants")
 
     assert (status["domain"], status["proxies"]) == (0, "2/2")
@@ -141,6 +142,7 @@ def test_what_users_are_told(world: World) -> None:
     assert {condition["type"] for condition in status["conditions"]} == {
         "Ready",
         "PortsAllocated",
+        "PortsReachable",
         "Degraded",
     }
     assert "participants of domain 0" in of.condition("Ready")["message"]
