@@ -24,6 +24,10 @@ def test_loopback(name: str, value: str) -> None:
     assert f"leave {name} out" in text
 
 
+def test_what_an_image_says_is_told_at_no_length() -> None:
+    assert len(wrong(KEY, ROS_HOSTNAME="x" * 100_000 + ".localhost")) < 300
+
+
 @pytest.mark.parametrize("value", [HERE, TOWARDS, FAR, "172.18.0.1"])
 def test_an_address_of_this_host(value: str) -> None:
     text = wrong(ROS_IP=value)

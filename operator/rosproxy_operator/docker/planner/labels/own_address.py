@@ -8,6 +8,7 @@ it has asked a master (`ROSLaunchNode.start` in roslaunch/server.py).
 """
 
 from rosproxy.net.addresses import is_loopback
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.planner.model import Container, HostState, Key
 
 VARIABLES = ("ROS_IP", "ROS_HOSTNAME")
@@ -20,8 +21,8 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
         cure = f"leave {name} out, no node behind a proxy needs it"
         if value and is_loopback(value):
             return (
-                f"its variable {name}={value} has its nodes listen on loopback only, where "
-                f"nobody reaches them, their proxy neither: {cure}"
+                f"its variable {name}={bounded(value, 80)} has its nodes listen on loopback only, "
+                f"where nobody reaches them, their proxy neither: {cure}"
             )
         if value and value in _of_this_host(key, observed):
             return (
