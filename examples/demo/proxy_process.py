@@ -88,7 +88,7 @@ class ProxyProcess:
         if process.stdout is not None:
             async for line in process.stdout:
                 self.log.append(line.decode("utf-8", "replace").rstrip())
-                if " ready: " in self.log[-1]:
+                if " listening: " in self.log[-1]:
                     self.state = "ready"
                     ready.set()
         await process.wait()
