@@ -89,7 +89,7 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
         "ear": ear.container.state if ear else None,
         "master_uri": key.master_uri,
         "master_address": (status.master.address if status else None) or "",
-        "master_up": status.master.up if status else None,
+        "master_up": status.master.up if status and not key.is_ros2 else None,
         "advertise_host": key.advertise_host,
         "range": str(own.range) if own else "",
         "state": proxy.container.state if proxy else "absent",

@@ -2,12 +2,25 @@
 
 from dataclasses import replace
 
+import pytest
+
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.host_document import host_document
+from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.report import render
+from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
-from tests.unit.operator.docker.builders import HERE, SETTINGS, container, observed, planned
+from tests.unit.operator.docker.builders import (
+    HERE,
+    KEY,
+    SETTINGS,
+    container,
+    observed,
+    planned,
+    proxy,
+)
 
 TIGHT = PlanSettings(advertise_host=HERE, ports=2, port_window=PortRange(11400, 11401))
 
@@ -31,3 +44,15 @@ def test_a_container_whose_master_is_refused_is_listed() -> None:
     made = planned(state, settings, DockerMemory(), 0.0)
     (row,) = host_document(state, made, made.problems, {}, settings)["containers"]
     assert (row["name"], row["proxy"]) == ("talker", None)
+
+
+@pytest.mark.parametrize(("key", "up"), [(KEY, False), (Key("", HERE, 0), None)])
+def test_only_a_proxy_for_ros_1_has_a_master(key: Key, up: bool | None) -> None:
+    """What a proxy for ROS 2 says of one is nothing that is wrong."""
+    running = proxy(KEY)
+    own = replace(running.container, name=proxy_name(key))
+    state = observed(proxies=[replace(running, key=key, container=own)])
+    made = planned(state, SETTINGS, DockerMemory(), 0.0)
+    answers = {proxy_name(key): ProxyStatus()}
+    (row,) = host_document(state, made, (), answers, SETTINGS)["proxies"]
+    assert (row["reachable"], row["master_up"]) == (True, up)
