@@ -26,6 +26,10 @@ MAGIC = b"RTPS"
 VERSION, NO_VENDOR = b"\x02\x03", b"\x00\x00"
 HEADER = 20
 """Bytes of a message's header."""
+ALIGNMENT = 4
+"""The length of a parameter is a multiple of this (9.4.2.11), and that of each submessage but the
+last (9.4.1). Fast DDS rounds others up (ParameterList.cpp, MessageReceiver.cpp), so that it finds
+what follows elsewhere than who does not."""
 PREFIX = 12
 """Bytes of a GUID prefix."""
 VERSION_TO_PREFIX = HEADER - len(MAGIC)
@@ -234,8 +238,8 @@ def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
 def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
     """Each submessage's id, flags and body.
 
-    Raises RtpsError if a length leads outside, or an INFO_DST is too short: so what is kept of a
-    message can be read again later.
+    Raises RtpsError if a length leads outside, is none that all read alike, or an INFO_DST is too
+    short: so what is kept of a message can be read again later.
     """
     offset, count, size = HEADER, 0, len(datagram)
     while offset < size:
@@ -251,6 +255,8 @@ def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
             offset = size  # the last one may say so (9.4.5.1.3)
         if offset > size:
             raise RtpsError(f"submessage {kind:#x} is longer than the message")
+        if (offset - body) % ALIGNMENT and offset < size:
+            raise RtpsError(f"submessage {kind:#x} of {offset - body} bytes in front of others")
         if kind == _INFO_DST and offset - body < PREFIX:
             raise RtpsError(f"a destination of {offset - body} bytes needs {PREFIX}")
         yield kind, flags, Span(body, offset)
@@ -260,7 +266,7 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
     """Each parameter of a list: its id, where that stands, and where its value ends.
 
     The last is the sentinel, which ends with its header. Raises RtpsError if there is none, a
-    length leads outside, or there are too many.
+    length leads outside or is none that all read alike, or there are too many.
     """
     unpack = (_LITTLE_HEADER if little else _BIG_HEADER).unpack_from
     offset, last = span.start, span.end - 4
@@ -274,6 +280,8 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
         end = offset + 4 + length
         if end > span.end:
             raise RtpsError(f"parameter {pid:#x} is longer than its list")
+        if length % ALIGNMENT:
+            raise RtpsError(f"parameter {pid:#x} of {length} bytes, no multiple of {ALIGNMENT}")
         yield pid, offset, end
         offset = end
     raise RtpsError(f"a list of more than {MOST_PARAMETERS} parameters")

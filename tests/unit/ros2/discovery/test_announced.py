@@ -13,7 +13,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import DdsSecurity, LocatorFault, ParticipantTraits
 from rosproxy.ros2.rewriting.discovery import read_discovery
-from tests.unit.ros2.protocol.messages import data, message, payload
+from tests.unit.ros2.protocol.messages import VALUES, data, message, payload
 
 INSIDE, OTHER = "172.30.0.5", "172.30.0.6"
 LARGE_DATA = bytes.fromhex(
@@ -136,9 +136,7 @@ def test_its_domain(number: int, domain: int | None) -> None:
 
 @given(
     st.lists(
-        st.tuples(
-            st.sampled_from([0x31, 0x32, 0x0F, 0x1001, 0x1002, 0x1005]), st.binary(max_size=40)
-        ),
+        st.tuples(st.sampled_from([0x31, 0x32, 0x0F, 0x1001, 0x1002, 0x1005]), VALUES),
         max_size=12,
     )
 )

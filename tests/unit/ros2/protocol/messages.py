@@ -3,9 +3,13 @@
 import struct
 from collections.abc import Sequence
 
+from hypothesis import strategies as st
+
 PREFIX = bytes(range(12))
 VENDOR = b"\x01\x0f"
 SPDP_WRITER = 0x000100C2
+VALUES = st.binary(max_size=40).map(lambda value: value + bytes(-len(value) % 4))
+"""Values of parameters, whose length is a multiple of four."""
 
 
 def order(little: bool) -> str:

@@ -22,21 +22,21 @@ def info_dst(prefix: bytes = FOR) -> bytes:
 
 
 def test_a_message_of_one_participant_stays_as_it_is() -> None:
-    whole = message(info_dst(), data(b"one"), data(b"two"))
+    whole = message(info_dst(), data(b"1st!"), data(b"2nd!"))
     assert by_source(whole) == [whole]
 
 
 def test_each_participant_gets_a_message_of_its_own() -> None:
-    whole = message(data(b"first"), info_src(), data(b"2nd!"), info_src(PREFIX), data(b"last"))
+    whole = message(data(b"1st!"), info_src(), data(b"2nd!"), info_src(PREFIX), data(b"last"))
     first, other, last = by_source(whole)
-    assert first == message(data(b"first"))
+    assert first == message(data(b"1st!"))
     assert other == b"RTPS\x02\x05\x01\x10" + OTHER + data(b"2nd!")
     assert source_vendor(other) == b"\x01\x10"
     assert [sample.prefix for sample in samples(last)] == [PREFIX]
 
 
 def test_whom_it_is_meant_for_stays_so() -> None:
-    whole = message(info_dst(), data(b"one"), info_src(), data(b"two"))
+    whole = message(info_dst(), data(b"1st!"), info_src(), data(b"2nd!"))
     assert [destination(datagram) for datagram in by_source(whole)] == [FOR, FOR]
 
 
@@ -48,7 +48,7 @@ def test_who_says_nothing_gets_none() -> None:
 @pytest.mark.parametrize("rest", [submessage(0x0C, 0, bytes(8)), b"\x0c\x01\xff\xff", b"\x0c"])
 def test_a_length_that_leads_outside_is_refused(rest: bytes) -> None:
     with pytest.raises(RtpsError):
-        by_source(message(data(b"one"), rest))
+        by_source(message(data(b"1st!"), rest))
 
 
 @given(st.lists(st.sampled_from([data(b"some"), info_src(), info_dst(), info_src(PREFIX)])))

@@ -15,12 +15,11 @@ from rosproxy.ros2.protocol.parameters import (
     payload_parameters,
 )
 from rosproxy.ros2.protocol.rtps import MOST_PARAMETERS, RtpsError, Sample, apply, samples
-from tests.unit.ros2.protocol.messages import data, message, order, parameter_list, payload
+from tests.unit.ros2.protocol.messages import VALUES, data, message, order, parameter_list, payload
 
 BOTH = pytest.mark.parametrize("little", [True, False], ids=["little", "big"])
 ADDRESSES = st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)).map(str)
 PORTS = st.integers(1, 65535)
-VALUES = st.binary(max_size=40).map(lambda value: value + bytes(-len(value) % 4))
 LISTS = st.lists(st.tuples(st.integers(2, 0xFFFF), VALUES), max_size=10)
 
 
@@ -121,6 +120,8 @@ def test_a_payload_that_is_no_list(content: bytes) -> None:
         b"\0\3\0\0",
         b"\0\3\0\0\x50\0\x10\0abcd",
         b"\0\3\0\0\x50\0\x04\0abcd",
+        b"\0\3\0\0\x50\0\x03\0abc\1\0\0\0",
+        b"\0\3\0\0\x50\0\x03\0abc\0\1\0\0\0",
         b"\0\3\0\0" + b"\2\0\0\0" * MOST_PARAMETERS + b"\1\0\0\0",
     ],
 )

@@ -17,7 +17,7 @@ from rosproxy.ros2.protocol.qos import (
     read_qos,
 )
 from rosproxy.ros2.protocol.rtps import samples
-from tests.unit.ros2.protocol.messages import data, message, order, payload
+from tests.unit.ros2.protocol.messages import VALUES, data, message, order, payload
 
 # What Fast DDS 2.14 (Jazzy) announces of a publisher of QoSProfile(depth=10), and Cyclone DDS 11 of
 # a reliable reader, without names and locators.
@@ -139,9 +139,7 @@ def test_kinds_that_do_not_exist() -> None:
 
 @given(
     st.lists(
-        st.tuples(
-            st.sampled_from([0x1A, 0x1B, 0x1D, 0x1F, 0x23, 0x29, 0x73]), st.binary(max_size=40)
-        ),
+        st.tuples(st.sampled_from([0x1A, 0x1B, 0x1D, 0x1F, 0x23, 0x29, 0x73]), VALUES),
         max_size=10,
     ),
     st.booleans(),

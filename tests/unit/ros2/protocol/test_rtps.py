@@ -19,9 +19,11 @@ from rosproxy.ros2.protocol.rtps import (
 from tests.unit.ros2.protocol.messages import (
     PREFIX,
     SPDP_WRITER,
+    VALUES,
     data,
     fragment,
     message,
+    parameter,
     parameter_list,
     payload,
     submessage,
@@ -29,7 +31,7 @@ from tests.unit.ros2.protocol.messages import (
 
 BOTH = pytest.mark.parametrize("little", [True, False], ids=["little", "big"])
 PARAMETERS = st.lists(
-    st.tuples(st.integers(2, 0xFFFF), st.binary(max_size=40).map(lambda b: b + bytes(-len(b) % 4))),
+    st.tuples(st.integers(2, 0xFFFF), VALUES),
     max_size=8,
 )
 
@@ -83,11 +85,22 @@ def test_the_last_submessage_may_tell_no_length() -> None:
     assert sample.payload is not None
 
 
+@pytest.mark.parametrize("size", [5, 6, 7])
+def test_the_last_submessage_may_have_any_length(size: int) -> None:
+    (sample,) = samples(message(submessage(0x80, 0, b"abcd"), data(bytes(size))))
+    assert sample.payload is not None
+
+
 def test_a_pad_of_no_length_is_no_last_submessage() -> None:
     assert len(samples(message(submessage(0x01, 0, b""), data(b"abcd")))) == 1
 
 
-@given(st.lists(st.tuples(st.integers(0x80, 0xFF), st.binary(min_size=1, max_size=60)), max_size=9))
+@given(
+    st.lists(
+        st.tuples(st.integers(0x80, 0xFF), st.integers(1, 15).map(lambda words: bytes(4 * words))),
+        max_size=9,
+    )
+)
 def test_what_is_not_known_is_passed_over(unknown: list[tuple[int, bytes]]) -> None:
     unknown_submessages = [submessage(kind, 0, body) for kind, body in unknown]
     read_samples = samples(message(*unknown_submessages, data(b"abcd"), *unknown_submessages))
@@ -110,6 +123,8 @@ def test_what_is_not_known_is_passed_over(unknown: list[tuple[int, bytes]]) -> N
         message(submessage(0x15, 0x04, struct.pack("<HH", 0, 4) + bytes(16))),
         message(submessage(0x15, 0x06, struct.pack("<HH", 0, 16) + bytes(20) + b"\0\0")),
         message(*[submessage(0x80, 0, b"")[:2] + b"\4\0abcd"] * (MOST_SUBMESSAGES + 1)),
+        message(submessage(0x80, 0, b"abc"), data(b"abcd")),
+        message(data(b"abcd", qos=b"\x71\0\3\0abc" + parameter(1, b""))),
     ],
 )
 def test_what_leads_outside_is_refused(datagram: bytes) -> None:

@@ -1,0 +1,100 @@
+"""Datagrams that one implementation reads in another way than the next: none passes a policy."""
+
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.protocol.parameters import Pid
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    NOW,
+    ROBOT,
+    SEDP_WRITERS,
+    A,
+    B,
+    make_domain,
+    meet,
+    spdp,
+)
+from tests.unit.ros2.protocol.messages import (
+    data,
+    message,
+    order,
+    parameter,
+    submessage,
+)
+
+
+def topic(name: str, little: bool = True) -> bytes:
+    text = struct.pack(order(little) + "I", len(name) + 1) + name.encode() + b"\0"
+    return parameter(Pid.TOPIC_NAME, text + bytes(-len(text) % 4), little)
+
+
+def denying() -> Domain:
+    domain = make_domain(judge=lambda _kind, name, _address: name != "/secret")
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    return domain
+
+
+def metatraffic(domain: Domain) -> int:
+    (port,) = [port for port, (_, le) in domain.inside.leases.items() if le.target.port == 7410]
+    return port
+
+
+def crossing(domain: Domain, submessages: bytes) -> Iterator[list[Outgoing]]:
+    """What goes on of a message from inside, and of one from outside."""
+    (stand_in,) = domain.outside.stand_ins
+    yield domain.at_stand_in(stand_in, message(submessages, prefix=A), INSIDE, NOW)
+    yield domain.at_lease(metatraffic(domain), message(submessages, prefix=B), ROBOT, NOW)
+
+
+def announced(parameters: bytes, little: bool = True) -> bytes:
+    encoding = bytes([0, 3 if little else 2, 0, 0])
+    return data(encoding + parameters, writer=SEDP_WRITERS, little=little)
+
+
+def behind_an_unaligned_parameter() -> bytes:
+    """Read without rounding up, the next three bytes begin one that ends before what is allowed."""
+    denied, allowed, end = (
+        topic("rt/secret", False),
+        topic("rt/public", False),
+        parameter(1, b"", False),
+    )
+    one_byte, unknown = struct.pack(">HHB", 0x8000, 1, 0), struct.pack(">HH", 0x8000, 256)
+    assert unknown[3:] == denied[:1]
+    before = bytes(256 - len(denied[1:]) - 4)
+    told = parameter(0x8000, before + allowed + end + bytes(3), False)
+    return announced(one_byte + unknown[:3] + denied + told + end, False)
+
+
+def behind_an_unaligned_submessage() -> bytes:
+    """Read without rounding up, the next three bytes begin an unknown one, up to the end."""
+    denied = topic("rt/secret") + parameter(1, b"")
+    filler = parameter(0x8000, bytes(0x114 - len(announced(denied)) - 4))
+    hidden = announced(filler + denied + b"\0\0")
+    unknown = struct.pack(">BBH", 0x80, 0, len(hidden) - 1)
+    assert unknown[3:] == hidden[:1]
+    return submessage(0x01, 0, b"\0") + unknown[:3] + hidden
+
+
+@pytest.mark.parametrize(
+    "hidden", [behind_an_unaligned_parameter(), behind_an_unaligned_submessage()]
+)
+def test_what_is_behind_an_unaligned_length_is_not_passed(hidden: bytes) -> None:
+    """Fast DDS rounds it up and reads the topic that is denied; the proxy read another, or none."""
+    domain = denying()
+    for count, sent in enumerate(crossing(domain, hidden), 1):
+        assert sent == []
+        assert domain.refused.count == count
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_an_unaligned_submessage_may_be_the_last(size: int) -> None:
+    said = announced(topic("rt/public") + parameter(1, b"")) + submessage(0x80, 0, bytes(size))
+    for sent in crossing(denying(), said):
+        assert sent[-1].datagram.endswith(bytes(size))
+        assert b"rt/public" in sent[-1].datagram
