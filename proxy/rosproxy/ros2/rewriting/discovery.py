@@ -25,6 +25,7 @@ from rosproxy.ros2.protocol.parameters import (
 )
 from rosproxy.ros2.protocol.reliable import withheld
 from rosproxy.ros2.protocol.rtps import (
+    PREFIX,
     Fragments,
     Overwrite,
     RtpsError,
@@ -45,9 +46,13 @@ MULTICAST = (
     Pid.DEFAULT_MULTICAST_LOCATOR,
     Pid.METATRAFFIC_MULTICAST_LOCATOR,
 )
+_IDENTITIES = (Pid.PARTICIPANT_GUID, Pid.ENDPOINT_GUID, Pid.KEY_HASH)
+"""Parameters by which an announcement says what it is about; each begins with a GUID prefix.
+Receivers act on these, whoever has sent the message (Fast DDS: EDPSimplePUBListener)."""
 _DISPOSED_OR_UNREGISTERED = 0x03
 LONGEST_OF_PARTICIPANT = 8192
 """Bytes of a datagram in which a participant announces itself; it is kept. Some have 1,500."""
+_OF_ANOTHER = "it announces another participant than the one that sends it"
 LONGEST_TOPIC = 1024
 """Bytes of a topic's name; those of ROS 2 have 255."""
 
@@ -134,13 +139,15 @@ class DiscoveryMessage(msgspec.Struct, frozen=True):
 def read_discovery(datagram: bytes) -> DiscoveryMessage:
     """What a datagram announces.
 
-    Raises RtpsError if it or an announcement is malformed, or is of another participant than the
-    sender.
+    Raises RtpsError if it or an announcement is malformed, or is of or about another participant
+    than the sender.
     """
     prefix = source_prefix(datagram)
     builtin_samples = [sample for sample in samples(datagram) if sample.writer in _BUILTIN_WRITERS]
     if any(sample.prefix != prefix for sample in builtin_samples):
-        raise RtpsError("it announces another participant than the one that sends it")
+        raise RtpsError(_OF_ANOTHER)
+    for sample in builtin_samples:  # fragments have inline QoS as well
+        _require_own(datagram, sample, inline_parameters(datagram, sample))
     message = DiscoveryMessage(
         datagram,
         prefix,
@@ -171,9 +178,11 @@ def rewritten(
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     parameters, inline = payload_parameters(datagram, sample), inline_parameters(datagram, sample)
     ended = sample.is_key_only or _tells_an_end(datagram, inline)
-    if parameters is None and not ended:
+    # An end may have no payload, but not one in which nobody has looked for whose it is.
+    if parameters is None and (sample.payload or not ended):
         raise RtpsError("an announcement that is no parameter list")
     parameters = parameters or ParameterList(sample.little, ())
+    _require_own(datagram, sample, parameters)
     topics = parameters.all(Pid.TOPIC_NAME)
     # The policy is asked of the first alone, and a receiver may take another one.
     if len(topics) > 1:
@@ -181,6 +190,14 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC:
         raise RtpsError(f"a topic with a name of more than {LONGEST_TOPIC} bytes")
     return Announcement(BuiltinWriter(sample.writer), sample, parameters, inline, ended)
+
+
+def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | None) -> None:
+    """Raise RtpsError if an announcement is about another participant than the one it is of."""
+    for parameter in parameters.all(*_IDENTITIES) if parameters else ():
+        start, end = parameter.value.start, parameter.value.end
+        if datagram[start : min(start + PREFIX, end)] != sample.prefix:
+            raise RtpsError(_OF_ANOTHER)
 
 
 def _tells_an_end(datagram: bytes, inline_qos: ParameterList | None) -> bool:

@@ -63,11 +63,12 @@ def fragment(
     *,
     writer: int = SPDP_WRITER,
     sequence: int = 1,
+    qos: bytes = b"",
     little: bool = True,
 ) -> bytes:
-    """A DATA_FRAG submessage with as many fragments as the part has."""
+    """A DATA_FRAG submessage with as many fragments as the part has; ``qos`` as in `data`."""
     mark = order(little)
     body = struct.pack(mark + "HH", 0, 28) + bytes(4) + writer.to_bytes(4, "big")
     body += struct.pack(mark + "iI", sequence >> 32, sequence & 0xFFFFFFFF)
-    body += struct.pack(mark + "IHHI", first, -(-len(chunk) // size), size, total) + chunk
-    return submessage(0x16, 0, body, little)
+    body += struct.pack(mark + "IHHI", first, -(-len(chunk) // size), size, total) + qos + chunk
+    return submessage(0x16, 0x02 if qos else 0, body, little)

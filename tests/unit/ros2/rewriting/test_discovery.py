@@ -102,7 +102,7 @@ def test_the_end_of_a_participant_is_told_by_its_status(
 
 
 def test_a_key_alone_tells_an_end_as_well() -> None:
-    datagram = message(data(payload([(Pid.PARTICIPANT_GUID, bytes(16))]), key=True))
+    datagram = message(data(payload([(Pid.PARTICIPANT_GUID, bytes(range(16)))]), key=True))
     assert read_discovery(datagram).announcements[0].ended
 
 
@@ -120,7 +120,7 @@ def test_an_announcement_without_an_end_is_refused() -> None:
 
 
 LOCATORS = st.tuples(
-    st.sampled_from([*UNICAST, *MULTICAST, Pid.TYPE_NAME, Pid.KEY_HASH]),
+    st.sampled_from([*UNICAST, *MULTICAST, Pid.TYPE_NAME, Pid.ENTITY_NAME]),
     st.binary(min_size=24, max_size=24),
 )
 

@@ -1,0 +1,100 @@
+"""Whom an announcement is about: nobody announces or ends another, whatever names him."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from tests.unit.ros2.discovery.domains import (
+    EAR,
+    INSIDE,
+    NOW,
+    OTHER,
+    ROBOT,
+    A,
+    B,
+    make_domain,
+    meet,
+    spdp,
+)
+from tests.unit.ros2.protocol.messages import data, fragment, message, parameter_list, payload
+
+C = b"\x01\x0f" + bytes(9) + b"\x07"
+IDENTITIES = [Pid.PARTICIPANT_GUID, Pid.ENDPOINT_GUID, Pid.KEY_HASH]
+ENDED = (Pid.STATUS_INFO, bytes([0, 0, 0, 3]))
+TOPIC = (Pid.TOPIC_NAME, b"\x0b\0\0\0rt/chatter\0\0")
+ENTITY = bytes([0, 0, 1, 3])
+
+
+def met() -> Domain:
+    """A and C are inside, B is outside."""
+    domain = make_domain()
+    meet(domain)
+    meet(domain, C, OTHER)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    return domain
+
+
+def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
+    """What goes on of what A says inside, and B outside, by each way that there is."""
+    (stand_in,) = domain.outside.stand_ins
+    (lease,) = [le for le in domain.inside.by_prefix[A].leases.values() if le.target.port == 7410]
+    inside, outside = message(said, prefix=A), message(said, prefix=B)
+    yield domain.at_stand_in(stand_in, inside, INSIDE, NOW)
+    yield domain.heard_inside(inside, INSIDE, NOW)
+    yield domain.at_lease(lease.port, outside, ROBOT, NOW)
+    yield domain.heard_outside(outside, ROBOT, NOW)
+    yield domain.heard_outside(wrapped(ROBOT, outside), EAR.host, NOW)
+
+
+def said_of(prefix: bytes, pid: int, writer: int) -> dict[str, bytes]:
+    """Announcements and ends by which somebody names a participant."""
+    named = (pid, prefix + ENTITY)
+    key = parameter_list([named, ENDED])
+    part = payload([TOPIC, (0x8000, bytes(200))])
+    return {
+        "announced": data(payload([named, TOPIC]), writer=writer),
+        "announced, by the key": data(payload([TOPIC]), qos=parameter_list([named]), writer=writer),
+        "announced twice": data(payload([(pid, A + ENTITY), named, TOPIC]), writer=writer),
+        "ended": data(payload([named]), qos=parameter_list([ENDED]), writer=writer),
+        "ended, by the key": data(qos=key, writer=writer),
+        "ended, as a key alone": data(payload([named]), key=True, writer=writer),
+        "ended in fragments": fragment(part, 1, 300, len(part), writer=writer, qos=key),
+        "half a name": data(payload([(pid, prefix[:8]), TOPIC]), writer=writer),
+    }
+
+
+@pytest.mark.parametrize("how", said_of(C, Pid.KEY_HASH, BuiltinWriter.PARTICIPANTS))
+@pytest.mark.parametrize("pid", IDENTITIES)
+@pytest.mark.parametrize("writer", BuiltinWriter)
+def test_nobody_speaks_for_another_under_his_own_prefix(
+    how: str, pid: int, writer: BuiltinWriter
+) -> None:
+    """Fast DDS ends or takes in whom the parameter names; it passed as it was."""
+    domain = met()
+    for count, sent in enumerate(crossing(domain, said_of(C, pid, writer)[how]), 1):
+        assert sent == []
+        assert domain.refused.count == count
+    assert domain.inside.by_prefix.keys() == {A, C}
+    assert domain.outside.by_prefix.keys() == {B}
+
+
+def test_nobody_is_ended_by_a_key_that_is_no_parameter_list() -> None:
+    domain = met()
+    raw = data(bytes([0, 1, 0, 0]) + C + ENTITY, key=True, writer=BuiltinWriter.PUBLICATIONS)
+    for sent in crossing(domain, raw):
+        assert sent == []
+
+
+@pytest.mark.parametrize("how", said_of(A, Pid.KEY_HASH, BuiltinWriter.PUBLICATIONS))
+@pytest.mark.parametrize("pid", IDENTITIES)
+def test_everybody_speaks_for_himself(how: str, pid: int) -> None:
+    domain = met()
+    (stand_in,) = domain.outside.stand_ins
+    said = said_of(A, pid, BuiltinWriter.PUBLICATIONS)[how]
+    sent = domain.at_stand_in(stand_in, message(said, prefix=A), INSIDE, NOW)
+    assert bool(sent) is (how != "half a name")
