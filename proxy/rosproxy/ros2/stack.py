@@ -233,9 +233,10 @@ class Ros2:
 
     async def apply_policy(self) -> EnforcementCounts:
         """Match participants anew of whom the policy says something else than before."""
-        self._applied = self._runtime.policy.version
+        version = self._runtime.policy.version
         for server in self.servers:
             server.apply_policy()
+        self._applied = version  # only now: what fails is tried again
         return EnforcementCounts()
 
     retired = False

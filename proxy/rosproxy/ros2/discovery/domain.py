@@ -143,8 +143,12 @@ class Domain(DomainParticipants):
         sent = self.returning.repeated_questions(now)
         for source, message in self.returning.ready(now):
             if message.prefix not in self.outside.by_prefix:
-                sent += self._announced_inside(message, source, now)
-        return sent + self.rediscovery.proceed(self.inside.by_prefix.values(), now)
+                admit = partial(self._announced_inside, message, source, now)
+                sent += self._unless_malformed(source, admit)
+        for insider in list(self.inside.by_prefix.values()):
+            proceed = partial(self.rediscovery.proceed, insider, now)
+            sent += self._unless_malformed(insider.address, proceed)
+        return sent
 
     def apply_policy(self, now: float) -> list[Outgoing]:
         """Have participants meet anew of which the policy says something else than before."""
@@ -153,8 +157,16 @@ class Domain(DomainParticipants):
         for insider in self.inside.by_prefix.values():
             if has_changed(self.settings.judge, insider):
                 insider.verdicts.clear()
-                sent += self.rediscovery.separate(insider, now)
+                separate = partial(self.rediscovery.separate, insider, now)
+                sent += self._unless_malformed(insider.address, separate)
         return sent
+
+    def _unless_malformed(self, source: str, step: Callable[[], list[Outgoing]]) -> list[Outgoing]:
+        """What a step gives to send, or nothing: one participant must not keep it from others."""
+        try:
+            return step()
+        except RtpsError as error:
+            return self._drop("malformed", source, str(error))
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         prefix, spdp = message.prefix, message.of_participant

@@ -36,7 +36,7 @@ from rosproxy.ros2.registry.participants import (
     LeaseKind,
     ParticipantTable,
 )
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, rewritten
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, require_rewritable, rewritten
 
 
 @dataclass(slots=True)
@@ -57,12 +57,13 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
         """The participant that announces itself from an address; None if it is not accepted.
 
-        One that is on several networks itself is served at the first.
+        One that is on several networks itself is served at the first. Raises RtpsError.
         """
         prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
         participant = self.find(prefix, source)
         if spdp is None:
             return participant
+        require_rewritable(message)
         if participant is None:
             if prefix in self.by_prefix:
                 return None

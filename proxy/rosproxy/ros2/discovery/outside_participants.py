@@ -42,6 +42,7 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     read_discovery,
+    require_rewritable,
     rewritten,
 )
 
@@ -63,7 +64,11 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> OutsideParticipant | None:
-        """The participant that announces itself or its end at an address; None if not accepted."""
+        """The participant that announces itself or its end at an address; None if not accepted.
+
+        Raises RtpsError.
+        """
+        require_rewritable(message)
         prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
         participant = self.find(prefix, source)
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):

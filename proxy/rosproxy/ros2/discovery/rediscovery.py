@@ -39,7 +39,7 @@ class Rediscovery:
     ear_heard: bool = False
 
     def separate(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """Have a participant inside and all outside forget each other."""
+        """Have a participant inside and all outside forget each other. Raises RtpsError."""
         insider.parting_from, insider.apart_until, insider.farewell_times = (
             None,
             now + APART_TIME,
@@ -50,17 +50,15 @@ class Rediscovery:
         inwards = [sent for o in outsiders for sent in self.outside.farewell_to(o, insider, now)]
         return inwards + self.settings.to_outside(datagram)
 
-    def proceed(self, insiders: Iterable[InsideParticipant], now: float) -> list[Outgoing]:
-        """Part those that have waited, and introduce those that are apart for long enough."""
-        sent = list[Outgoing]()
-        for insider in insiders:
-            if insider.parting_from is not None and self._may_part(insider.parting_from, now):
-                sent += self.separate(insider, now)
-            elif insider.apart_until is not None and now >= insider.apart_until:
-                insider.apart_until = None
-                sent += self.settings.to_outside(insider.announcement)
-                sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
-        return sent
+    def proceed(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+        """Part one that has waited, or introduce one that is apart for long enough. RtpsError."""
+        if insider.parting_from is not None and self._may_part(insider.parting_from, now):
+            return self.separate(insider, now)
+        if insider.apart_until is None or now < insider.apart_until:
+            return []
+        insider.apart_until = None
+        sent = self.settings.to_outside(insider.announcement)
+        return sent + self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
 
     def note_met(self, insider: InsideParticipant, prefix: bytes) -> None:
         """Note that a participant inside has sent something to where one outside is found now."""

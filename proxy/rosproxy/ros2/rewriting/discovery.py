@@ -175,6 +175,14 @@ def rewritten(
     return apply(message.datagram, edits)
 
 
+def require_rewritable(message: DiscoveryMessage) -> None:
+    """Raise RtpsError unless all that a message announces can be led elsewhere, and be hidden.
+
+    Before anything of it is kept, which is rewritten again and again later.
+    """
+    rewritten(message, lambda *_: None, lambda told: bool(told.topic(message.datagram)))
+
+
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     parameters, inline = payload_parameters(datagram, sample), inline_parameters(datagram, sample)
     ended = sample.is_key_only or _tells_an_end(datagram, inline)
@@ -187,6 +195,9 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     # The policy is asked of the first alone, and a receiver may take another one.
     if len(topics) > 1:
         raise RtpsError("an announcement that names more than one topic")
+    is_endpoint = sample.writer in _KINDS
+    if is_endpoint and not ended and not parameters.text(datagram, Pid.TOPIC_NAME):
+        raise RtpsError("a reader or writer without a topic")
     if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC:
         raise RtpsError(f"a topic with a name of more than {LONGEST_TOPIC} bytes")
     return Announcement(BuiltinWriter(sample.writer), sample, parameters, inline, ended)

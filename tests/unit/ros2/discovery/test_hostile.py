@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -10,19 +11,22 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain_settings import MOST_INSIDE, MOST_PER_ADDRESS, MOST_PER_HOST
+from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import LAST_NUMBER
+from rosproxy.ros2.protocol.rtps import LAST_NUMBER, RtpsError
 from rosproxy.ros2.registry import locator_ports, participants
 from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
     EndpointKind,
     EndpointNotes,
+    InsideParticipant,
     Participant,
 )
+from rosproxy.ros2.rewriting import discovery
 from tests.unit.ros2.discovery.domains import (
     EAR,
     INSIDE,
@@ -115,7 +119,7 @@ def test_an_exhausted_range_is_not_sorted_for_each_locator(monkeypatch: pytest.M
         for number in range(400)
     ]
     meet(domain)
-    long = message(data(payload(locators), writer=SEDP_WRITERS), prefix=A)
+    long = message(data(payload([TOPIC, *locators]), writer=SEDP_WRITERS), prefix=A)
     domain.heard_inside(long, INSIDE, NOW)
     assert len(ordered) == 15  # the ports that there are
 
@@ -220,6 +224,101 @@ def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> No
     assert evil not in {*domain.outside.by_prefix, *domain.inside.by_prefix}
     denied.append("/chatter")
     domain.apply_policy(NOW)
+
+
+EVIL = b"\x01\x0f" + bytes([0x5A] * 10)
+NAMELESS = data(payload([]), writer=SEDP_WRITERS)
+"""A reader or writer without a topic, in 28 bytes: too short to become a GAP."""
+
+
+@pytest.mark.parametrize(
+    "behind",
+    [NAMELESS, data(payload([(Pid.TOPIC_NAME, b"\1\0\0\0\0\0\0\0")]), writer=SEDP_WRITERS)],
+)
+def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
+    """Who announced one that was hidden was taken in nevertheless, and every later change of the
+    policy, and every announcement of others, failed by him."""
+    denied = [""]
+    domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
+    domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
+    domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
+    domain.heard_outside(wrapped(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
+    assert (domain.refused.count, domain.inside.leases) == (3, {})
+    assert EVIL not in {*domain.inside.by_prefix, *domain.outside.by_prefix}
+    meet(domain, A, OTHER)
+    assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), OTHER)
+    (stand_in,) = domain.outside.stand_ins
+    domain.at_stand_in(stand_in, sedp(A, OTHER, 7000), OTHER, NOW)
+    denied.append("/chatter")
+    assert domain.apply_policy(NOW)
+    assert domain.settle(NOW + APART_TIME)
+
+
+def test_who_can_not_be_rewritten_is_not_taken_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise RtpsError("it can't be withheld")
+
+    domain = make_domain(judge=lambda *_: False)
+    monkeypatch.setattr(discovery, "withheld", refuse)
+    behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
+    domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
+    domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
+    assert not domain.inside.by_prefix
+    assert not domain.inside.leases
+    assert not domain.outside.by_prefix
+    assert meet(domain)
+    assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    before = domain.outside.by_prefix[B].announcement
+    domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW)
+    assert domain.outside.by_prefix[B].announcement == before
+
+
+def test_one_whose_announcement_is_bad_keeps_no_policy_from_others() -> None:
+    denied: list[str] = []
+    domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
+    meet(domain, EVIL, INSIDE)
+    meet(domain, A, OTHER)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = domain.outside.stand_ins
+    domain.at_stand_in(stand_in, sedp(EVIL, INSIDE, 7000), INSIDE, NOW)
+    domain.at_stand_in(stand_in, sedp(A, OTHER, 7000), OTHER, NOW)
+    domain.inside.by_prefix[EVIL].announcement = b"no RTPS message"
+    denied.append("/chatter")
+    domain.apply_policy(NOW)
+    assert domain.inside.by_prefix[A].is_apart
+    assert domain.refused.count == 1
+    assert spdp(A, OTHER)[:20] in {told[:20] for told in to(domain.settle(NOW + APART_TIME), ROBOT)}
+    assert not domain.inside.by_prefix[A].is_apart
+
+
+def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None:
+    domain = make_domain()
+    meet(domain, EVIL, INSIDE)
+    meet(domain, A, OTHER)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    for insider in domain.inside.by_prefix.values():
+        domain.rediscovery.separate(insider, NOW)
+    domain.outside.by_prefix[B].announcement = b"no RTPS message"
+    domain.settle(NOW + APART_TIME)
+    assert not any(insider.is_apart for insider in domain.inside.by_prefix.values())
+
+
+def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    domain = make_domain()
+    domain.heard_inside(spdp(EVIL, INSIDE), INSIDE, 0.1)
+    domain.heard_inside(spdp(A, OTHER), OTHER, 0.1)
+    exported = domain.inside.exported
+
+    def refusing(insider: InsideParticipant, *rest: Any) -> bytes:
+        if insider.prefix == EVIL:
+            raise RtpsError("malformed")
+        return exported(insider, *rest)
+
+    monkeypatch.setattr(InsideParticipants, "exported", lambda _, *rest: refusing(*rest))
+    assert to(domain.settle(0.1 + ANSWER_TIME), ROBOT)
+    assert domain.inside.by_prefix[A].leases
 
 
 def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:

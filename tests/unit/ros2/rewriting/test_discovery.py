@@ -130,7 +130,8 @@ def test_nothing_but_locators_changes(
     parameters: list[tuple[Pid, bytes]], writer: BuiltinWriter, little: bool
 ) -> None:
     """Whatever they hold, all other bytes stay, and no locator leads where it led before."""
-    before = message(data(payload(parameters, little), writer=writer, little=little))
+    named = (Pid.TOPIC_NAME, struct.pack(order(little) + "I", 4) + b"rt/\0")
+    before = message(data(payload([named, *parameters], little), writer=writer, little=little))
     after = rewritten(read_discovery(before), lambda pid, locator: HostPort(HOST, 45000), nothing)
     (announcement,) = read_discovery(before).announcements
     restored = bytearray(after)
