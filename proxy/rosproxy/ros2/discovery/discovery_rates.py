@@ -3,6 +3,7 @@
 Reading discovery costs a hundred times what passing on a user's datagram does, and one announcement
 goes on to everybody on the other side. So each source has an allowance of datagrams, in and out,
 that fills up again with the time; a long one counts as several, since it takes as long to read.
+What users send is not charged, also where it comes to a port for both, as that of Cyclone DDS.
 What is over it is dropped, as datagrams may be anywhere: discovery is repeated, and its readers
 ask for what they lack.
 """

@@ -35,6 +35,7 @@ from rosproxy.ros2.protocol.rtps import (
     RtpsError,
     by_source,
     for_all,
+    may_be_discovery,
     source_vendor,
 )
 from rosproxy.ros2.registry.participants import (
@@ -109,10 +110,14 @@ class Domain(DomainParticipants):
             insider, lease = leased
             if lease.kind is LeaseKind.DATA:
                 return [self._passed(lease, datagram, True)]
-            if self.outside.is_strange(source) or self._is_too_much(datagram, source, now):
+            if self.outside.is_strange(source):
                 return []
-            imported = partial(self._imported, port, source, insider, now)
-            passed, back = _pass_on_each(datagram, imported)
+            passed, back = [datagram], list[Outgoing]()
+            if may_be_discovery(datagram):  # Cyclone DDS has one locator for both
+                if self._is_too_much(datagram, source, now):
+                    return []
+                imported = partial(self._imported, port, source, insider, now)
+                passed, back = _pass_on_each(datagram, imported)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
         return [self._passed(lease, d, True) for d in passed] + back
@@ -122,7 +127,8 @@ class Domain(DomainParticipants):
         users = list(self.outside.stand_ins.get(port, ()))
         passed, back = list[bytes](), list[Outgoing]()
         try:
-            if any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users):
+            is_metatraffic = any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users)
+            if is_metatraffic and may_be_discovery(datagram):
                 if self._is_too_much(datagram, source, now):
                     return []
                 exported = partial(self._exported, port, source, users[0][0].prefix, now)

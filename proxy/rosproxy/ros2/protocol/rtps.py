@@ -34,6 +34,8 @@ PREFIX = 12
 """Bytes of a GUID prefix."""
 VERSION_TO_PREFIX = HEADER - len(MAGIC)
 """Bytes of what a header and an INFO_SRC both have: version, vendor, GUID prefix."""
+MOST_OF_USERS = 16
+"""Submessages of a datagram that may pass unread; of users' data there are half a dozen."""
 MOST_SUBMESSAGES = 256
 """Submessages of a datagram that are read; real ones have a dozen."""
 
@@ -83,7 +85,17 @@ _WRITER_AT: dict[int, int] = {
     SubmessageId.NACK_FRAG: 4,
     SubmessageId.HEARTBEAT_FRAG: 4,
 }
-"""Where in its body a submessage has the writer's entity id."""
+"""Where in its body a submessage has the writer's entity id; in front of it stands the reader's."""
+_NAMELESS = frozenset(
+    kind.value
+    for kind in (
+        SubmessageId.PAD,
+        SubmessageId.INFO_TS,
+        SubmessageId.INFO_SRC,
+        SubmessageId.INFO_DST,
+    )
+)
+"""Submessages that are from no writer, and only tell of those that follow."""
 _BUILT_IN = 0xC0
 """The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
 
@@ -186,6 +198,34 @@ def of_built_in_writer(datagram: bytes) -> bool | None:
             _require_size(body, offset + 4)
             return bool(datagram[body.start + offset + 3] & _BUILT_IN == _BUILT_IN)
     return None
+
+
+def may_be_discovery(datagram: bytes) -> bool:
+    """Whether a message has to be read: whether a built-in writer or reader may be named in it.
+
+    So it may where it is no message, has more submessages than users' data has, or such as nobody
+    can look into: those of DDS Security, and unknown ones.
+    """
+    try:
+        source_prefix(datagram)
+        for count, (kind, _, body) in enumerate(submessages(datagram)):
+            if count >= MOST_OF_USERS or (
+                kind not in _NAMELESS and _names_built_in(datagram, kind, body)
+            ):
+                return True
+    except RtpsError:
+        return True
+    return False
+
+
+def _names_built_in(datagram: bytes, kind: int, body: Span) -> bool:
+    """Whether a submessage names a built-in reader or writer, or may. Raises RtpsError."""
+    offset = _WRITER_AT.get(kind)
+    if offset is None:
+        return True
+    _require_size(body, offset + 4)
+    reader, writer = datagram[body.start + offset - 1], datagram[body.start + offset + 3]
+    return _BUILT_IN in (reader & _BUILT_IN, writer & _BUILT_IN)
 
 
 def samples(datagram: bytes) -> list[Sample]:
