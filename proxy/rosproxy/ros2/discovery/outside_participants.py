@@ -2,10 +2,12 @@
 
 Their discovery passes the proxy always: its locators are led to *stand-ins*, ports of the proxy's
 that those inside reach. What users send goes there directly, unless the direction is both: then the
-locators of user data are led to stand-ins as well, and inside needs no route.
+locators of user data are led to stand-ins as well, and inside needs no route. Of several addresses
+inside gets the one that a participant was heard from. Each machine has others that mean another one
+inside: those of its own container networks may be the very gateway of the reader's.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from math import inf
@@ -103,7 +105,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         note_endpoints(self.notes, outsider, message.datagram, message.announcements)
         # The observer alone gets this: it is rewritten to open the stand-ins. Nothing is hidden,
         # since the observer would ask for that again and again.
-        return rewritten(message, self._leading_in(outsider, outsider.address), lambda _: False)
+        lead = self._leading_in(outsider, outsider.address, message)
+        return rewritten(message, lead, lambda _: False)
 
     def introduced(
         self,
@@ -197,17 +200,23 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         judge = self.settings.judge
         return rewritten(
             message,
-            self._leading_in(outsider, insider.address),
+            self._leading_in(outsider, insider.address, message),
             lambda a: is_hidden(judge, insider, a, message.datagram, is_own=False),
         )
 
     def _leading_in(
-        self, outsider: OutsideParticipant, address: str
+        self, outsider: OutsideParticipant, address: str, message: DiscoveryMessage
     ) -> Callable[[int, HostPort], HostPort | None]:
-        return partial(self._lead_in, outsider, self.settings.proxy_address_for(address))
+        near, hosts = self.settings.proxy_address_for(address), set(_user_hosts(message))
+        return partial(self._lead_in, outsider, near, outsider.address in hosts)
 
     def _lead_in(
-        self, outsider: OutsideParticipant, near: str, pid: int, locator: HostPort
+        self,
+        outsider: OutsideParticipant,
+        near: str,
+        only_heard: bool,
+        pid: int,
+        locator: HostPort,
     ) -> HostPort | None:
         """Where inside reaches a locator of a participant outside; None if it does not."""
         if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
@@ -216,10 +225,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
                 outsider, outsider.metatraffic, LeaseKind.METATRAFFIC
             )
         elif not self.settings.both_ways:
-            # These addresses mean the reader's own machine or link, unless all is on one machine.
-            is_same_host = is_loopback(near) and is_loopback(outsider.address)
-            is_local = is_loopback(locator.host) or is_of_link(locator.host)
-            return locator if is_same_host or not is_local else None
+            return None if _leads_elsewhere(outsider, near, only_heard, locator) else locator
         else:
             is_own = locator.host == outsider.address
             lease = self._lease(outsider, locator, LeaseKind.DATA) if is_own else None
@@ -258,3 +264,28 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         if remaining:
             self.stand_ins[lease.port] = remaining
         self.changes += 1
+
+
+def _user_hosts(message: DiscoveryMessage) -> Iterator[str]:
+    """The hosts at which a message says that users' data is received."""
+    for announcement in message.announcements:
+        for pid, locator in announcement.reached_at(message.datagram):
+            if pid != Pid.METATRAFFIC_UNICAST_LOCATOR:
+                yield locator.host
+
+
+def _leads_elsewhere(
+    outsider: OutsideParticipant, near: str, only_heard: bool, locator: HostPort
+) -> bool:
+    """Whether a locator may mean somebody else where inside reaches the proxy at ``near``.
+
+    ``only_heard``: the message has a locator at the address that its participant was heard from.
+    Without one it is behind NAT, as it seems, and may be reached by those that it has. So it may be
+    by those of the other family, in which it was not heard.
+    """
+    heard, host = outsider.address, locator.host
+    if only_heard and (":" in host) == (":" in heard) and host != heard:
+        return True
+    # These addresses mean the reader's own machine or link, unless all is on one machine.
+    is_same_host = is_loopback(near) and is_loopback(heard)
+    return not is_same_host and (is_loopback(host) or is_of_link(host))
