@@ -129,17 +129,23 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     def introduced(self, newcomer: InsideParticipant, message: DiscoveryMessage) -> list[Outgoing]:
         """A participant's announcement for others on its network, if that passes on no multicast.
 
-        It goes on as it is: they reach each other without the proxy.
+        It goes on as it is: they reach each other without the proxy. So do those at one address, as
+        the processes of a pod are: Fast DDS sends no multicast where it has peers. What one names
+        as its own may be where the proxy itself hears announcements: nothing goes there.
         """
         if newcomer.is_in_group:
             return []
+        near, settings = newcomer.proxy_address, self.settings
+        ears = {HostPort(near, p) for p in (settings.unicast_port, settings.multicast_port)}
         announcement = for_all(message.datagram)
         return [
             Outgoing(p.metatraffic, announcement)
             for p in self.by_prefix.values()
-            if p.proxy_address == newcomer.proxy_address
-            and p.address != newcomer.address
+            if p.proxy_address == near
+            and p is not newcomer
+            # Cyclone DDS has one locator for all participants of a process, which know each other.
             and p.metatraffic
+            and p.metatraffic not in {newcomer.metatraffic, *ears}
         ]
 
     def forget(self, participant: InsideParticipant) -> None:

@@ -3,8 +3,11 @@
 import pytest
 
 from rosproxy.admin.requests import BodyError, ContainerNews, read_body
+from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.discovery.outside_participants import FAREWELL_INTERVAL
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, EAR_TIME
 from rosproxy.ros2.protocol.envelope import wrapped
@@ -13,6 +16,7 @@ from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
     EAR,
     INSIDE,
+    NEAR,
     NOW,
     OTHER,
     RANGE,
@@ -49,6 +53,52 @@ def test_those_inside_are_introduced_to_each_other_as_they_are() -> None:
     assert by(B, to(sent, INSIDE)) == [spdp(B, OTHER)]
     again = domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
     assert by(A, to(again, OTHER)) == [spdp(A, INSIDE)]
+
+
+def test_processes_of_one_pod_are_introduced_to_each_other() -> None:
+    """They have one address, and Fast DDS sends no multicast where it has ROS_STATIC_PEERS."""
+    domain = make_domain()
+    meet(domain, A, INSIDE)
+
+    announcement = spdp(B, INSIDE, 7412)
+    sent = domain.heard_inside(announcement, INSIDE, NOW)
+
+    assert [s.target for s in sent if s.datagram == announcement] == [HostPort(INSIDE, 7410)]
+    again = domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    assert [s.target for s in again if s.datagram == spdp(A, INSIDE)] == [HostPort(INSIDE, 7412)]
+    domain.inside.note_in_group(announcement, INSIDE)
+    heard = domain.heard_inside(announcement, INSIDE, NOW)
+    assert by(B, to(heard, INSIDE)) == []
+
+
+def test_nobody_is_introduced_to_himself() -> None:
+    """Nor participants of one process, which have one locator in Cyclone DDS."""
+    domain = make_domain()
+    for prefix in (A, B, A, B):
+        assert by(prefix, to(meet(domain, prefix, INSIDE), INSIDE)) == []
+
+
+@pytest.mark.parametrize("port", [7400, 7410])
+def test_announcements_do_not_go_round(port: int) -> None:
+    """Who is on the proxy's own machine may say that he is found where the proxy listens."""
+    domain = make_domain()
+    for prefix, own_port in ((A, port), (B, port), (C, 7418), (A, port), (C, 7418)):
+        sent = domain.heard_inside(spdp(prefix, NEAR, own_port), NEAR, NOW)
+        assert HostPort(NEAR, port) not in {s.target for s in sent if s.datagram[8:20] == prefix}
+    assert HostPort(NEAR, 7418) in {
+        s.target for s in domain.heard_inside(spdp(A, NEAR, port), NEAR, NOW)
+    }
+
+
+def test_introductions_are_charged_to_who_makes_them() -> None:
+    domain = make_domain(ports=PortMap(PortRange(45000, 45199), PortRange(45000, 45199)))
+    for number in range(MOST_PER_ADDRESS):
+        prefix = A[:2] + number.to_bytes(10, "big")
+        domain.heard_inside(spdp(prefix, INSIDE, 7410 + 2 * number), INSIDE, NOW)
+    sent = domain.heard_inside(spdp(A[:2] + bytes(10), INSIDE), INSIDE, NOW)
+    assert len(by(A[:2] + bytes(10), to(sent, INSIDE))) == MOST_PER_ADDRESS - 1
+    heard = sum(1 for _ in range(1000) if domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW))
+    assert heard < BURST / (MOST_PER_ADDRESS - 1)
 
 
 def test_who_is_heard_by_multicast_needs_no_introduction() -> None:
