@@ -261,8 +261,8 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
     ``leases`` are ports of the range for one inside; for one outside its stand-ins, which inside
     reaches. ``kept``: one inside keeps them for when the proxy starts again. ``proven``: one
     outside gets what it is sent. ``problem``: what it lacks. ``domain``: the one that it says it
-    is in. ``security`` and ``locator_fault`` are one of `rosproxy.ros2.registry.participants`.
-    ``types`` are those of the topics and services.
+    is in. ``security``, ``locator_fault`` and ``shortage``, the kind of ``problem``, are each one
+    of `rosproxy.ros2.registry.participants`. ``types`` are those of the topics and services.
     """
 
     guid_prefix: str = ""
@@ -279,6 +279,7 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
     domain: Count | None = None
     security: str = ""
     locator_fault: str = ""
+    shortage: str = ""
     types: tuple[NamedTypeStatus, ...] = ()
 
 
@@ -301,15 +302,16 @@ class MismatchStatus(msgspec.Struct, frozen=True):
 class DomainStatus(msgspec.Struct, frozen=True):
     """A domain of ROS 2: its participants, and what became of datagrams.
 
-    ``discovery`` is where outside announces itself to the proxy. ``dropped`` were refused, ``lost``
-    are those that the kernel did not take. ``data_plane``: how user data is forwarded.
-    ``mismatches_left_out``: how many more there are.
+    ``discovery`` is where outside announces itself to the proxy, ``direction`` that of the proxy.
+    ``dropped`` were refused, ``lost`` the kernel did not take. ``data_plane``: how user data is
+    forwarded. ``mismatches_left_out``: how many more there are.
     """
 
     domain: Count = 0
     discovery: str = ""
     peers: Names = ()
     ear: str = ""
+    direction: str = "out"
     ports_used: Count = 0
     ports_free: Count = 0
     dropped: Count = 0

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import msgspec
 
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
-from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault
+from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault, ShortageKind
 from rosproxy.telemetry.text import plural
 
 
@@ -47,6 +47,14 @@ _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.MISSING: (
         "it announces no address of UDP",
         "where it runs: give it a transport of UDPv4 in its profile",
+    ),
+}
+_LONGER_RANGE = "give a longer --port-range, and publish it"
+_SHORTAGE_CURES = {
+    ShortageKind.BOUND.value: (
+        "where it runs: fewer addresses (the interface list of its profile, or CYCLONEDDS_URI), "
+        "fewer readers and writers with ports of their own (unique network flows), or several "
+        "processes; no range is too short for it"
     ),
 }
 _DEFAULT_CURE = "give both the same {policy}"
@@ -118,11 +126,11 @@ def _problems(
     fault = _LOCATOR_FAULTS.get(participant.locator_fault)
     if fault:
         yield DomainProblem("transport", participant.guid_prefix, f"{label}: {fault[0]}", fault[1])
-    if is_inside:
-        # Locators in the SEDP of one outside stay as they are, unless the direction is both.
-        yield from _security(participant, label)
+    # Locators in the SEDP of one outside stay as they are, unless the direction is both.
+    if is_inside or domain.direction == "both":
+        yield from _security(participant, label, is_inside)
     if participant.problem:
-        fix = "give a longer --port-range, and publish it"
+        fix = _SHORTAGE_CURES.get(participant.shortage, _LONGER_RANGE)
         yield DomainProblem(
             "ports", participant.guid_prefix, f"{label}: {participant.problem}", fix
         )
@@ -135,8 +143,10 @@ def _problems(
         yield DomainProblem("reached", participant.guid_prefix, text, fix, grave=False)
 
 
-def _security(participant: ParticipantStatus, label: str) -> Iterator[DomainProblem]:
-    """What DDS Security keeps from one inside: the proxy can't change what is protected.
+def _security(
+    participant: ParticipantStatus, label: str, is_inside: bool
+) -> Iterator[DomainProblem]:
+    """What DDS Security keeps from a participant: the proxy can't change what is protected.
 
     Fast DDS repeats its addresses with each reader and writer; Cyclone DDS only announces them with
     the participant itself, which is never protected.
@@ -144,9 +154,12 @@ def _security(participant: ParticipantStatus, label: str) -> Iterator[DomainProb
     if participant.security != DdsSecurity.PROTECTED or participant.vendor == CYCLONE_DDS:
         return
     text = f"{label}: DDS Security protects its discovery, so that the proxy can't change the "
-    text += "addresses of its readers and writers: what outside sends does not reach them"
+    side = "outside" if is_inside else "inside"
+    text += f"addresses of its readers and writers: what {side} sends does not reach them"
     fix = "a governance with discovery_protection_kind and rtps_protection_kind NONE; or "
     fix += "ROS_SECURITY_ENABLE=false"
+    if not is_inside:
+        fix += "; or a way out for those inside, and --direction out"
     # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
     yield DomainProblem(
         "security", participant.guid_prefix, text, fix, grave=participant.vendor == FAST_DDS

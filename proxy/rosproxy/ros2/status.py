@@ -26,6 +26,7 @@ from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     OutsideParticipant,
     Participant,
+    PortShortage,
 )
 from rosproxy.ros2.servers.domain_server import DomainServer
 
@@ -33,6 +34,7 @@ MOST_NAMES = 200
 """Topics and services of a participant that are listed; the rest is counted."""
 MOST_MISMATCHES = 100
 """Mismatches of a domain that are listed; the rest is counted."""
+_NO_SHORTAGE = PortShortage()
 
 
 @dataclass(eq=False)
@@ -114,6 +116,7 @@ class Ros2State(Collector):
             discovery=str(HostPort(settings.host, discovery)),
             peers=tuple(peer.host if not peer.port else str(peer) for peer in settings.peers),
             ear=str(settings.ear or ""),
+            direction="both" if settings.both_ways else "out",
             ports_used=len(domain.inside.leases),
             ports_free=domain.ports.pool.free,
             dropped=domain.refused.count,
@@ -122,26 +125,28 @@ class Ros2State(Collector):
             mismatches=tuple(map(_mismatch, pairs[:MOST_MISMATCHES])),
             mismatches_left_out=max(len(pairs) - MOST_MISMATCHES, 0),
             inside=bounded_names(
-                self._inside(p, domain.inside.port_shortages.get(p.prefix, ""), domain.is_kept(p))
+                self._inside(
+                    p, domain.inside.port_shortages.get(p.prefix, _NO_SHORTAGE), domain.is_kept(p)
+                )
                 for p in domain.inside.by_prefix.values()
             ),
             outside=bounded_names(self._outside(p) for p in domain.outside.by_prefix.values()),
         )
 
     def _inside(
-        self, participant: InsideParticipant, problem: str, kept: bool
+        self, participant: InsideParticipant, shortage: PortShortage, kept: bool
     ) -> document.ParticipantStatus:
-        return msgspec.structs.replace(self._status_of(participant, problem=problem), kept=kept)
+        return msgspec.structs.replace(
+            self._status_of(participant),
+            kept=kept,
+            problem=shortage.text,
+            shortage=shortage.kind.value,
+        )
 
     def _outside(self, participant: OutsideParticipant) -> document.ParticipantStatus:
-        return self._status_of(participant, proven=participant.proven)
+        return msgspec.structs.replace(self._status_of(participant), proven=participant.proven)
 
-    def _status_of(
-        self,
-        participant: Participant,
-        proven: bool = True,
-        problem: str = "",
-    ) -> document.ParticipantStatus:
+    def _status_of(self, participant: Participant) -> document.ParticipantStatus:
         endpoints = list(participant.endpoints.values()) if self.with_names else []
         writers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.WRITER}
         readers = {endpoint.topic for endpoint in endpoints if endpoint.kind is EndpointKind.READER}
@@ -161,8 +166,6 @@ class Ros2State(Collector):
             subscribes=tuple(shown[1]),
             services=tuple(shown[2]),
             left_out=left_out,
-            proven=proven,
-            problem=problem,
             domain=participant.traits.domain,
             security=participant.traits.security.value,
             locator_fault=participant.traits.locator_fault.value,

@@ -35,6 +35,13 @@ def test_nothing_is_wrong() -> None:
         ({"locator_fault": "elsewhere"}, "transport", True, "not the one that it sends from"),
         ({"locator_fault": "missing"}, "transport", True, "UDPv4"),
         ({"problem": "no port of 11400-11403 is free"}, "ports", True, "--port-range"),
+        (
+            {"problem": "has more than 16 locators", "shortage": "bound"},
+            "ports",
+            True,
+            "fewer addresses",
+        ),
+        ({"problem": "no port is free", "shortage": "range"}, "ports", True, "--port-range"),
         ({"proven": False}, "reached", False, "10.0.0.1"),
     ],
 )
@@ -64,6 +71,23 @@ def test_dds_security_that_passes(changes: dict[str, object]) -> None:
 def test_outside_is_reached_by_its_own_addresses() -> None:
     secured = replace(OUTSIDE, security="protected", vendor="Fast DDS")
     assert list(domain_problems(replace(DOMAIN, outside=(secured,)))) == []
+
+
+def test_a_longer_range_is_no_cure_for_too_many_locators() -> None:
+    (problem,) = with_inside(problem="has more than 16 locators", shortage="bound")
+    assert "--port-range" not in problem.text + problem.fix
+
+
+def test_outside_is_not_reached_in_direction_both_where_its_addresses_are_protected() -> None:
+    """They are replaced there, too; it was told of those inside alone."""
+    secured = replace(OUTSIDE, security="protected", vendor="Fast DDS")
+    both_ways = replace(DOMAIN, direction="both")
+    (problem,) = domain_problems(replace(both_ways, outside=(secured,)))
+    assert (problem.check, problem.subject, problem.grave) == ("security", "01.10.bb", True)
+    assert "what inside sends does not reach them" in problem.text
+    assert "--direction out" in problem.fix
+    for one in (replace(secured, security="authenticated"), replace(secured, vendor="Cyclone DDS")):
+        assert list(domain_problems(replace(both_ways, outside=(one,)))) == []
 
 
 def test_its_own_domain_is_no_fault() -> None:

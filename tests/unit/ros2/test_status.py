@@ -4,12 +4,15 @@ import struct
 from dataclasses import dataclass
 from typing import cast
 
+import pytest
+
 from rosproxy.admin.status_document import (
     DataPlaneStatus,
     DomainStatus,
     LocatorStatus,
     NamedTypeStatus,
 )
+from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
@@ -93,6 +96,26 @@ def test_topics_and_their_types() -> None:
         NamedTypeStatus("/scan", "std_msgs/msg/String"),
     )
     assert told(domain).mismatches == ()
+
+
+@pytest.mark.parametrize(("both_ways", "direction"), [(False, "out"), (True, "both")])
+def test_in_which_direction_the_proxy_passes_on(both_ways: bool, direction: str) -> None:
+    assert told(make_domain(both_ways=both_ways)).direction == direction
+
+
+def test_what_there_is_too_little_of() -> None:
+    ports = PortMap(PortRange(45000, 45099), PortRange(45000, 45099))
+    domain = make_domain(ports=ports)
+    for number in range(20):
+        domain.heard_inside(spdp(A, INSIDE, 7410 + 2 * number), INSIDE, NOW)
+    (inside,) = told(domain).inside
+    assert (inside.shortage, len(inside.leases)) == ("bound", 16)
+    assert "more than 16 locators" in inside.problem
+    domain = make_domain()
+    for number in range(1, 10):
+        address = f"172.30.0.{number}"
+        domain.heard_inside(spdp(number.to_bytes(12, "big"), address), address, NOW)
+    assert {participant.shortage for participant in told(domain).inside} == {"", "range"}
 
 
 def test_who_does_not_match() -> None:

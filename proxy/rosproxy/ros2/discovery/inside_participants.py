@@ -35,6 +35,8 @@ from rosproxy.ros2.registry.participants import (
     Lease,
     LeaseKind,
     ParticipantTable,
+    PortShortage,
+    ShortageKind,
 )
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, require_rewritable, rewritten
 
@@ -51,7 +53,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     ports: LocatorPorts
     refused: Refused
     leases: dict[int, tuple[InsideParticipant, Lease]] = field(default_factory=dict)
-    port_shortages: dict[bytes, str] = field(default_factory=dict)
+    port_shortages: dict[bytes, PortShortage] = field(default_factory=dict)
     changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
@@ -194,13 +196,13 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     ) -> Lease | None:
         if len(participant.leases) >= MOST_LEASES:
             text = f"has more than {MOST_LEASES} locators; {locator} got no port"
-            self.port_shortages[participant.prefix] = text
+            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.BOUND, text)
             return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)
         if port is None:
             ports = self.settings.ports.listen
             text = f"no port of {ports} is free for {locator}: give a longer --port-range"
-            self.port_shortages[participant.prefix] = text
+            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         lease = participant.leases[locator] = Lease(port, locator, kind)
         self.leases[port] = participant, lease

@@ -47,6 +47,21 @@ class EndpointKind(StrEnum):
     WRITER = "writer"
 
 
+class ShortageKind(StrEnum):
+    """What there is too little of for a locator: ``RANGE``, or ``BOUND``, ports for one alone."""
+
+    NONE = ""
+    RANGE = "range"
+    BOUND = "bound"
+
+
+class PortShortage(msgspec.Struct, frozen=True):
+    """Why a locator inside got no port."""
+
+    kind: ShortageKind = ShortageKind.NONE
+    text: str = ""
+
+
 class DdsEndpoint(msgspec.Struct, frozen=True):
     """A reader or writer of a participant, as its SEDP tells."""
 

@@ -19,7 +19,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import destination, source_prefix, source_vendor
 from rosproxy.ros2.registry.locator_ports import SETTLING
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import LeaseKind, ShortageKind
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
     EAR,
@@ -255,7 +255,9 @@ def test_a_range_that_is_too_short_is_told() -> None:
             spdp(number.to_bytes(12, "big"), f"172.30.0.{number}"), f"172.30.0.{number}", NOW
         )
     assert len(domain.inside.leases) == 15  # of sixteen, one is for discovery
-    assert all("--port-range" in text for text in domain.inside.port_shortages.values())
+    shortages = domain.inside.port_shortages.values()
+    assert all("--port-range" in shortage.text for shortage in shortages)
+    assert {shortage.kind for shortage in shortages} == {ShortageKind.RANGE}
     assert domain.inside.port_shortages
 
 
