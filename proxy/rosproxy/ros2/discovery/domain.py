@@ -243,6 +243,7 @@ class Domain(DomainParticipants):
         return [] if insider.apart_until else self.settings.to_outside(announcement)
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
+        self.returning.end(message.prefix, source)
         insider = self.inside.find(message.prefix, source)
         if insider is None:
             return []

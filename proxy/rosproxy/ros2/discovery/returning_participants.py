@@ -79,8 +79,12 @@ class ReturningParticipants:
     def forget(self, addresses: Collection[str]) -> None:
         """Forget those that wait at addresses where nobody is any more."""
         for prefix in [p for p, (source, *_) in self.waiting.items() if source in addresses]:
-            self._counts -= Counter((self.waiting.pop(prefix)[0],))
-            self.keeper.forget(prefix)
+            self._forget_waiting(prefix)
+
+    def end(self, prefix: bytes, source: str) -> None:
+        """Forget a participant at an address that waits and has ended."""
+        if self.is_waiting(prefix, source):
+            self._forget_waiting(prefix)
 
     def note_former(self, former: Mapping[bytes, Sequence[int]], present: Container[bytes]) -> None:
         """Note which ports participants had at a proxy elsewhere; not of those ``present``.
@@ -109,6 +113,10 @@ class ReturningParticipants:
             participant.prefix, participant.ports, self._reply_target(participant.address)
         )
         return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
+
+    def _forget_waiting(self, prefix: bytes) -> None:
+        self._counts -= Counter((self.waiting.pop(prefix)[0],))
+        self.keeper.forget(prefix)
 
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
         return (

@@ -422,6 +422,22 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
     assert not domain.inside.by_prefix
 
 
+def test_who_ends_while_he_waits_is_not_announced() -> None:
+    """Outside was told of him once all others were, and took him for there."""
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
+    domain.heard_inside(spdp(B, OTHER), OTHER, 0.1)
+    domain.heard_inside(farewell(B), INSIDE, 0.2)  # nobody ends one at another address
+    domain.heard_inside(farewell(A), INSIDE, 0.2)
+
+    sent = domain.settle(SETTLING + ANSWER_TIME)
+
+    assert {source_prefix(told) for told in to(sent, ROBOT)} == {B}
+    assert domain.inside.by_prefix.keys() == {B}
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, 7.0)
+    assert domain.returning.waiting.keys() == {A}
+
+
 def test_no_port_of_the_range_stands_in() -> None:
     """Wherever the range lies, for the proxy listens there."""
     domain = make_domain()
