@@ -13,7 +13,7 @@ take too much together, the largest goes first.
 """
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -87,6 +87,11 @@ class _WaitingDatagram(msgspec.Struct, frozen=True):
         """The bytes that it counts for."""
         return len(self.datagram) + len(self.fragments) * OVERHEAD
 
+    @property
+    def keys(self) -> set[_Key]:
+        """The announcements that it has fragments of."""
+        return {_key(self.port, sample) for sample, _ in self.fragments}
+
 
 @dataclass(slots=True)
 class FragmentStores:
@@ -141,10 +146,16 @@ class FragmentStores:
 
 @dataclass(slots=True)
 class FragmentStore:
-    """Announcements of a participant of which fragments have come, and the datagrams that wait."""
+    """Announcements of a participant of which fragments have come, and the datagrams that wait.
+
+    These have numbers, in the order in which they came; ``_waiting_by_key`` has the numbers of
+    those with fragments of an announcement.
+    """
 
     _samples: dict[_Key, _PendingSample] = field(default_factory=dict)
-    _waiting_datagrams: list[_WaitingDatagram] = field(default_factory=list)
+    _waiting_datagrams: dict[int, _WaitingDatagram] = field(default_factory=dict)
+    _waiting_by_key: dict[_Key, set[int]] = field(default_factory=dict)
+    _held_count: int = 0
     _sample_bytes: int = 0
     _waiting_bytes: int = 0
 
@@ -172,25 +183,43 @@ class FragmentStore:
             raise RtpsError(f"more than {MOST_FRAGMENTS} fragments in a datagram")
         # Whole announcements beside the fragments are rewritten now, fragments in `_filled`.
         arrived = _WaitingDatagram(port, message.fragments, rewrite(message))
-        completed = [self._gather(port, message, *pair, rewrite) for pair in message.fragments]
-        if not any(completed):
-            if self._is_whole(arrived):  # fragments of what was whole before, sent again
-                return [self._filled(arrived)]
-            self._hold(arrived)
-            return []
-        waiting = [*self._waiting_datagrams, arrived]
-        self._waiting_datagrams, self._waiting_bytes = [], 0
-        for datagram in waiting:
-            if not self._is_whole(datagram):
-                self._hold(datagram)
-        return [self._filled(d) for d in waiting if self._is_whole(d)]
+        completed = {
+            _key(port, sample)
+            for sample, frags in message.fragments
+            if self._gather(port, message, sample, frags, rewrite)
+        }
+        released = [self._filled(datagram) for datagram in self._released(completed)]
+        if self._is_whole(arrived):  # it may also be of what was whole before, sent again
+            return [*released, self._filled(arrived)]
+        self._hold(arrived)
+        return released
+
+    def _released(self, completed: Iterable[_Key]) -> list[_WaitingDatagram]:
+        """The datagrams that waited for announcements that are whole now, and for no others."""
+        numbers = set[int]().union(*(self._waiting_by_key.get(key, ()) for key in completed))
+        whole = [n for n in sorted(numbers) if self._is_whole(self._waiting_datagrams[n])]
+        return [self._let_go(number) for number in whole]
 
     def _hold(self, datagram: _WaitingDatagram) -> None:
         """Have a datagram wait."""
-        self._waiting_datagrams.append(datagram)
+        self._held_count += 1
+        self._waiting_datagrams[self._held_count] = datagram
         self._waiting_bytes += datagram.cost
+        for key in datagram.keys:
+            self._waiting_by_key.setdefault(key, set()).add(self._held_count)
         while self._waiting_bytes > MOST_BYTES:
-            self._waiting_bytes -= self._waiting_datagrams.pop(0).cost
+            self._let_go(next(iter(self._waiting_datagrams)))
+
+    def _let_go(self, number: int) -> _WaitingDatagram:
+        """The datagram with a number, which waits no longer."""
+        datagram = self._waiting_datagrams.pop(number)
+        self._waiting_bytes -= datagram.cost
+        for key in datagram.keys:
+            numbers = self._waiting_by_key[key]
+            numbers.discard(number)
+            if not numbers:
+                del self._waiting_by_key[key]
+        return datagram
 
     def _gather(
         self,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import fragments
-from rosproxy.ros2.discovery.fragments import OVERHEAD, FragmentStores
+from rosproxy.ros2.discovery.fragments import OVERHEAD, FragmentStore, FragmentStores
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, destination, submessages
@@ -154,8 +154,52 @@ def test_so_much_is_remembered_of_a_participant_and_no_more(
     (store,) = stores.by_prefix.values()
     assert len(store._samples) <= 3
     assert len(store._waiting_datagrams) <= 3
+    assert set().union(*store._waiting_by_key.values()) == store._waiting_datagrams.keys()
     stores.forget(PREFIX)
     assert (stores.size, stores.by_prefix) == (0, {})
+
+
+def test_a_whole_announcement_wakes_its_own_datagrams_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All that waited were walked through for each that became whole."""
+    stores, is_whole, looks = FragmentStores(), FragmentStore._is_whole, list[object]()
+
+    def counted(store: FragmentStore, datagram: fragments._WaitingDatagram) -> bool:
+        looks.append(datagram)
+        return is_whole(store, datagram)
+
+    monkeypatch.setattr(FragmentStore, "_is_whole", counted)
+    for sequence in range(1, 201):
+        assert through(stores, cut(described(20), 128, sequence)[0]) == []
+    looks.clear()
+    for sequence in range(201, 301):
+        first, last = cut(described(20), 128, sequence)
+        assert through(stores, first) == []
+        assert len(through(stores, last)) == 2
+    assert len(looks) <= 100 * 3
+    assert len(through(stores, cut(described(20), 128, 7)[1])) == 2
+
+
+def test_a_datagram_waits_for_all_that_it_has_a_part_of() -> None:
+    size, store = 128, FragmentStores()
+    whole = described(20)
+    chunks = [whole[at : at + size] for at in range(0, len(whole), size)]
+    parts = {
+        (sequence, number): fragment(chunk, number, size, len(whole), sequence=sequence)
+        for sequence in (1, 2)
+        for number, chunk in enumerate(chunks, 1)
+    }
+    assert len(chunks) == 2
+    both = message(parts[1, 1], parts[2, 1])
+    assert through(store, both) == []
+    assert len(through(store, message(parts[1, 2]))) == 1
+    assert [len(datagram) for datagram in through(store, message(parts[2, 2]))] == [
+        len(both),
+        len(message(parts[2, 2])),
+    ]
+    (of_one,) = store.by_prefix.values()
+    assert (of_one._waiting_datagrams, of_one._waiting_by_key, of_one._waiting_bytes) == ({}, {}, 0)
 
 
 def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch) -> None:
