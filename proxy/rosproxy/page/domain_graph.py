@@ -70,7 +70,7 @@ def _node(
     return PageNode(
         CONTAINER if is_inside else outside_lane,
         "participant",
-        shown_name(f"{participant.address} {participant.guid_prefix[-11:]}"),
+        shown_name(f"{participant.address} {_distinguishing(participant.guid_prefix)}"),
         _state(problem),
         shown_text(problem.text) if problem else "",
         shown_text(problem.fix) if problem else "",
@@ -78,6 +78,15 @@ def _node(
         ", ".join(str(lease.port) for lease in participant.leases),
         rounded(sum(lease.rate for lease in data)) if data else None,
     )
+
+
+def _distinguishing(guid_prefix: str) -> str:
+    """The part of a GUID prefix in which participants of a machine differ.
+
+    The first four bytes are the vendor's and, of Fast DDS, the machine's. Then it has the process,
+    and in the last four the participant of that, which are 0 for the only one.
+    """
+    return guid_prefix[len("01.0f.aa.bb.") :].removesuffix(".00.00.00.00")
 
 
 def _state(problem: DomainProblem | None) -> str:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from msgspec.structs import replace
+
 from rosproxy.admin.status_document import (
     DomainStatus,
     LocatorStatus,
@@ -41,6 +43,24 @@ def test_participants_and_what_crosses_the_boundary() -> None:
     assert not {"hz", "rate", "since"} & link.keys(), "user data is not read"
     assert document["links"]["topic /rosout 0 01.10.bb 0 01.0f.aa"]["quiet"]
     assert "master" not in document["nodes"]
+
+
+def test_participants_of_one_container_have_labels_of_their_own() -> None:
+    """Fast DDS tells processes by the bytes in the middle; the last ones are 0 for all of them."""
+    prefixes = [
+        "01.0f.a1.b2.17.00.c3.d4.00.00.00.00",
+        "01.0f.a1.b2.18.00.c3.d5.00.00.00.00",
+        "01.0f.a1.b2.18.00.c3.d5.01.00.00.00",
+        "01.10.5e.92.7c.0d.11.aa.00.00.01.c1",
+    ]
+    inside = tuple(replace(INSIDE, guid_prefix=prefix) for prefix in prefixes)
+    nodes = made(inside=inside)["nodes"]
+    assert [nodes[f"0 {prefix}"]["label"] for prefix in prefixes] == [
+        "172.30.0.5 17.00.c3.d4",
+        "172.30.0.5 18.00.c3.d5",
+        "172.30.0.5 18.00.c3.d5.01.00.00.00",
+        "172.30.0.5 7c.0d.11.aa.00.00.01.c1",
+    ]
 
 
 def test_a_mismatch_is_on_its_link_alone() -> None:
