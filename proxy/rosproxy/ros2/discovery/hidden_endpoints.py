@@ -26,10 +26,12 @@ def is_hidden(
 
     ``inside`` is the participant that makes it, if it ``is_own``, else the one that is to get it.
     """
-    # An end names the key of a reader or writer, and no topic to judge it by.
-    if announcement.kind is None or announcement.ended:
+    # An end names the key of a reader or writer, and no topic to judge it by. What names a topic
+    # others may not take for an end: they read the last status of several, or another flag.
+    topic = announcement.topic(datagram)
+    if announcement.kind is None or (announcement.ended and not topic):
         return False
-    rule = rule_about(announcement.kind, announcement.topic(datagram), is_own)
+    rule = rule_about(announcement.kind, topic, is_own)
     if rule is None:
         return False
     if rule not in inside.verdicts and len(inside.verdicts) < MOST_VERDICTS:

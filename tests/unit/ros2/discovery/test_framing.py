@@ -24,6 +24,7 @@ from tests.unit.ros2.protocol.messages import (
     message,
     order,
     parameter,
+    parameter_list,
     submessage,
 )
 
@@ -90,6 +91,22 @@ def test_what_is_behind_an_unaligned_length_is_not_passed(hidden: bytes) -> None
     for count, sent in enumerate(crossing(domain, hidden), 1):
         assert sent == []
         assert domain.refused.count == count
+
+
+def ends(*statuses: int) -> bytes:
+    told = [(Pid.STATUS_INFO, bytes([0, 0, 0, status])) for status in statuses]
+    return data(SECRET, qos=parameter_list(told), writer=SEDP_WRITERS)
+
+
+SECRET = bytes([0, 3, 0, 0]) + topic("rt/secret") + parameter(1, b"")
+AS_KEY_AND_AS_DATA = submessage(0x15, 0x0C, data(SECRET, writer=SEDP_WRITERS)[4:])
+
+
+@pytest.mark.parametrize("said", [ends(3, 0), ends(3), AS_KEY_AND_AS_DATA])
+def test_what_one_takes_for_an_end_and_another_does_not_is_judged(said: bytes) -> None:
+    """Cyclone DDS reads the last status of several; the proxy read the first, and judged no end."""
+    for sent in crossing(denying(), said):
+        assert b"secret" not in sent[-1].datagram
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5])
