@@ -44,7 +44,7 @@ from rosproxy.ros2.registry.participants import (
     LeaseKind,
     OutsideParticipant,
 )
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, require_rewritable
 
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
@@ -247,6 +247,7 @@ class Domain(DomainParticipants):
         insider = self.inside.find(message.prefix, source)
         if insider is None:
             return []
+        require_rewritable(message)
         exported = self.inside.exported(insider, message, now)  # it may tell other things as well
         self._forget_inside(insider)
         return self.settings.to_outside(exported)

@@ -178,8 +178,11 @@ def rewritten(
 def require_rewritable(message: DiscoveryMessage) -> None:
     """Raise RtpsError unless all that a message announces can be led elsewhere, and be hidden.
 
-    Before anything of it is kept, which is rewritten again and again later.
+    Before anything of it is kept, which is rewritten again and again later. Fragments are not: they
+    are read once all are there, and nobody waits for that with a participant's announcement.
     """
+    if message.fragments:
+        raise RtpsError("fragments in a message by which a participant announces itself")
     rewritten(message, lambda *_: None, lambda told: bool(told.topic(message.datagram)))
 
 

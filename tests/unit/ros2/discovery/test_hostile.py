@@ -87,6 +87,32 @@ def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
     assert not domain.inside.by_prefix
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> None:
+    """They went on as they came, and were kept to be told to whoever came later."""
+    whole = payload([TOPIC, (0x8000, bytes(200))])
+    size = len(whole) // count
+    behind = b"".join(
+        fragment(whole[at : at + size], 1 + at // size, size, len(whole), writer=SEDP_WRITERS)
+        for at in range(0, len(whole), size)
+    )
+    domain = make_domain(judge=lambda *_: False)
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (lease, *_) = domain.inside.by_prefix[A].leases.values()
+    sent = domain.heard_inside(spdp(A, INSIDE) + behind, INSIDE, NOW)
+    sent += domain.heard_inside(farewell(A) + behind, INSIDE, NOW)
+    sent += domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW)
+    sent += domain.heard_outside(wrapped(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
+    sent += domain.at_lease(lease.port, spdp(B, ROBOT) + behind, ROBOT, NOW)
+    assert domain.refused.count == 5
+    sent += domain.heard_outside(farewell(B) + behind, ROBOT, NOW)
+    sent += meet(domain, EVIL, OTHER)
+    sent += domain.settle(NOW)
+    assert sent
+    assert not any(b"chatter" in told.datagram for told in sent)
+
+
 def test_fragments_are_judged_anew_by_another_policy() -> None:
     allowed = True
     domain = make_domain(judge=lambda *_: allowed)
