@@ -105,18 +105,18 @@ def described(number: int, count: int) -> bytes:
 def heavy(number: int) -> list[bytes]:
     """Datagrams of a participant that are made to take time and memory."""
     own, sequences = prefix(number % 60), range(number * 256 + 1, number * 256 + 257)
-    qos = parameter_list([(0x1234, b"")] * 40)
+    qos, named = parameter_list([(0x1234, b"")] * 40), (Pid.TOPIC_NAME, b"\4\0\0\0rt/\0")
     kinds = [
         [
             data(described(sequence, 200), writer=SEDP_WRITERS, sequence=sequence)
             for sequence in sequences[:8]
         ],
         [
-            data(payload([]), qos=qos, writer=SEDP_WRITERS, sequence=sequence)
+            data(payload([named]), qos=qos, writer=SEDP_WRITERS, sequence=sequence)
             for sequence in sequences
         ],
         [
-            fragment(b"x", 1, 128, 300, writer=SEDP_WRITERS, sequence=sequence)
+            fragment(b"four", 1, 128, 300, writer=SEDP_WRITERS, sequence=sequence)
             for sequence in sequences[:60]
         ],
         [
