@@ -102,10 +102,7 @@ class Domain(DomainParticipants):
         leased = self.inside.leases.get(port)
         try:
             if leased is None:  # outside may mean a participant of before the start
-                if self.ports.may_have_returning(now) and not self._is_too_much(
-                    datagram, source, now
-                ):
-                    self.ports.note_use(port, datagram, now)
+                self._note_former_use(port, datagram, source, now)
                 return []
             insider, lease = leased
             if lease.kind is LeaseKind.DATA:
@@ -316,6 +313,11 @@ class Domain(DomainParticipants):
         lease.note_passed(len(datagram))
         self.passed[lease.kind, inwards] += len(datagram)
         return Outgoing(lease.target, datagram)
+
+    def _note_former_use(self, port: int, datagram: bytes, source: str, now: float) -> None:
+        """Note whom outside means by a port that nobody has, soon after the start. RtpsError."""
+        if self.ports.may_have_returning(now) and not self._is_too_much(datagram, source, now):
+            self.ports.note_use(port, datagram, self.settings.is_peer(source), now)
 
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether a source makes more discovery than it may; what is not is charged to it."""

@@ -6,13 +6,18 @@ same one first: then who came first has it, which a new process can't know. But 
 sending to the ports that it was told, and names the participant that it means (INFO_DST). So no
 port is given in the first second. Then a port goes first to the participant that was named there,
 next to one that says itself that it had it (`rosproxy.ros2.discovery.port_keeper`), as anybody may.
-What the kernel forwards does not come here; but its table is what a former process has left there,
-and tells which port led to which locator.
+Several may be named at a port, as anybody outside may name anybody, and a participant at several
+ports, as it has more than one locator: there its own word decides, and a peer's word counts more
+than a stranger's. What the kernel forwards does not come here; but its table is what a former
+process has left there, and tells which port led to which locator.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import partial
 from hashlib import blake2b
-from itertools import islice
+from itertools import chain, islice
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
@@ -23,6 +28,8 @@ STAND_INS = PortRange(20_000, 32_767)
 """Where ports for participants outside are chosen from: below those that Linux gives away."""
 TRIES = 32
 """How many ports are tried for a locator outside."""
+MOST_NAMED = 8
+"""Participants that may be named at one port; where there are more they tell nothing."""
 MOST_SHARING = 4
 """Locators outside that one port may stand for."""
 SETTLING = 1.0
@@ -38,12 +45,49 @@ def order_for(key: str, ports: PortRange) -> Iterator[int]:
         yield ports.first + (start + number) % len(ports)
 
 
+_User = tuple[bytes, LeaseKind]
+"""A participant's prefix, and what arrives at its port."""
+
+
+class _Claim(IntEnum):
+    """Whose a port was, as it seems to a participant that wants one; the least goes first."""
+
+    PROVEN = 0
+    """Its own: the kernel led there, or outside has named it and it says so itself."""
+    NAMED = 1
+    """Its own, as outside says."""
+    SAID = 2
+    """Its own, as it says itself; nobody else was named there."""
+    NOBODYS = 3
+    ANOTHERS = 4
+    """Who was named there may still come back."""
+
+
+@dataclass(slots=True)
+class _FormerUsers:
+    """Participants that were named at a port: by peers, and by others outside."""
+
+    by_peers: set[_User] = field(default_factory=set)
+    by_others: set[_User] = field(default_factory=set)
+
+    def note(self, user: _User, by_peer: bool) -> None:
+        """Note one that was named, up to one more than `MOST_NAMED`."""
+        users = self.by_peers if by_peer else self.by_others
+        if len(users) <= MOST_NAMED:
+            users.add(user)
+
+    @property
+    def users(self) -> Collection[_User]:
+        """Those to believe in: none where so many were named that it tells nothing."""
+        return next((u for u in (self.by_peers, self.by_others) if 0 < len(u) <= MOST_NAMED), ())
+
+
 class LocatorPorts:
     """Lends the ports of the range to locators; ``started`` is when the proxy did, in seconds."""
 
     def __init__(self, pool: PortPool, started: float) -> None:
         self.pool, self._started = pool, started
-        self._former_users: dict[int, tuple[bytes, LeaseKind]] = {}
+        self._former_users: dict[int, _FormerUsers] = {}
         self._forwarded: dict[int, HostPort] = {}
 
     def may_give_ports(self, now: float) -> bool:
@@ -54,17 +98,19 @@ class LocatorPorts:
         """Whether there may still be participants that had ports before the start."""
         return now - self._started < REMEMBERED
 
-    def note_use(self, port: int, datagram: bytes, now: float) -> None:
+    def note_use(self, port: int, datagram: bytes, by_peer: bool, now: float) -> None:
         """Note whom a datagram from outside is for, at a port that nobody has. Raises RtpsError."""
         prefix, is_built_in = destination(datagram), of_built_in_writer(datagram)
         if prefix is not None and is_built_in is not None:
             kind = LeaseKind.METATRAFFIC if is_built_in else LeaseKind.DATA
-            self.note_former_user(port, prefix, kind, now)
+            self.note_former_user(port, prefix, kind, by_peer, now)
 
-    def note_former_user(self, port: int, prefix: bytes, kind: LeaseKind, now: float) -> None:
-        """Note that a participant had a port."""
+    def note_former_user(
+        self, port: int, prefix: bytes, kind: LeaseKind, by_peer: bool, now: float
+    ) -> None:
+        """Note that a participant was named at a port."""
         if self.may_have_returning(now) and port in self.pool.range:
-            self._former_users[port] = prefix, kind
+            self._former_users.setdefault(port, _FormerUsers()).note((prefix, kind), by_peer)
 
     def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
         """Note what the kernel was told to forward before the start, by port."""
@@ -81,24 +127,35 @@ class LocatorPorts:
             self._former_users.clear()
             self._forwarded.clear()
         if not self.pool.free:
-            return None  # sorting takes long, and one datagram may name a thousand locators
+            return None  # looking takes long, and one datagram may name a thousand locators
         user = prefix, kind
-
-        # 0: its own, as outside or the kernel tells; 1: its own, as it says itself (anybody may);
-        # 2: nobody's; 3: that of another, who may still come back.
-        def rank(port: int) -> int:
-            if (former_locator := self._forwarded.get(port)) is not None:
-                return 0 if former_locator == locator and kind is LeaseKind.DATA else 3
-            former_user = self._former_users.get(port)
-            if former_user is None:
-                return 1 if port == had else 2
-            return 0 if former_user == user else 3
-
-        order = sorted(order_for(f"{prefix.hex()} {locator}", self.pool.range), key=rank)
-        port = next(filter(self.pool.claim, order), None)
+        told_of = {*self._former_users, *self._forwarded, *([had] if had else [])}
+        claims = {port: self._claim(port, user, locator, had) for port in told_of}
+        order = partial(order_for, f"{prefix.hex()} {locator}", self.pool.range)
+        nobodys = (port for port in order() if claims.get(port) in (None, _Claim.NOBODYS))
+        others = (port for port in order() if claims.get(port) is _Claim.ANOTHERS)
+        first, length = next(order()), len(self.pool.range)
+        own = [port for port, claim in claims.items() if claim < _Claim.NOBODYS]
+        own.sort(key=lambda port: (claims[port], (port - first) % length))
+        port = next(filter(self.pool.claim, chain(own, nobodys, others)), None)
         self._former_users.pop(port or 0, None)
         self._forwarded.pop(port or 0, None)
         return port
+
+    def _claim(self, port: int, user: _User, locator: HostPort, had: int | None) -> _Claim:
+        """Whose a port was, as it seems to a participant that wants one for a locator."""
+        prefix, kind = user
+        if (former_locator := self._forwarded.get(port)) is not None:
+            is_own = former_locator == locator and kind is LeaseKind.DATA
+            return _Claim.PROVEN if is_own else _Claim.ANOTHERS
+        users = self._former_users[port].users if port in self._former_users else ()
+        if user in users:
+            return _Claim.PROVEN if port == had else _Claim.NAMED
+        if port == had:
+            # Cyclone DDS has one locator for both kinds.
+            is_own = not users or any(prefix == named for named, _ in users)
+            return _Claim.SAID if is_own else _Claim.ANOTHERS
+        return _Claim.ANOTHERS if users else _Claim.NOBODYS
 
     def give_back(self, port: int) -> None:
         """Take a port back."""

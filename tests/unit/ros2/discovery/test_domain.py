@@ -303,6 +303,20 @@ def test_a_participant_says_which_ports_it_had() -> None:
     assert ports == {7410: 45009, 7411: 45004}
 
 
+def test_what_a_peer_says_of_a_port_counts_more_than_what_others_do() -> None:
+    domain, outsider = make_domain(), bytes([1, 15, *range(10, 20)])
+    for prefix, source in ((A, ROBOT), (B, STRANGER)):
+        for port in (45002, 45005):
+            domain.at_lease(port, sedp(outsider, ROBOT, 7410, to=prefix), source, 0.1)
+    domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.2)
+    domain.heard_inside(spdp(A, OTHER), OTHER, 0.3)
+    domain.settle(SETTLING + ANSWER_TIME)
+    ports = {participant.prefix: port for port, (participant, lease) in domain.inside.leases.items()
+             if lease.kind is LeaseKind.METATRAFFIC}  # fmt: skip
+    assert ports[A] in {45002, 45005}
+    assert ports[B] not in {45002, 45005}
+
+
 def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
     """The proxy may be killed at any time."""
     domain = make_domain()

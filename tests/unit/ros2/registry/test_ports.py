@@ -53,7 +53,7 @@ def test_no_port_is_given_twice(wanted: list[tuple[bytes, int]]) -> None:
 def test_who_is_meant_at_a_port_gets_it(prefix: bytes, other_prefix: bytes) -> None:
     pool = ports()
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
-    pool.note_former_user(first, other_prefix, DATA, 0.5)
+    pool.note_former_user(first, other_prefix, DATA, True, 0.5)
     if prefix != other_prefix:
         assert pool.take(prefix, locator(0), DATA, SETTLING) != first
     assert pool.take(other_prefix, locator(3), DATA, SETTLING) == first
@@ -68,23 +68,84 @@ def test_who_says_what_it_had_gets_it(prefix: bytes, had: int) -> None:
 
 def test_what_outside_says_counts_more_than_ones_own_word() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
-    pool.note_former_user(45007, other_prefix, DATA, 0.5)
+    pool.note_former_user(45007, other_prefix, DATA, True, 0.5)
     assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) != 45007
     assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45003) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
     pool, prefix = ports(), bytes(12)
-    pool.note_former_user(45007, prefix, METATRAFFIC, 0.5)
+    pool.note_former_user(45007, prefix, METATRAFFIC, True, 0.5)
     assert pool.take(prefix, locator(1), DATA, SETTLING) != 45007
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == 45007
+
+
+@given(st.permutations([(bytes(12), 45003), (bytes(range(12)), 45007)]))
+def test_where_several_are_named_their_own_word_decides(had: list[tuple[bytes, int]]) -> None:
+    """Whoever comes first: the last one that was named at a port may not be whose it was."""
+    pool = ports()
+    for port in (45003, 45007):
+        for prefix, _ in had:
+            pool.note_former_user(port, prefix, DATA, True, 0.5)
+    taken = [pool.take(prefix, locator(0), DATA, SETTLING, port) for prefix, port in had]
+    assert taken == [port for _, port in had]
+
+
+def test_each_locator_of_a_participant_gets_its_own_port() -> None:
+    """Fast DDS has two for data, and outside names the participant at both."""
+    pool, prefix, had = ports(), bytes(12), {0: 45003, 1: 45007}
+    for port in had.values():
+        pool.note_former_user(port, prefix, DATA, True, 0.5)
+    taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
+    assert taken == had
+
+
+@given(st.permutations([0, 1, 2]))
+def test_each_locator_gets_its_own_port_without_a_word(order: list[int]) -> None:
+    """Where it can be: as long as nobody had the port that it wants."""
+    before, after, prefix = ports(), ports(), bytes(12)
+    had = {n: before.take(prefix, locator(n), DATA, SETTLING) for n in range(3)}
+    for port in had.values():
+        after.note_former_user(port or 0, prefix, DATA, True, 0.5)
+    assert {n: after.take(prefix, locator(n), DATA, SETTLING) for n in order} == had
+
+
+def test_a_locator_for_both_kinds_keeps_its_port() -> None:
+    """Of Cyclone DDS: outside may have sent data alone, and the announcement begins with either."""
+    pool, prefix = ports(), bytes(12)
+    pool.note_former_user(45007, prefix, DATA, True, 0.5)
+    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING, 45007) == 45007
+
+
+def test_a_stranger_names_nobody_where_a_peer_has() -> None:
+    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    pool.note_former_user(45007, prefix, DATA, True, 0.5)
+    pool.note_former_user(45007, other_prefix, DATA, False, 0.5)
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45007) != 45007
+    assert pool.take(prefix, locator(0), DATA, SETTLING) == 45007
+
+
+def test_where_too_many_are_named_that_tells_nothing() -> None:
+    """Nobody can take a port from whom it was by naming all the world there."""
+    pool, prefix = ports(), bytes(12)
+    for number in range(1, 100):
+        pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, False, 0.5)
+    assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) == 45007
+
+
+def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
+    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    for port in RANGE.ports():
+        pool.note_former_user(port, other_prefix, DATA, True, 0.5)
+    first, second, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
+    assert [pool.take(prefix, locator(0), DATA, SETTLING) for _ in range(2)] == [first, second]
 
 
 def test_what_was_heard_is_forgotten_after_a_time() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
-    pool.note_former_user(first, other_prefix, DATA, 0.5)
-    pool.note_former_user(45000, other_prefix, DATA, REMEMBERED + 1)
+    pool.note_former_user(first, other_prefix, DATA, True, 0.5)
+    pool.note_former_user(45000, other_prefix, DATA, True, REMEMBERED + 1)
     assert pool.take(prefix, locator(0), DATA, REMEMBERED) == first
 
 
@@ -119,7 +180,7 @@ def test_what_the_kernel_forwarded_leads_there_again(
 ) -> None:
     pool = ports()
     pool.note_forwarded({port: locator(1), 9: locator(1)})
-    pool.note_former_user(port, other_prefix, DATA, 0.5)
+    pool.note_former_user(port, other_prefix, DATA, True, 0.5)
     assert pool.take(other_prefix, locator(0), DATA, SETTLING, had=port) != port
     assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING, had=port) != port
     assert pool.take(prefix, locator(1), DATA, SETTLING) == port
