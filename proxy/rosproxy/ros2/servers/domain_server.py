@@ -118,7 +118,7 @@ class DomainServer:
 
     def apply_policy(self) -> None:
         """Have participants meet anew of which the policy says something else than before."""
-        self._send(self.domain.apply_policy(self._now()))
+        self._open_and_send(self.domain.apply_policy(self._now()))
 
     def select(self, addresses: Iterable[str]) -> None:
         """Let in participants at these addresses alone, from now on."""
@@ -140,7 +140,7 @@ class DomainServer:
     async def expire(self) -> None:
         """Let in participants that have waited, and forget those that have gone."""
         self._release()
-        self._send(self.domain.settle(self._now()))
+        self._open_and_send(self.domain.settle(self._now()))
         self.domain.expire(self._now())
         self._sync_stand_ins()
         self._tell_changes()
@@ -179,7 +179,7 @@ class DomainServer:
         """Take in what participants have announced that are let in now."""
         now = self._now()
         for source, datagram in self._selected.released(now):
-            self._send(self.domain.heard_inside(datagram, source, now))
+            self._open_and_send(self.domain.heard_inside(datagram, source, now))
 
     def _ask(self, addresses: Iterable[str]) -> None:
         """Announce the observer to addresses inside whose network may not pass on multicast.
@@ -268,10 +268,17 @@ class DomainServer:
                     continue
                 byte_count += len(datagram)
                 outgoing = take(datagram, plain_address(sender[0]), self._now())
-                # What is sent names ports: these have to be open before.
-                self._sync_stand_ins()
                 self._tell_changes()
-                self._send(outgoing)
+                self._open_and_send(outgoing)
+
+    def _open_and_send(self, outgoing: Iterable[Outgoing]) -> None:
+        """Send what may name new stand-ins.
+
+        They have to be open before. If one can't be, nothing is sent: participants would believe it
+        for good, and what was announced comes again.
+        """
+        if self._sync_stand_ins():
+            self._send(outgoing)
 
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
         for out in outgoing:
@@ -290,12 +297,13 @@ class DomainServer:
             self._told_changes = changes
             self._changed()
 
-    def _sync_stand_ins(self) -> None:
-        """Open and close the ports for participants outside."""
+    def _sync_stand_ins(self) -> bool:
+        """Open and close the ports for participants outside; whether all are open."""
         outside = self.domain.outside
         if outside.changes == self._synced_changes:
-            return
+            return True
         self._synced_changes, wanted = outside.changes, outside.stand_ins
+        before = len(wanted)
         for port in self._stand_ins.keys() - wanted.keys():
             self._stop_reading(self._stand_ins.pop(port))
         for port in wanted.keys() - self._stand_ins.keys():
@@ -307,6 +315,7 @@ class DomainServer:
                 continue
             self._stand_ins[port] = sock
             self._loop.add_reader(sock, self._take_in, sock, self._at_stand_in(port))
+        return len(wanted) == before
 
 
 def _families(bind: str) -> list[socket.AddressFamily]:
