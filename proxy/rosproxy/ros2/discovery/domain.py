@@ -22,7 +22,7 @@ Every datagram may be forged. So
 - each source may make only so much discovery in a second, what it leads to included.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
@@ -34,6 +34,7 @@ from rosproxy.ros2.protocol.rtps import (
     NO_VENDOR,
     RtpsError,
     by_source,
+    destinations,
     for_all,
     may_be_discovery,
     source_vendor,
@@ -49,6 +50,8 @@ from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, 
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
 
+_StandInUsers = Sequence[tuple[OutsideParticipant, Lease]]
+"""Participants outside that a stand-in leads to, each by its lease."""
 _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams that go on, and what goes back to where they came from."""
 
@@ -121,25 +124,19 @@ class Domain(DomainParticipants):
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What inside sends to a port that stands for locators outside."""
-        users = list(self.outside.stand_ins.get(port, ()))
-        passed, back = list[bytes](), list[Outgoing]()
+        users, sent = list(self.outside.stand_ins.get(port, ())), list[Outgoing]()
+        is_metatraffic = any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users)
+        if not (is_metatraffic and may_be_discovery(datagram)):
+            is_of_participant = source in self.inside.count_by_address
+            return self._to_outside(users, datagram) if is_of_participant else []
+        if self._is_too_much(datagram, source, now):
+            return []
         try:
-            is_metatraffic = any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users)
-            if is_metatraffic and may_be_discovery(datagram):
-                if self._is_too_much(datagram, source, now):
-                    return []
-                exported = partial(self._exported, port, source, users[0][0].prefix, now)
-                passed, back = _pass_on_each(datagram, exported)
-            elif source in self.inside.count_by_address:
-                passed = [datagram]
+            for message in map(read_discovery, by_source(datagram)):
+                sent += self._exported(port, source, users, message, now)
         except RtpsError as error:
-            return self._drop("malformed", source, str(error))
-        return back + [
-            sent
-            for outsider, lease in users
-            for d in passed
-            for sent in self._to_outside(outsider, lease, d)
-        ]
+            sent += self._drop("malformed", source, str(error))
+        return sent
 
     def settle(self, now: float) -> list[Outgoing]:
         """Admit those that waited until it was known who had which port; and have others meet."""
@@ -250,19 +247,23 @@ class Domain(DomainParticipants):
         return self.settings.to_outside(exported)
 
     def _exported(
-        self, port: int, source: str, reader: bytes, now: float, message: DiscoveryMessage
-    ) -> _Passing:
-        """Metatraffic from inside as outside gets it. Raises RtpsError."""
+        self, port: int, source: str, users: _StandInUsers, message: DiscoveryMessage, now: float
+    ) -> list[Outgoing]:
+        """Metatraffic from inside as outside gets it, and what goes back. Raises RtpsError."""
         insider = self.inside.find(message.prefix, source)
         if insider is None:
-            self._drop("unknown_participant", source, "it has not announced itself")
-            return [], []
+            return self._drop("unknown_participant", source, "it has not announced itself")
         if insider.is_apart:
-            return [], []
-        self.rediscovery.note_met(insider, reader)
+            return []
+        # One port may stand for several: those that are named get it, or all if nobody is.
+        named = destinations(message.datagram)
+        users = [user for user in users if user[0].prefix in named] or users
+        for outsider, _ in users:
+            self.rediscovery.note_met(insider, outsider.prefix)
         count, exported = len(insider.leases), partial(self.inside.exported, insider, now=now)
-        passed, questions = self.fragments.rewritten(port, message, reader, exported)
-        return passed, sent_to(insider.metatraffic, questions) + self._reminders(insider, count)
+        passed, questions = self.fragments.rewritten(port, message, users[0][0].prefix, exported)
+        back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count)
+        return back + [sent for d in passed for sent in self._to_outside(users, d)]
 
     def _reminders(self, insider: InsideParticipant, former_count: int) -> list[Outgoing]:
         """What makes a participant keep new ports at once, if it has more than ``former_count``.
@@ -300,13 +301,16 @@ class Domain(DomainParticipants):
             self._forget_outside(outsider)
         return passed, back
 
-    def _to_outside(
-        self, target: OutsideParticipant, lease: Lease, datagram: bytes
-    ) -> list[Outgoing]:
-        if not target.may_be_sent(len(datagram)):
-            text = f"{target.guid_prefix} has not shown yet that it receives what is sent to it"
-            return self._drop("unproven", target.address, text)
-        return [self._passed(lease, datagram, False)]
+    def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
+        """A datagram that goes to participants outside, as far as they may be sent any."""
+        sent = list[Outgoing]()
+        for target, lease in users:
+            if target.may_be_sent(len(datagram)):
+                sent.append(self._passed(lease, datagram, False))
+            else:
+                text = f"{target.guid_prefix} has not shown yet that it receives what is sent to it"
+                sent += self._drop("unproven", target.address, text)
+        return sent
 
     def _passed(self, lease: Lease, datagram: bytes, inwards: bool) -> Outgoing:
         """A datagram that goes to where a lease leads."""

@@ -180,6 +180,22 @@ def destination(datagram: bytes) -> bytes | None:
     return None
 
 
+def destinations(datagram: bytes) -> set[bytes]:
+    """The GUID prefixes of all whom a message is for; none if some of it is for all. RtpsError.
+
+    Cyclone DDS puts into one message what goes to one address, whoever is there.
+    """
+    prefixes, prefix = set[bytes](), bytes(PREFIX)
+    for kind, _, body in submessages(datagram):
+        if kind == _INFO_DST:
+            prefix = datagram[body.start : body.start + PREFIX]
+        elif kind not in _NAMELESS:
+            if not any(prefix):
+                return set()
+            prefixes.add(prefix)
+    return prefixes
+
+
 def for_all(datagram: bytes) -> bytes:
     """The message without its destinations, so that everybody takes it. Raises RtpsError."""
     destinations = [body for kind, _, body in submessages(datagram) if kind == _INFO_DST]

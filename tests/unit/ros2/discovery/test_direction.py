@@ -124,6 +124,9 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
         7420,
         7421,
     }
+    named = sedp(A, INSIDE, 7001, to=bytes([9, 1]) + B[2:])
+    targets = {sent.target.port for sent in domain.at_stand_in(20_000, named, INSIDE, NOW)}
+    assert targets == {7420, 7421}
 
 
 def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:

@@ -13,6 +13,7 @@ from rosproxy.ros2.protocol.rtps import (
     RtpsError,
     Span,
     apply,
+    destinations,
     samples,
     source_prefix,
 )
@@ -183,3 +184,15 @@ def test_the_prefix_of_a_message() -> None:
     assert source_prefix(message()) == PREFIX
     assert samples(message()) == []
     assert Span(1, 2) != Span(1, 3)
+
+
+def test_all_that_a_message_names_are_meant() -> None:
+    """One message of Cyclone DDS may be for several at one address."""
+    first, second = bytes([1] * 12), bytes([2] * 12)
+    to_first, to_second, to_all = (submessage(0x0E, 0, p) for p in (first, second, bytes(12)))
+    ack, info = submessage(0x06, 1, bytes(24)), submessage(0x09, 1, bytes(8))
+    assert destinations(message(info, to_first, ack, to_second, info, ack)) == {first, second}
+    assert destinations(message(to_first, ack, to_second)) == {first}
+    assert destinations(message(ack, to_first, ack)) == set()
+    assert destinations(message(to_first, ack, to_all, ack)) == set()
+    assert destinations(message(info)) == set()
