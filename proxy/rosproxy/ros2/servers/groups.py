@@ -4,12 +4,18 @@ Participants announce themselves to one group with IPv4, and to one of two with 
 standard there: Fast DDS has one of global scope (UDPv6Transport.cpp), Cyclone DDS one of link scope
 (ddsi_udp.c). A membership is by an own address with IPv4, by the interface's index with IPv6, and
 a group of link scope has a socket for each link.
+
+A membership stays with its socket when the network goes, and of those of IPv4 a socket has 20
+(igmp_max_memberships): so they are given up, and where one socket has no room the next one has.
 """
 
+import contextlib
 import errno
 import socket
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import interface_index
@@ -18,6 +24,9 @@ GROUP, GROUP_FAST_DDS6, GROUP_CYCLONE6 = "239.255.0.1", "ff1e::ffff:efff:1", "ff
 """Where participants announce themselves (DDSI-RTPS 2.5, 9.6.2.4.1)."""
 _SHARED = {socket.AF_INET: (GROUP,), socket.AF_INET6: (GROUP_FAST_DDS6,)}
 _OF_LINK = {socket.AF_INET: (), socket.AF_INET6: (GROUP_CYCLONE6,)}
+_ONLY_OWN = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (socket.IPPROTO_IPV6, 29)}
+"""IP_MULTICAST_ALL and IPV6_MULTICAST_ALL of linux/in.h and in6.h: whether a socket hears the group
+on networks that only other sockets have joined."""
 
 
 def family_of(address: str) -> socket.AddressFamily:
@@ -31,6 +40,29 @@ def groups_of(address: str) -> tuple[str, ...]:
     return _SHARED[family] + _OF_LINK[family]
 
 
+class Membership(NamedTuple):
+    """A socket that hears a group on a network; ``request`` names both to the kernel."""
+
+    sock: socket.socket
+    request: bytes
+
+    def end(self) -> None:
+        """Hear it no more. The network may have gone."""
+        is_v6 = self.sock.family == socket.AF_INET6
+        level = socket.IPPROTO_IPV6 if is_v6 else socket.IPPROTO_IP
+        option = socket.IPV6_LEAVE_GROUP if is_v6 else socket.IP_DROP_MEMBERSHIP
+        with contextlib.suppress(OSError):
+            self.sock.setsockopt(level, option, self.request)
+
+
+@dataclass(slots=True)
+class _Network:
+    """What hears the groups on a network: its own sockets, and memberships of shared ones."""
+
+    sockets: list[socket.socket] = field(default_factory=list)
+    memberships: list[Membership] = field(default_factory=list)
+
+
 class GroupEars:
     """Sockets that hear the groups of a port. ``begin`` is called with each, ``end`` closes it."""
 
@@ -41,26 +73,28 @@ class GroupEars:
         end: Callable[[socket.socket], None],
     ) -> None:
         self._port, self._begin, self._end = port, begin, end
-        self._shared: dict[socket.AddressFamily, list[socket.socket]] = {}
-        self._of_link: dict[str, list[socket.socket]] = {}
+        self._shared: dict[str, list[socket.socket]] = {}
+        self._networks: dict[str, _Network] = {}
 
     @property
     def joined(self) -> list[str]:
         """The addresses on whose networks they are heard."""
-        return list(self._of_link)
+        return list(self._networks)
 
     def open(self, families: Iterable[socket.AddressFamily]) -> None:
         """Hear the groups that have one socket for all networks. Raises OSError."""
-        for family in families:
-            self._shared[family] = [self._opened(group) for group in _SHARED[family]]
+        for group in (group for family in families for group in _SHARED[family]):
+            self._shared[group] = [self._opened(group)]
 
     def join(self, addresses: Iterable[str]) -> list[str]:
         """Hear them on the networks of these own addresses alone; the addresses that are new."""
-        present = {a for a in addresses if family_of(a) in self._shared}
-        for address in self._of_link.keys() - present:
-            for sock in self._of_link.pop(address):
-                self._end(sock)
-        new = sorted(present - self._of_link.keys())
+        present = {a for a in addresses if any(g in self._shared for g in groups_of(a))}
+        gone = self._networks.keys() - present
+        # Another address of a network that has gone may have had its membership for both.
+        shared = {a for a, network in self._networks.items() if gone and not network.memberships}
+        for address in gone | shared:
+            self._leave(address)
+        new = sorted(present - self._networks.keys())
         return [address for address in new if self._join(address)]
 
     def close(self) -> None:
@@ -74,18 +108,37 @@ class GroupEars:
     def _join(self, address: str) -> bool:
         """Hear them on one network, if it is still there."""
         family = family_of(address)
-        link_sockets = list[socket.socket]()
+        network = self._networks[address] = _Network()
         try:
-            link_sockets += (self._opened(group, address) for group in _OF_LINK[family])
-            for sock in self._shared[family] + link_sockets:
-                join(sock, address)
+            for group in _OF_LINK[family]:
+                network.sockets.append(self._opened(group, address))
+                join(network.sockets[-1], address)
+            for group in _SHARED[family]:
+                if membership := self._join_shared(group, address):
+                    network.memberships.append(membership)
         except OSError:
             # Networks come and go: as it is not in `joined`, the next call tries it again.
-            for sock in link_sockets:
-                self._end(sock)
+            self._leave(address)
             return False
-        self._of_link[address] = link_sockets
         return True
+
+    def _join_shared(self, group: str, address: str) -> Membership | None:
+        """Join a group by the first socket that has room for it. Raises OSError."""
+        for sock in self._shared[group]:
+            try:
+                return join(sock, address)
+            except OSError as error:
+                if error.errno != errno.ENOBUFS:
+                    raise
+        self._shared[group].append(self._opened(group))
+        return join(self._shared[group][-1], address)
+
+    def _leave(self, address: str) -> None:
+        network = self._networks.pop(address)
+        for sock in network.sockets:
+            self._end(sock)
+        for membership in network.memberships:
+            membership.end()
 
     def _opened(self, group: str, link_of: str = "") -> socket.socket:
         sock = group_socket(HostPort(group, self._port), link_of)
@@ -102,6 +155,7 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
     try:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.setsockopt(*_ONLY_OWN[sock.family], 0)
         # A group of link scope is another one on each link: the scope id tells which (ipv6(7)).
         link = (0, interface_index(link_of)) if link_of else ()
         sock.bind((group.host, group.port, *link))
@@ -124,16 +178,22 @@ def send_through(sock: socket.socket, address: str, loop: bool) -> None:
     sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, loop)
 
 
-def join(sock: socket.socket, address: str) -> None:
-    """Hear the group that a socket is bound to on the network of an own address. Raises OSError."""
+def join(sock: socket.socket, address: str) -> Membership | None:
+    """Hear the group that a socket is bound to on the network of an own address. Raises OSError.
+
+    None if the socket does already, by another address of that network.
+    """
     packed = socket.inet_pton(sock.family, sock.getsockname()[0].partition("%")[0])
+    if sock.family == socket.AF_INET6:
+        level, option = socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP
+        request = packed + interface_index(address).to_bytes(4, sys.byteorder)
+    else:
+        level, option = socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP
+        request = packed + socket.inet_aton(address)
     try:
-        if sock.family == socket.AF_INET6:
-            link = interface_index(address).to_bytes(4, sys.byteorder)
-            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, packed + link)
-        else:
-            member = packed + socket.inet_aton(address)
-            sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        sock.setsockopt(level, option, request)
     except OSError as error:
-        if error.errno != errno.EADDRINUSE:  # joined already, by another address of that network
-            raise
+        if error.errno == errno.EADDRINUSE:
+            return None
+        raise
+    return Membership(sock, request)

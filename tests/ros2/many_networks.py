@@ -1,0 +1,88 @@
+"""Joins more networks than a socket may, and others after them, and tells what it hears: JSON.
+
+It is run in a network namespace of its own, where it makes and removes the networks.
+"""
+
+import asyncio
+import json
+import socket
+import subprocess
+from collections.abc import Iterator
+
+from rosproxy.ros2.servers.groups import GROUP, GroupEars, send_through
+from tests.integration.net import PATIENCE
+
+PORT = 7400
+AT_ONCE, IN_ALL = 25, 60
+
+
+class Hearing:
+    """What is heard of the group; ``opened`` counts sockets."""
+
+    def __init__(self) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.sources = list[str]()
+        self.opened = 0
+        self.ears = GroupEars(PORT, self._begin, self._end)
+        self.ears.open([socket.AF_INET])
+
+    def _begin(self, sock: socket.socket) -> None:
+        self.opened += 1
+        self.loop.add_reader(sock, lambda: self.sources.append(sock.recvfrom(100)[1][0]))
+
+    def _end(self, sock: socket.socket) -> None:
+        self.loop.remove_reader(sock)
+        sock.close()
+
+    async def heard(self, addresses: list[str]) -> list[str]:
+        """From where it hears what is sent through the networks of these addresses, once each."""
+        self.sources.clear()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            for address in addresses:
+                send_through(out, address, loop=True)
+                out.sendto(b"RTPS", (GROUP, PORT))
+        async with asyncio.timeout(PATIENCE):
+            while len(self.sources) < len(addresses):
+                await asyncio.sleep(0.01)
+        await asyncio.sleep(0)  # what would be heard twice is there as well
+        return sorted(self.sources)
+
+
+def ip(command: str) -> None:
+    subprocess.run(["ip", *command.split()], check=True)
+
+
+def networks() -> Iterator[str]:
+    """Networks of this machine, each made when it is asked for; their addresses here."""
+    for number in range(IN_ALL):
+        ip(f"link add d{number} type veth peer name e{number}")
+        ip(f"addr add 10.60.{number}.1/24 dev d{number}")
+        ip(f"link set d{number} up")
+        yield f"10.60.{number}.1"
+
+
+async def main() -> None:
+    hearing, coming = Hearing(), networks()
+    present = [next(coming) for _ in range(AT_ONCE)]
+    joined = [len(hearing.ears.join(present))]
+    first = await hearing.heard(present)
+    sockets = [hearing.opened]
+    for number, address in enumerate(coming):
+        ip(f"link del d{number}")
+        present = [*present[1:], address]
+        joined.append(len(hearing.ears.join(present)))
+    last = await hearing.heard(present)
+    sockets.append(hearing.opened)
+    second_address = "10.60.59.2"
+    ip(f"addr add {second_address}/24 dev d59")
+    hearing.ears.join([present[-1], second_address])
+    hearing.ears.join([second_address])
+    by_second = await hearing.heard([second_address])
+    hearing.ears.close()
+    print(json.dumps({"joined": joined, "heard": [len(first), len(last), len(by_second)],
+                      "twice": [len(s) - len(set(s)) for s in (first, last, by_second)],
+                      "sockets": sockets}))  # fmt: skip
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
