@@ -9,7 +9,6 @@ Types are compared by their names, as ROS 2 has them: another definition has the
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from fnmatch import fnmatchcase
 from itertools import islice, product
 
 import msgspec
@@ -22,7 +21,7 @@ MOST_LOOKED_AT = 20_000
 """Readers and writers of a side that are looked at; a participant of ROS 2 has some tens."""
 MOST_COMPARED = 20_000
 """Pairs that are compared at a time."""
-_WILDCARDS = {"*", "?"}
+_WILDCARDS = {"*", "?", "["}
 _XCDR = 0
 _REPRESENTATIONS = {0: "XCDR", 1: "XML", 2: "XCDR2"}
 
@@ -97,21 +96,19 @@ def _partition(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
     offered, requested = writer.qos.partitions, reader.qos.partitions
     if offered is None or requested is None:
         return None
-    if any(_same_partition(*pair) for pair in product(offered or ("",), requested or ("",))):
+    if any(_may_be_same_partition(*pair) for pair in product(offered or ("",), requested or ("",))):
         return None
     return Mismatch("partition", " ".join(offered) or "none", " ".join(requested) or "none")
 
 
-def _same_partition(offered: str, requested: str) -> bool:
-    """Whether two names of partitions match; either may have wildcards, as file names have.
+def _may_be_same_partition(offered: str, requested: str) -> bool:
+    """Whether two names of partitions match, or may: one may be a pattern, as of file names.
 
-    If both have some, they match only if they are the same (2.2.3.13).
+    Implementations differ in what patterns mean. If both are some, they match only if they are the
+    same (DDS 1.4, 2.2.3.13).
     """
     wild = [bool(_WILDCARDS & {*name}) for name in (offered, requested)]
-    if wild[0] == wild[1]:
-        return offered == requested
-    name, pattern = (requested, offered) if wild[0] else (offered, requested)
-    return fnmatchcase(name, pattern)
+    return offered == requested or wild[0] != wild[1]
 
 
 def _reliability(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
