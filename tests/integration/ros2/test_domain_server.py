@@ -10,6 +10,7 @@ import pytest
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import DomainSettings
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED, stand_in_port
@@ -80,3 +81,29 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(server: DomainSer
         (opened,) = server.domain.outside.stand_ins
         assert told == HostPort(PROXY, opened)
         assert opened != wanted
+
+
+async def test_who_is_not_selected_has_an_allowance_of_discovery(
+    server: DomainServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is held back of it has to be read, too, which takes long."""
+    server.select([])
+    held = server._selected.held_announcements
+    with participant(INSIDE) as insider:
+        port, target = insider.getsockname()[1], (PROXY, server.domain.settings.unicast_port)
+        with monkeypatch.context() as patch:
+            asked = asyncio.Event()
+
+            def none_left(*_: object) -> bool:
+                asked.set()
+                return False
+
+            patch.setattr(DiscoveryRates, "take", none_left)
+            insider.sendto(spdp(A, INSIDE, port), target)
+            async with asyncio.timeout(PATIENCE):
+                await asked.wait()
+        insider.sendto(spdp(B, INSIDE, port), target)
+        async with asyncio.timeout(PATIENCE):
+            while not held:
+                await asyncio.sleep(0.01)
+    assert held[INSIDE].keys() == {B}

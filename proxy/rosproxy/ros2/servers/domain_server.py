@@ -227,6 +227,8 @@ class DomainServer:
                 return []
             if self._selected.admits(source, now):
                 return take(datagram, source, now)
+            if not self.domain.rates.take(source, len(datagram), now):
+                return []
             with contextlib.suppress(RtpsError):
                 for message in map(read_discovery, by_source(datagram)):
                     if message.of_participant is not None:
