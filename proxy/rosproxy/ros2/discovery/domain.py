@@ -28,17 +28,9 @@ from functools import partial
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import Outgoing, sent_to
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
+from rosproxy.ros2.protocol.addressing import destinations, for_all, may_be_discovery
 from rosproxy.ros2.protocol.envelope import unwrapped
-from rosproxy.ros2.protocol.rtps import (
-    MAGIC,
-    NO_VENDOR,
-    RtpsError,
-    by_source,
-    destinations,
-    for_all,
-    may_be_discovery,
-    source_vendor,
-)
+from rosproxy.ros2.protocol.rtps import MAGIC, NO_VENDOR, RtpsError, by_source, source_vendor
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,

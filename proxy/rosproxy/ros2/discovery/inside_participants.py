@@ -21,14 +21,9 @@ from rosproxy.ros2.discovery.domain_settings import (
     Refused,
 )
 from rosproxy.ros2.discovery.hidden_endpoints import is_hidden
+from rosproxy.ros2.protocol.addressing import for_all
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import (
-    RtpsError,
-    by_source,
-    for_all,
-    source_prefix,
-    source_vendor,
-)
+from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,

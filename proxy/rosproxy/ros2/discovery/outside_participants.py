@@ -30,9 +30,10 @@ from rosproxy.ros2.discovery.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.discovery.hidden_endpoints import is_hidden
+from rosproxy.ros2.protocol.addressing import destination, for_all
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import destination, for_all, source_vendor
+from rosproxy.ros2.protocol.rtps import source_vendor
 from rosproxy.ros2.registry.locator_ports import stand_in_port
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,

@@ -57,6 +57,22 @@ class Pid(IntEnum):
     PARTICIPANT_SECURITY_INFO = 0x1005
 
 
+class FastDdsPid(IntEnum):
+    """Parameters of Fast DDS that tell what it shares with others on its machine.
+
+    Ids from 0x8000 on have a meaning for each vendor (ParameterTypes.hpp).
+    """
+
+    MACHINE_ID = 0x8003
+    DATA_SHARING = 0x8006
+    NETWORK_CONFIGURATION = 0x8007
+
+
+OLD_LOCATORS = (0x0B, 0x0C, 0x0D, 0x0E, 0x11, 0x45, 0x46)
+"""Addresses and ports of locators, each a parameter of its own: RTPS 2.1 had them, and Cyclone DDS
+still goes by them (ddsi_plist.c)."""
+
+
 class Parameter(msgspec.Struct, frozen=True):
     """A parameter: its id, where that stands in the datagram, and where its value is."""
 
@@ -108,6 +124,11 @@ class ParameterList(msgspec.Struct, frozen=True):
     def removed(self, parameter: Parameter) -> Overwrite:
         """The edit that takes a parameter out."""
         return Overwrite(parameter.offset, struct.pack(self.order + "H", Pid.PAD))
+
+    def zeroed(self, parameter: Parameter) -> Overwrite:
+        """The edit that leaves nothing of a parameter's value."""
+        start, end = parameter.value.start, parameter.value.end
+        return Overwrite(start, bytes(end - start))
 
 
 def payload_parameters(datagram: bytes, sample: Sample) -> ParameterList | None:

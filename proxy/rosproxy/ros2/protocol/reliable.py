@@ -15,13 +15,13 @@ from collections.abc import Collection, Iterator, Sequence
 
 import msgspec
 
+from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.rtps import (
     LAST_NUMBER,
     Overwrite,
     RtpsError,
     Sample,
     SubmessageId,
-    destination,
     message_header,
     submessages,
 )

@@ -23,7 +23,7 @@ from enum import IntEnum
 import msgspec
 
 MAGIC = b"RTPS"
-VERSION, NO_VENDOR = b"\x02\x03", b"\x00\x00"
+VERSION, NO_VENDOR, RTI = b"\x02\x03", b"\x00\x00", b"\x01\x01"
 HEADER = 20
 """Bytes of a message's header."""
 ALIGNMENT = 4
@@ -34,8 +34,6 @@ PREFIX = 12
 """Bytes of a GUID prefix."""
 VERSION_TO_PREFIX = HEADER - len(MAGIC)
 """Bytes of what a header and an INFO_SRC both have: version, vendor, GUID prefix."""
-MOST_OF_USERS = 16
-"""Submessages of a datagram that may pass unread; of users' data there are half a dozen."""
 MOST_SUBMESSAGES = 256
 """Submessages of a datagram that are read; real ones have a dozen."""
 
@@ -49,6 +47,8 @@ MOST_PARAMETERS = 512
 _LITTLE_HEADER, _BIG_HEADER = struct.Struct("<HH"), struct.Struct(">HH")
 
 _LITTLE, _QOS, _DATA, _KEY, _FRAGMENT_KEY = 0x01, 0x02, 0x04, 0x08, 0x04
+_CHECKSUM = 0x60
+"""Which checksum a HEADER_EXTENSION has, if any (DDSI-RTPS 2.5, 9.4.5.2)."""
 
 
 class RtpsError(ValueError):
@@ -58,6 +58,7 @@ class RtpsError(ValueError):
 class SubmessageId(IntEnum):
     """The submessages that the proxy reads."""
 
+    HEADER_EXTENSION = 0x00
     PAD = 0x01
     ACKNACK = 0x06
     HEARTBEAT = 0x07
@@ -69,35 +70,14 @@ class SubmessageId(IntEnum):
     HEARTBEAT_FRAG = 0x13
     DATA = 0x15
     DATA_FRAG = 0x16
+    RTI_CRC = 0x80
 
 
 # Plain numbers: a member of an enumeration is slow to look up, and this is done for each datagram.
-_INFO_SRC, _INFO_DST = SubmessageId.INFO_SRC.value, SubmessageId.INFO_DST.value
+_INFO_SRC, INFO_DST = SubmessageId.INFO_SRC.value, SubmessageId.INFO_DST.value
 _DATA_FRAG = SubmessageId.DATA_FRAG.value
 _WITH_SAMPLE = frozenset({SubmessageId.DATA.value, _DATA_FRAG})
 _MAY_BE_EMPTY = frozenset({SubmessageId.PAD.value, SubmessageId.INFO_TS.value})
-_WRITER_AT: dict[int, int] = {
-    SubmessageId.DATA: 8,
-    SubmessageId.DATA_FRAG: 8,
-    SubmessageId.ACKNACK: 4,
-    SubmessageId.HEARTBEAT: 4,
-    SubmessageId.GAP: 4,
-    SubmessageId.NACK_FRAG: 4,
-    SubmessageId.HEARTBEAT_FRAG: 4,
-}
-"""Where in its body a submessage has the writer's entity id; in front of it stands the reader's."""
-_NAMELESS = frozenset(
-    kind.value
-    for kind in (
-        SubmessageId.PAD,
-        SubmessageId.INFO_TS,
-        SubmessageId.INFO_SRC,
-        SubmessageId.INFO_DST,
-    )
-)
-"""Submessages that are from no writer, and only tell of those that follow."""
-_BUILT_IN = 0xC0
-"""The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
 
 
 class Span(msgspec.Struct, frozen=True):
@@ -168,80 +148,14 @@ def source_vendor(datagram: bytes) -> bytes:
     return datagram[6:8]
 
 
-def destination(datagram: bytes) -> bytes | None:
-    """The GUID prefix of whom a message is for; None if it is for all. Raises RtpsError.
-
-    The first INFO_DST counts: what follows may be for others, who are then at the same locator.
-    """
-    for kind, _, body in submessages(datagram):
-        if kind == _INFO_DST:
-            prefix = datagram[body.start : body.start + PREFIX]
-            return prefix if any(prefix) else None
-    return None
-
-
-def destinations(datagram: bytes) -> set[bytes]:
-    """The GUID prefixes of all whom a message is for; none if some of it is for all. RtpsError.
-
-    Cyclone DDS puts into one message what goes to one address, whoever is there.
-    """
-    prefixes, prefix = set[bytes](), bytes(PREFIX)
-    for kind, _, body in submessages(datagram):
-        if kind == _INFO_DST:
-            prefix = datagram[body.start : body.start + PREFIX]
-        elif kind not in _NAMELESS:
-            if not any(prefix):
-                return set()
-            prefixes.add(prefix)
-    return prefixes
-
-
-def for_all(datagram: bytes) -> bytes:
-    """The message without its destinations, so that everybody takes it. Raises RtpsError."""
-    destinations = [body for kind, _, body in submessages(datagram) if kind == _INFO_DST]
-    # GUIDPREFIX_UNKNOWN, which is all zero, means everybody.
-    return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in destinations])
-
-
-def of_built_in_writer(datagram: bytes) -> bool | None:
-    """Whether a message is from or to a built-in writer, as discovery is; None if to no writer.
-
-    The first submessage that names a writer counts. Raises RtpsError.
-    """
-    for kind, _, body in submessages(datagram):
-        offset = _WRITER_AT.get(kind)
-        if offset is not None:
-            _require_size(body, offset + 4)
-            return bool(datagram[body.start + offset + 3] & _BUILT_IN == _BUILT_IN)
-    return None
-
-
-def may_be_discovery(datagram: bytes) -> bool:
-    """Whether a message has to be read: whether a built-in writer or reader may be named in it.
-
-    So it may where it is no message, has more submessages than users' data has, or such as nobody
-    can look into: those of DDS Security, and unknown ones.
-    """
-    try:
-        source_prefix(datagram)
-        for count, (kind, _, body) in enumerate(submessages(datagram)):
-            if count >= MOST_OF_USERS or (
-                kind not in _NAMELESS and _names_built_in(datagram, kind, body)
-            ):
-                return True
-    except RtpsError:
-        return True
-    return False
-
-
-def _names_built_in(datagram: bytes, kind: int, body: Span) -> bool:
-    """Whether a submessage names a built-in reader or writer, or may. Raises RtpsError."""
-    offset = _WRITER_AT.get(kind)
-    if offset is None:
-        return True
-    _require_size(body, offset + 4)
-    reader, writer = datagram[body.start + offset - 1], datagram[body.start + offset + 3]
-    return _BUILT_IN in (reader & _BUILT_IN, writer & _BUILT_IN)
+def has_checksum(datagram: bytes) -> bool:
+    """Whether a message carries a checksum of itself. Raises RtpsError."""
+    is_of_rti = source_vendor(datagram) == RTI
+    return any(
+        (kind == SubmessageId.HEADER_EXTENSION and flags & _CHECKSUM)
+        or (kind == SubmessageId.RTI_CRC and is_of_rti)
+        for kind, flags, _ in submessages(datagram)
+    )
 
 
 def samples(datagram: bytes) -> list[Sample]:
@@ -249,7 +163,7 @@ def samples(datagram: bytes) -> list[Sample]:
     all_samples, prefix = list[Sample](), source_prefix(datagram)
     for kind, flags, body in submessages(datagram):
         if kind == _INFO_SRC:
-            _require_size(body, 20)
+            require_size(body, 20)
             prefix = datagram[body.start + 8 : body.start + 20]
         elif kind in _WITH_SAMPLE:
             all_samples.append(_sample(datagram, prefix, flags, body, kind == _DATA_FRAG))
@@ -267,13 +181,13 @@ def by_source(datagram: bytes) -> list[bytes]:
     messages = list[bytes]()
     for kind, _, body in submessages(datagram):
         if kind == _INFO_SRC:
-            _require_size(body, 4 + VERSION_TO_PREFIX)
+            require_size(body, 4 + VERSION_TO_PREFIX)
             if body.start - 4 > start:
                 messages.append(header + datagram[start : body.start - 4])
             source_offset = body.start + 4
             header = MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX] + info_dst
             start = body.end
-        elif kind == _INFO_DST:
+        elif kind == INFO_DST:
             info_dst = datagram[body.start - 4 : body.end]
     if not messages and start == HEADER:
         return [datagram]
@@ -313,7 +227,7 @@ def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
             raise RtpsError(f"submessage {kind:#x} is longer than the message")
         if (offset - body) % ALIGNMENT and offset < size:
             raise RtpsError(f"submessage {kind:#x} of {offset - body} bytes in front of others")
-        if kind == _INFO_DST and offset - body < PREFIX:
+        if kind == INFO_DST and offset - body < PREFIX:
             raise RtpsError(f"a destination of {offset - body} bytes needs {PREFIX}")
         yield kind, flags, Span(body, offset)
 
@@ -345,7 +259,7 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
 
 def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment: bool) -> Sample:
     fixed_size = 32 if is_fragment else 20
-    _require_size(body, fixed_size)
+    require_size(body, fixed_size)
     start, little = body.start, bool(flags & _LITTLE)
     to_qos = _unpack("H", datagram, start + 2, flags)
     high, low = _unpack("i", datagram, start + 12, flags), _unpack("I", datagram, start + 16, flags)
@@ -386,7 +300,8 @@ def _fragments(datagram: bytes, offset: int, flags: int) -> Fragments:
     )
 
 
-def _require_size(body: Span, size: int) -> None:
+def require_size(body: Span, size: int) -> None:
+    """Raise RtpsError unless a submessage has so many bytes."""
     if body.end - body.start < size:
         raise RtpsError(f"a submessage of {body.end - body.start} bytes needs {size}")
 

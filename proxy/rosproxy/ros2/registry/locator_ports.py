@@ -21,7 +21,7 @@ from itertools import chain, islice
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.rtps import destination, of_built_in_writer
+from rosproxy.ros2.protocol.addressing import destination, of_built_in_writer
 from rosproxy.ros2.registry.participants import LeaseKind
 
 STAND_INS = PortRange(20_000, 32_767)

@@ -13,12 +13,13 @@ import msgspec
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.qos import EndpointQos
-from rosproxy.ros2.protocol.rtps import destination
+from rosproxy.ros2.protocol.rtps import NO_VENDOR, RTI
 
 VENDORS = {
-    b"\x00\x00": "rosproxy",
-    b"\x01\x01": "RTI Connext",
+    NO_VENDOR: "rosproxy",
+    RTI: "RTI Connext",
     b"\x01\x02": "OpenSplice",
     b"\x01\x03": "OpenDDS",
     b"\x01\x0f": "Fast DDS",

@@ -5,6 +5,7 @@ are samples of built-in writers, known by their entity ids (DDSI-RTPS 2.5, 8.5 a
 payload is a parameter list. An *announcement* goes on as it is but for its locators: each that a
 participant can be reached at is led elsewhere, and all others are taken out. These are multicast
 ones, which end at the next router, and those of transports that can't be passed on (shared memory).
+So are marks by which Fast DDS knows programs of its own machine.
 An announcement that is to be hidden goes on as a GAP, so that its reader does not ask for it again
 and again.
 """
@@ -17,6 +18,8 @@ import msgspec
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import read_locator, replaced
 from rosproxy.ros2.protocol.parameters import (
+    OLD_LOCATORS,
+    FastDdsPid,
     Parameter,
     ParameterList,
     Pid,
@@ -25,14 +28,17 @@ from rosproxy.ros2.protocol.parameters import (
 )
 from rosproxy.ros2.protocol.reliable import withheld
 from rosproxy.ros2.protocol.rtps import (
+    NO_VENDOR,
     PREFIX,
     Fragments,
     Overwrite,
     RtpsError,
     Sample,
     apply,
+    has_checksum,
     samples,
     source_prefix,
+    source_vendor,
 )
 from rosproxy.ros2.registry.participants import EndpointKind
 
@@ -49,6 +55,8 @@ MULTICAST = (
 _IDENTITIES = (Pid.PARTICIPANT_GUID, Pid.ENDPOINT_GUID, Pid.KEY_HASH)
 """Parameters by which an announcement says what it is about; each begins with a GUID prefix.
 Receivers act on these, whoever has sent the message (Fast DDS: EDPSimplePUBListener)."""
+TAKEN_FOR_FAST_DDS = (b"\x01\x0f", NO_VENDOR)
+"""Vendors whose parameters Fast DDS reads as its own."""
 _DISPOSED_OR_UNREGISTERED = 0x03
 LONGEST_OF_PARTICIPANT = 8192
 """Bytes of a datagram in which a participant announces itself; it is kept. Some have 1,500."""
@@ -146,6 +154,8 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
     builtin_samples = [sample for sample in samples(datagram) if sample.writer in _BUILTIN_WRITERS]
     if any(sample.prefix != prefix for sample in builtin_samples):
         raise RtpsError(_OF_ANOTHER)
+    if builtin_samples and has_checksum(datagram):
+        raise RtpsError("discovery with a checksum, which would not fit what is rewritten")
     for sample in builtin_samples:  # fragments have inline QoS as well
         _require_own(datagram, sample, inline_parameters(datagram, sample))
     message = DiscoveryMessage(
@@ -230,6 +240,21 @@ def _edits(
     for parameter in parameters.all(*UNICAST, *MULTICAST):
         target = _target(datagram, parameters, parameter, lead)
         yield replaced(parameters, parameter, target) if target else parameters.removed(parameter)
+    yield from (parameters.removed(parameter) for parameter in parameters.all(*OLD_LOCATORS))
+    if source_vendor(datagram) in TAKEN_FOR_FAST_DDS:
+        yield from _edits_of_machine(parameters)
+
+
+def _edits_of_machine(parameters: ParameterList) -> Iterator[Overwrite]:
+    """What keeps participants of Fast DDS from taking each other for programs of one machine.
+
+    Two containers may have the same machine id, and the same MAC addresses, from which that of data
+    sharing follows: no message would leave the machine. A participant on the proxy's own machine
+    would take its locators for loopback (UDPv4Transport.cpp, transform_remote_locator).
+    """
+    yield from map(parameters.removed, parameters.all(FastDdsPid.MACHINE_ID))
+    yield from map(parameters.removed, parameters.all(FastDdsPid.DATA_SHARING))
+    yield from map(parameters.zeroed, parameters.all(FastDdsPid.NETWORK_CONFIGURATION))
 
 
 def _target(

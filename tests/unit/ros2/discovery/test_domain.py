@@ -12,12 +12,13 @@ from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
+from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
-from rosproxy.ros2.protocol.rtps import destination, source_prefix, source_vendor
+from rosproxy.ros2.protocol.rtps import source_prefix, source_vendor
 from rosproxy.ros2.registry.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import LeaseKind, ShortageKind
 from rosproxy.ros2.rewriting.discovery import read_discovery

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.discovery.fragments import OVERHEAD, FragmentStore, FragmentStores
+from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, destination, submessages
+from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, submessages
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
 from tests.unit.ros2.protocol.messages import PREFIX, data, fragment, message, payload, submessage
 

@@ -6,8 +6,9 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.port_keeper import COUNTS_EACH_SECOND, Keeper
+from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import heartbeats
-from rosproxy.ros2.protocol.rtps import destination, source_prefix
+from rosproxy.ros2.protocol.rtps import source_prefix
 
 RANGE = PortRange(11400, 11463)
 PEER, BACK = bytes(range(12)), HostPort("172.30.0.2", 7410)

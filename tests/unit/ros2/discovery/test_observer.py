@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.ros2.discovery.observer import Observer
-from rosproxy.ros2.protocol.rtps import destination, source_prefix, submessages
+from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.rtps import source_prefix, submessages
 from tests.unit.ros2.protocol.messages import data, message, submessage
 
 OWN, PEER = bytes(range(12)), b"\x01\x0f" + bytes(10)

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.protocol.rtps import RtpsError, by_source, destination, samples, source_vendor
+from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.rtps import RtpsError, by_source, samples, source_vendor
 from tests.unit.ros2.protocol.messages import PREFIX, data, message, submessage
 
 OTHER = b"\x01\x10" + bytes(range(10, 20))

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.ros2.protocol.addressing import destinations
 from rosproxy.ros2.protocol.rtps import (
     MOST_SUBMESSAGES,
     Fragments,
@@ -13,7 +14,6 @@ from rosproxy.ros2.protocol.rtps import (
     RtpsError,
     Span,
     apply,
-    destinations,
     samples,
     source_prefix,
 )

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
-from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.parameters import OLD_LOCATORS, Pid
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.rewriting.discovery import (
     MULTICAST,
@@ -47,7 +47,7 @@ def participant(little: bool = True) -> bytes:
         (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 7413), mark)),
         (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort("127.0.0.1", 7413), mark)),
         (Pid.DEFAULT_UNICAST_LOCATOR, shared_memory),
-        (0x8007, b"vendor's"),
+        (0x8010, b"vendor's"),
     ]
     return message(
         submessage(0x09, 0, bytes(8), little), data(payload(parameters, little), little=little)
@@ -84,8 +84,45 @@ def test_each_locator_leads_to_a_lease_and_what_can_not_be_led_is_gone(little: b
     pids = [parameter.pid for parameter in announcement.parameters.parameters]
     assert pids.count(Pid.PAD) == 3
     assert not set(MULTICAST) & set(pids)
-    (vendor,) = announcement.parameters.all(0x8007)
+    (vendor,) = announcement.parameters.all(0x8010)
     assert after[vendor.value.start : vendor.value.end] == b"vendor's"
+
+
+@BOTH
+def test_what_makes_two_machines_look_like_one_is_gone(little: bool) -> None:
+    """Two containers may have the same machine id and MAC address: no message left the machine."""
+    told = [(0x8003, b"machine "), (0x8006, bytes([8] * 8)), (0x8007, bytes([7] * 4))]
+    datagram = message(data(payload([*told, (0x8010, b"vendor's")], little), little=little))
+    for vendor in (b"\x01\x0f", b"\x00\x00"):  # Fast DDS takes who has none for its own
+        before = datagram[:6] + vendor + datagram[8:]
+        after = rewritten(read_discovery(before), lambda *_: None, nothing)
+        (announcement,) = read_discovery(after).announcements
+        assert {p.pid for p in announcement.parameters.parameters} == {Pid.PAD, 0x8007, 0x8010}
+        assert announcement.parameters.number(after, 0x8007) == 0
+    of_cyclone = datagram[:6] + b"\x01\x10" + datagram[8:]
+    assert rewritten(read_discovery(of_cyclone), lambda *_: None, nothing) == of_cyclone
+
+
+def test_old_locators_are_gone() -> None:
+    """By them a participant inside could have those outside send to anybody."""
+    datagram = message(data(payload([(pid, bytes([10, 0, 0, 7])) for pid in OLD_LOCATORS])))
+    after = rewritten(read_discovery(datagram), lambda *_: None, nothing)
+    (announcement,) = read_discovery(after).announcements
+    assert {p.pid for p in announcement.parameters.parameters} == {Pid.PAD}
+
+
+def test_discovery_with_a_checksum_is_refused() -> None:
+    """It would not fit any more, and the receiver would drop the message without a word."""
+    told = data(payload([(Pid.PARTICIPANT_GUID, bytes(range(16)))]))
+    with_checksum = submessage(0x00, 0x20, bytes(8))
+    with pytest.raises(RtpsError, match="checksum"):
+        read_discovery(message(with_checksum, told))
+    assert read_discovery(message(submessage(0x00, 0x02, bytes(8)), told)).announcements
+    assert not read_discovery(message(with_checksum)).announcements
+    crc = message(submessage(0x80, 0, bytes(8)), told)
+    assert read_discovery(crc).announcements  # of Fast DDS that is something else
+    with pytest.raises(RtpsError, match="checksum"):
+        read_discovery(crc[:6] + b"\x01\x01" + crc[8:])
 
 
 @pytest.mark.parametrize(

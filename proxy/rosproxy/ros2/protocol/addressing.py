@@ -1,0 +1,120 @@
+"""Whom a message is for, and whether it has to be read: known without reading its samples.
+
+Each submessage but those that only tell of the others names a reader and a writer by their entity
+ids, and INFO_DST in front of it whose they are.
+"""
+
+from rosproxy.ros2.protocol.rtps import (
+    INFO_DST,
+    PREFIX,
+    Overwrite,
+    RtpsError,
+    Span,
+    SubmessageId,
+    apply,
+    require_size,
+    source_prefix,
+    submessages,
+)
+
+MOST_OF_USERS = 16
+"""Submessages of a datagram that may pass unread; of users' data there are half a dozen."""
+
+_WRITER_AT: dict[int, int] = {
+    SubmessageId.DATA: 8,
+    SubmessageId.DATA_FRAG: 8,
+    SubmessageId.ACKNACK: 4,
+    SubmessageId.HEARTBEAT: 4,
+    SubmessageId.GAP: 4,
+    SubmessageId.NACK_FRAG: 4,
+    SubmessageId.HEARTBEAT_FRAG: 4,
+}
+"""Where in its body a submessage has the writer's entity id; in front of it stands the reader's."""
+_NAMELESS = frozenset(
+    kind.value
+    for kind in (
+        SubmessageId.PAD,
+        SubmessageId.INFO_TS,
+        SubmessageId.INFO_SRC,
+        SubmessageId.INFO_DST,
+    )
+)
+"""Submessages that are from no writer, and only tell of those that follow."""
+_BUILT_IN = 0xC0
+"""The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
+
+
+def destination(datagram: bytes) -> bytes | None:
+    """The GUID prefix of whom a message is for; None if it is for all. Raises RtpsError.
+
+    The first INFO_DST counts: what follows may be for others, who are then at the same locator.
+    """
+    for kind, _, body in submessages(datagram):
+        if kind == INFO_DST:
+            prefix = datagram[body.start : body.start + PREFIX]
+            return prefix if any(prefix) else None
+    return None
+
+
+def destinations(datagram: bytes) -> set[bytes]:
+    """The GUID prefixes of all whom a message is for; none if some of it is for all. RtpsError.
+
+    Cyclone DDS puts into one message what goes to one address, whoever is there.
+    """
+    prefixes, prefix = set[bytes](), bytes(PREFIX)
+    for kind, _, body in submessages(datagram):
+        if kind == INFO_DST:
+            prefix = datagram[body.start : body.start + PREFIX]
+        elif kind not in _NAMELESS:
+            if not any(prefix):
+                return set()
+            prefixes.add(prefix)
+    return prefixes
+
+
+def for_all(datagram: bytes) -> bytes:
+    """The message without its destinations, so that everybody takes it. Raises RtpsError."""
+    destinations = [body for kind, _, body in submessages(datagram) if kind == INFO_DST]
+    # GUIDPREFIX_UNKNOWN, which is all zero, means everybody.
+    return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in destinations])
+
+
+def of_built_in_writer(datagram: bytes) -> bool | None:
+    """Whether a message is from or to a built-in writer, as discovery is; None if to no writer.
+
+    The first submessage that names a writer counts. Raises RtpsError.
+    """
+    for kind, _, body in submessages(datagram):
+        offset = _WRITER_AT.get(kind)
+        if offset is not None:
+            require_size(body, offset + 4)
+            return bool(datagram[body.start + offset + 3] & _BUILT_IN == _BUILT_IN)
+    return None
+
+
+def may_be_discovery(datagram: bytes) -> bool:
+    """Whether a message has to be read: whether a built-in writer or reader may be named in it.
+
+    So it may where it is no message, has more submessages than users' data has, or such as nobody
+    can look into: those of DDS Security, and unknown ones.
+    """
+    try:
+        source_prefix(datagram)
+        for count, (kind, _, body) in enumerate(submessages(datagram)):
+            if count >= MOST_OF_USERS or (
+                kind not in _NAMELESS and _names_built_in(datagram, kind, body)
+            ):
+                return True
+    except RtpsError:
+        return True
+    return False
+
+
+def _names_built_in(datagram: bytes, kind: int, body: Span) -> bool:
+    """Whether a submessage names a built-in reader or writer, or may. Raises RtpsError."""
+    offset = _WRITER_AT.get(kind)
+    if offset is None:
+        return True
+    require_size(body, offset + 4)
+    reader, writer = datagram[body.start + offset - 1], datagram[body.start + offset + 3]
+    return _BUILT_IN in (reader & _BUILT_IN, writer & _BUILT_IN)
