@@ -5,8 +5,11 @@ from __future__ import annotations
 import pytest
 
 from rosproxy.doctor.rules.participant import SETTLED
+from rosproxy.net.addresses import HostPort
 from tests.ros.processes import wait_until
+from tests.ros.topology import run_command
 from tests.ros2.lab import Lab
+from tests.ros2.machines import PORTS
 
 BAD_QOS = pytest.mark.parametrize(
     ("policy", "offer", "request_"),
@@ -132,3 +135,46 @@ def test_tcp(lab: Lab) -> None:
     told = line(lab.tool("doctor", fails=True), participant.guid_prefix)
     assert f"at {participant.address} (Fast DDS, inside): it is reached by TCP alone" in told
     assert "unset FASTDDS_BUILTIN_TRANSPORTS" in told
+
+
+def test_a_peer_that_does_not_get_in(lab: Lab) -> None:
+    """It is heard at the first port of the range, and a firewall is in front of the others."""
+    host = ("ip", "netns", "exec", lab.place("host").namespace, "nft")
+    rule = f"udp dport {{ {PORTS.first + 1}-{PORTS.last} }} drop"
+    run_command(*host, "-f", "-", text=f"""
+        table ip firewall {{
+          chain before {{ type filter hook prerouting priority raw; iifname "out0" {rule} ; }}
+        }}""")  # fmt: skip
+    try:
+        lab.node("jazzy", "c1", "pub", topic="/chatter")
+        reader = lab.node("jazzy", "out", "sub", topic="/chatter")
+        lab.wait_for_participants(1, 1)
+        (participant,) = lab.domain().outside
+        wait_for_problem(lab, participant.guid_prefix)
+        told = " ".join(lab.tool("doctor").split())
+        assert f"at {participant.address} (Fast DDS, outside): nothing has come from it" in told
+        assert "publish the range for UDP, and let it through firewalls" in told
+        assert "got " not in reader.output()
+    finally:
+        run_command(*host, "delete", "table", "ip", "firewall")
+
+    wait_for_problem(lab, participant.guid_prefix, present=False)
+    reader.wait_for_count("^got hello ", 5)
+
+
+def test_cyclone_with_ports_of_its_own(lab: Lab) -> None:
+    """Where it has multicast, as most machines have, no peer knows its ports."""
+    lab.node("jazzy", "c1", "pub", topic="/chatter").wait_for("^sent")
+    lab.wait_for_participants(1, 0)
+    lab.node("cyclone", "out", "sub", topic="/chatter")
+    told = " ".join(lab.tool("doctor").split())
+    peer = f'<Peer address="{HostPort(lab.host, PORTS.first)}"/>'
+    assert "no participant outside has been heard" in told
+    assert peer in told
+
+    # As it says.
+    lab.stop_nodes()
+    uri = f"<CycloneDDS><Domain><Discovery><Peers>{peer}</Peers></Discovery></Domain></CycloneDDS>"
+    lab.node("jazzy", "c1", "pub", topic="/chatter")
+    reader = lab.node("cyclone", "out", "sub", topic="/chatter", env={"CYCLONEDDS_URI": uri})
+    reader.wait_for_count("^got hello ", 5)

@@ -134,7 +134,7 @@ def _problems(
         yield DomainProblem(
             "ports", participant.guid_prefix, f"{label}: {participant.problem}", fix
         )
-    if not participant.proven:
+    if domain.inside and not participant.proven:  # else there is nobody whom it could answer
         text = f"{label}: nothing has come from it at the ports of the range"
         fix = (
             "publish the range for UDP, and let it through firewalls, so that it reaches "

@@ -144,7 +144,7 @@ class Ros2State(Collector):
         )
 
     def _outside(self, participant: OutsideParticipant) -> document.ParticipantStatus:
-        return msgspec.structs.replace(self._status_of(participant), proven=participant.proven)
+        return msgspec.structs.replace(self._status_of(participant), proven=participant.has_come_in)
 
     def _status_of(self, participant: Participant) -> document.ParticipantStatus:
         endpoints = list(participant.endpoints.values()) if self.with_names else []

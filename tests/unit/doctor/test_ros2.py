@@ -51,7 +51,7 @@ def diagnose_domain(
 
 
 def test_all_is_well() -> None:
-    told = diagnose_domain(DomainStatus(peers=("robot",), inside=(INSIDE,), outside=(OUTSIDE,)))
+    told = diagnose_domain(DomainStatus(peers=("10.0.0.9",), inside=(INSIDE,), outside=(OUTSIDE,)))
     assert {severity for severity, _ in told.values()} == {Severity.OK}
     assert "1 participant of Fast DDS" in told["inside", "domain 0"][1]
 
@@ -70,22 +70,37 @@ def test_who_hears_nobody_is_told_where_to_look() -> None:
     assert "10.0.0.1:11400" in told["outside", "domain 7"][1]
 
 
+def test_a_peer_of_whom_nobody_is_heard_is_told() -> None:
+    """Cyclone DDS takes ports of its own where it has multicast: announcements miss it."""
+    peers = ("10.0.0.9", "10.0.0.7", "10.0.0.6:11400")
+    told = diagnose_domain(
+        DomainStatus(peers=peers, discovery="10.0.0.1:11400", inside=(INSIDE,), outside=(OUTSIDE,))
+    )
+    assert ("outside", "peer 10.0.0.9") not in told
+    for peer in peers[1:]:
+        severity, text = told["outside", f"peer {peer}"]
+        assert severity is Severity.INFO
+        assert '<Peer address="10.0.0.1:11400"/>' in text
+
+
 def test_a_range_that_is_too_short_and_a_port_that_is_not_reached() -> None:
     short = ParticipantStatus("01.0f.cc", "172.30.0.6", problem="no port of 11400-11403 is free")
     unheard = ParticipantStatus("01.10.dd", "10.0.0.8", proven=False)
     told = diagnose_domain(
         DomainStatus(
-            peers=("robot",), discovery="10.0.0.1:11400", inside=(short,), outside=(unheard,)
+            peers=("10.0.0.9",), discovery="10.0.0.1:11400", inside=(short,), outside=(unheard,)
         )
     )
     assert told["ports", "01.0f.cc"][0] is Severity.ERROR
     assert told["reached", "01.10.dd"][0] is Severity.WARNING
     assert "10.0.0.1" in told["reached", "01.10.dd"][1]
+    alone = DomainStatus(peers=("10.0.0.9",), outside=(unheard,))
+    assert ("reached", "01.10.dd") not in diagnose_domain(alone)  # nobody there to be answered
 
 
 TALKER = replace(INSIDE, publishes=("/chatter", "/scan"), services=("/add",))
 LISTENER = replace(OUTSIDE, subscribes=("/chatter", "/scan"))
-BOTH = DomainStatus(peers=("robot",), inside=(TALKER,), outside=(LISTENER,))
+BOTH = DomainStatus(peers=("10.0.0.9",), inside=(TALKER,), outside=(LISTENER,))
 MISMATCH = MismatchStatus(
     "topic", "/scan", "reliability", "BEST_EFFORT", "RELIABLE", "01.0f.aa", "01.10.bb"
 )
@@ -173,5 +188,5 @@ def test_what_was_refused_lately_is_told() -> None:
 
 
 def test_nothing_is_heard_of_zenoh() -> None:
-    told = diagnose_domain(DomainStatus(peers=("robot",)))["inside", "domain 0"][1]
+    told = diagnose_domain(DomainStatus(peers=("10.0.0.9",)))["inside", "domain 0"][1]
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in told

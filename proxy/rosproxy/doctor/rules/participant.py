@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.net.addresses import parse_host_port
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.telemetry.text import listed, plural
 
@@ -63,13 +64,28 @@ def _domain(domain: DomainStatus) -> Iterator[DoctorFinding]:
         yield warning("inside", subject, text, fix + "use DDS, and the proxy can't carry them")
     else:
         yield ok("inside", subject, f"inside: {_counted(domain.inside)}")
+    if domain.outside:
+        yield ok("outside", subject, f"outside: {_counted(domain.outside)}")
+    yield from _silence(domain)
+    yield from map(_finding, domain_problems(domain))
+
+
+def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
+    """Where outside nobody has been heard: at a peer, or anywhere."""
+    fix = (
+        "start one there with the same ROS_DOMAIN_ID; publish the range for UDP; Cyclone DDS takes "
+        "ports of its own where it has multicast, which no peer knows: run rosproxy ear "
+        f'(--ros2-ear), or give it <Peer address="{domain.discovery}"/> in its CYCLONEDDS_URI'
+    )
     if not domain.outside:
         text = f"no participant outside has been heard; announced at {domain.discovery}"
-        fix = "start one there with the same ROS_DOMAIN_ID; publish the range for UDP; Cyclone DDS "
-        yield note("outside", subject, text, fix + "outside needs the ear")
-    else:
-        yield ok("outside", subject, f"outside: {_counted(domain.outside)}")
-    yield from map(_finding, domain_problems(domain))
+        yield note("outside", f"domain {domain.domain}", text, fix)
+        return
+    heard = {participant.address for participant in domain.outside}
+    for peer in domain.peers:
+        target = parse_host_port(peer)
+        if (target.host if target else peer) not in heard:
+            yield note("outside", f"peer {peer}", "no participant there has been heard", fix)
 
 
 def _finding(problem: DomainProblem) -> DoctorFinding:

@@ -286,6 +286,7 @@ class Domain(DomainParticipants):
         if outsider is None:
             return [], []
         outsider.note_sent(message.datagram, insider.prefix)
+        outsider.has_come_in = True
         imported = partial(self.outside.imported, outsider, insider)
         passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
         back = self.outside.allowed_questions(outsider, questions)

@@ -189,8 +189,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             self.refused("participants", source, text)
             return None
         outsider = OutsideParticipant(prefix, source, source_vendor(datagram), now)
-        # The user himself has named a peer: it may be sent anything.
-        outsider.proven = self.settings.is_peer(source)
+        outsider.trusted = self.settings.is_peer(source)
         self.add(outsider)
         return outsider
 

@@ -239,10 +239,13 @@ class OutsideParticipant(Participant):
     """A participant outside, with a stand-in for each locator that inside does not reach by itself.
 
     Until it is ``proven`` that it gets what is sent to it, it is sent no more bytes than came from
-    it; ``credit`` is how many are left.
+    it; ``credit`` is how many are left. One that is ``trusted``, at a peer's address, may be sent
+    anything. ``has_come_in``: something from it has arrived at a port that was lent.
     """
 
+    trusted: bool = False
     proven: bool = False
+    has_come_in: bool = False
     credit: int = 0
 
     def note_sent(self, datagram: bytes, addressee: bytes) -> None:
@@ -253,7 +256,7 @@ class OutsideParticipant(Participant):
 
     def may_be_sent(self, size: int) -> bool:
         """Whether so many bytes may go to it; if so, they are taken off its credit."""
-        if self.proven:
+        if self.trusted or self.proven:
             return True
         if self.credit < size:
             return False
