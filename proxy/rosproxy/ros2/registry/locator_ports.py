@@ -29,7 +29,7 @@ STAND_INS = PortRange(20_000, 32_767)
 TRIES = 32
 """How many ports are tried for a locator outside."""
 MOST_NAMED = 8
-"""Participants that may be named at one port; where there are more they tell nothing."""
+"""Participants that may be named at one port, for each kind; more of them tell nothing."""
 MOST_SHARING = 4
 """Locators outside that one port may stand for."""
 SETTLING = 1.0
@@ -54,10 +54,10 @@ class _Claim(IntEnum):
 
     PROVEN = 0
     """Its own: the kernel led there, or outside has named it and it says so itself."""
-    NAMED = 1
-    """Its own, as outside says."""
-    SAID = 2
+    SAID = 1
     """Its own, as it says itself; nobody else was named there."""
+    NAMED = 2
+    """Its own, as outside says; perhaps that of another of its locators."""
     NOBODYS = 3
     ANOTHERS = 4
     """Who was named there may still come back."""
@@ -65,7 +65,7 @@ class _Claim(IntEnum):
 
 @dataclass(slots=True)
 class _FormerUsers:
-    """Participants that were named at a port: by peers, and by others outside."""
+    """Who was named at a port, and for what: by peers, and by others outside."""
 
     by_peers: set[_User] = field(default_factory=set)
     by_others: set[_User] = field(default_factory=set)
@@ -79,7 +79,8 @@ class _FormerUsers:
     @property
     def users(self) -> Collection[_User]:
         """Those to believe in: none where so many were named that it tells nothing."""
-        return next((u for u in (self.by_peers, self.by_others) if 0 < len(u) <= MOST_NAMED), ())
+        users = self.by_peers or self.by_others
+        return users if len(users) <= MOST_NAMED else ()
 
 
 class LocatorPorts:
@@ -151,11 +152,11 @@ class LocatorPorts:
         users = self._former_users[port].users if port in self._former_users else ()
         if user in users:
             return _Claim.PROVEN if port == had else _Claim.NAMED
+        prefixes = {named for named, _ in users}
         if port == had:
-            # Cyclone DDS has one locator for both kinds.
-            is_own = not users or any(prefix == named for named, _ in users)
-            return _Claim.SAID if is_own else _Claim.ANOTHERS
-        return _Claim.ANOTHERS if users else _Claim.NOBODYS
+            return _Claim.SAID if not users or prefix in prefixes else _Claim.ANOTHERS
+        # Of its own for the other kind: Cyclone DDS has one locator for both, Fast DDS has not.
+        return _Claim.ANOTHERS if prefixes - {prefix} else _Claim.NOBODYS
 
     def give_back(self, port: int) -> None:
         """Take a port back."""
@@ -167,7 +168,7 @@ def stand_in_port(key: str, users: Callable[[int], int], busy: Callable[[int], b
 
     ``users`` tells how many locators a port stands for already. It may be several: so the port
     follows from the locator alone, and a proxy that starts again chooses the same. Each of these
-    gets what is meant for the others as well, and skips it, as with multicast.
+    gets users' data that is meant for the others as well, and skips it, as with multicast.
     ``busy`` tells which ports can't be had; they don't count as tries, as there may be many.
     """
     order = (port for port in order_for(key, STAND_INS) if not busy(port))

@@ -70,7 +70,7 @@ def test_what_outside_says_counts_more_than_ones_own_word() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
     pool.note_former_user(45007, other_prefix, DATA, True, 0.5)
     assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) != 45007
-    assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45003) == 45007
+    assert pool.take(other_prefix, locator(0), DATA, SETTLING) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
@@ -100,6 +100,13 @@ def test_each_locator_of_a_participant_gets_its_own_port() -> None:
     assert taken == had
 
 
+def test_each_locator_gets_its_own_port_though_outside_names_one_alone() -> None:
+    pool, prefix, had = ports(), bytes(12), {0: 45003, 1: 45007}
+    pool.note_former_user(45007, prefix, DATA, True, 0.5)
+    taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
+    assert taken == had
+
+
 @given(st.permutations([0, 1, 2]))
 def test_each_locator_gets_its_own_port_without_a_word(order: list[int]) -> None:
     """Where it can be: as long as nobody had the port that it wants."""
@@ -117,6 +124,13 @@ def test_a_locator_for_both_kinds_keeps_its_port() -> None:
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING, 45007) == 45007
 
 
+def test_a_locator_for_both_kinds_keeps_its_port_without_a_word() -> None:
+    pool, prefix = ports(), bytes(12)
+    first, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
+    pool.note_former_user(first, prefix, DATA, True, 0.5)
+    assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == first
+
+
 def test_a_stranger_names_nobody_where_a_peer_has() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
     pool.note_former_user(45007, prefix, DATA, True, 0.5)
@@ -129,7 +143,8 @@ def test_where_too_many_are_named_that_tells_nothing() -> None:
     """Nobody can take a port from whom it was by naming all the world there."""
     pool, prefix = ports(), bytes(12)
     for number in range(1, 100):
-        pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, False, 0.5)
+        pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, True, 0.5)
+    pool.note_former_user(45007, b"a stranger's", DATA, False, 0.5)
     assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) == 45007
 
 
