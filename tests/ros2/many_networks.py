@@ -14,6 +14,8 @@ from tests.integration.net import PATIENCE
 
 PORT = 7400
 AT_ONCE, IN_ALL = 25, 60
+MESSAGE, END = b"message", b"end"
+"""What is sent, and what is sent after it: a socket has heard all before the end."""
 
 
 class Hearing:
@@ -21,14 +23,18 @@ class Hearing:
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
-        self.sources = list[str]()
+        self.sources, self.ends = list[str](), list[str]()
         self.opened = 0
         self.ears = GroupEars(PORT, self._begin, self._end)
         self.ears.open([socket.AF_INET])
 
     def _begin(self, sock: socket.socket) -> None:
         self.opened += 1
-        self.loop.add_reader(sock, lambda: self.sources.append(sock.recvfrom(100)[1][0]))
+        self.loop.add_reader(sock, self._take, sock)
+
+    def _take(self, sock: socket.socket) -> None:
+        datagram, (source, _) = sock.recvfrom(100)
+        (self.sources if datagram == MESSAGE else self.ends).append(source)
 
     def _end(self, sock: socket.socket) -> None:
         self.loop.remove_reader(sock)
@@ -37,14 +43,15 @@ class Hearing:
     async def heard(self, addresses: list[str]) -> list[str]:
         """From where it hears what is sent through the networks of these addresses, once each."""
         self.sources.clear()
+        self.ends.clear()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            for address in addresses:
-                send_through(out, address, loop=True)
-                out.sendto(b"RTPS", (GROUP, PORT))
+            for datagram in (MESSAGE, END):
+                for address in addresses:
+                    send_through(out, address, loop=True)
+                    out.sendto(datagram, (GROUP, PORT))
         async with asyncio.timeout(PATIENCE):
-            while len(self.sources) < len(addresses):
+            while not {*addresses} <= {*self.ends}:
                 await asyncio.sleep(0.01)
-        await asyncio.sleep(0)  # what would be heard twice is there as well
         return sorted(self.sources)
 
 

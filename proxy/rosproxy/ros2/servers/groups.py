@@ -24,9 +24,9 @@ GROUP, GROUP_FAST_DDS6, GROUP_CYCLONE6 = "239.255.0.1", "ff1e::ffff:efff:1", "ff
 """Where participants announce themselves (DDSI-RTPS 2.5, 9.6.2.4.1)."""
 _SHARED = {socket.AF_INET: (GROUP,), socket.AF_INET6: (GROUP_FAST_DDS6,)}
 _OF_LINK = {socket.AF_INET: (), socket.AF_INET6: (GROUP_CYCLONE6,)}
-_ONLY_OWN = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (socket.IPPROTO_IPV6, 29)}
-"""IP_MULTICAST_ALL and IPV6_MULTICAST_ALL of linux/in.h and in6.h: whether a socket hears the group
-on networks that only other sockets have joined."""
+_IP_MULTICAST_ALL = 49
+"""Of linux/in.h: whether a socket hears the group on networks that only other sockets have joined.
+With IPv6 it does always: the kernel compares the address alone (inet6_mc_check)."""
 
 
 def family_of(address: str) -> socket.AddressFamily:
@@ -82,7 +82,7 @@ class GroupEars:
         return list(self._networks)
 
     def open(self, families: Iterable[socket.AddressFamily]) -> None:
-        """Hear the groups that have one socket for all networks. Raises OSError."""
+        """Hear the groups whose sockets are shared by networks. Raises OSError."""
         for group in (group for family in families for group in _SHARED[family]):
             self._shared[group] = [self._opened(group)]
 
@@ -91,8 +91,8 @@ class GroupEars:
         present = {a for a in addresses if any(g in self._shared for g in groups_of(a))}
         gone = self._networks.keys() - present
         # Another address of a network that has gone may have had its membership for both.
-        shared = {a for a, network in self._networks.items() if gone and not network.memberships}
-        for address in gone | shared:
+        without = {a for a, network in self._networks.items() if gone and not network.memberships}
+        for address in gone | without:
             self._leave(address)
         new = sorted(present - self._networks.keys())
         return [address for address in new if self._join(address)]
@@ -130,8 +130,14 @@ class GroupEars:
             except OSError as error:
                 if error.errno != errno.ENOBUFS:
                     raise
-        self._shared[group].append(self._opened(group))
-        return join(self._shared[group][-1], address)
+        sock = self._opened(group)
+        try:
+            membership = join(sock, address)
+        except OSError:
+            self._end(sock)
+            raise
+        self._shared[group].append(sock)
+        return membership
 
     def _leave(self, address: str) -> None:
         network = self._networks.pop(address)
@@ -155,7 +161,9 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
     try:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.setsockopt(*_ONLY_OWN[sock.family], 0)
+        if sock.family == socket.AF_INET:
+            with contextlib.suppress(OSError):  # else it hears more than it has to
+                sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
         # A group of link scope is another one on each link: the scope id tells which (ipv6(7)).
         link = (0, interface_index(link_of)) if link_of else ()
         sock.bind((group.host, group.port, *link))
