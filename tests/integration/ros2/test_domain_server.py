@@ -2,11 +2,13 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, repeat
 
 import pytest
 
+from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
@@ -15,21 +17,23 @@ from rosproxy.ros2.discovery.domain_settings import DomainSettings
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED, stand_in_port
 from rosproxy.ros2.servers.domain_server import DomainServer
-from tests.integration.net import PATIENCE
+from tests.integration.net import PATIENCE, until
 from tests.unit.ros2.discovery.domains import A, B, reached_at, spdp
 
 PROXY, INSIDE, OUTSIDE = "127.0.7.1", "127.0.7.2", "127.0.7.9"
-DOMAIN = 80
-RANGE = PortRange(21_000, 21_015)
+DOMAIN = 30
+"""Its ports are below those that tests draw."""
 
 
 @pytest.fixture
 async def server() -> AsyncIterator[DomainServer]:
     """One that has long been running."""
+    first = free_ports(16)
+    ports = PortRange(first, first + 15)
     settings = DomainSettings(
         number=DOMAIN,
         hosts=(PROXY,),
-        ports=PortMap(RANGE, RANGE),
+        ports=PortMap(ports, ports),
         proxy_address_for=lambda _: PROXY,
         note=lambda *_: None,
         judge=lambda *_: True,
@@ -44,39 +48,58 @@ async def server() -> AsyncIterator[DomainServer]:
     started.close()
 
 
+@pytest.fixture
+def well_known(server: DomainServer) -> tuple[str, int]:
+    """Where those inside announce themselves."""
+    return PROXY, server.domain.settings.unicast_port
+
+
 def participant(address: str) -> socket.socket:
     sock = bind(address, 0)
     sock.setblocking(False)
     return sock
 
 
-async def stand_ins_told(sock: socket.socket, prefix: bytes) -> list[HostPort]:
-    """Where the next announcement of a participant says that it is reached for discovery."""
+async def announcement(sock: socket.socket, prefix: bytes) -> bytes:
+    """The next announcement of a participant that comes in."""
     async with asyncio.timeout(PATIENCE):
         while True:
             datagram = await asyncio.get_running_loop().sock_recv(sock, 65536)
             if source_prefix(datagram) == prefix:
-                return reached_at(datagram)[:1]
+                return datagram
 
 
-async def test_no_stand_in_is_announced_that_can_not_be_opened(server: DomainServer) -> None:
+@contextmanager
+def outsider_without_a_port(server: DomainServer) -> Iterator[tuple[socket.socket, int]]:
+    """A participant outside, and the port that would stand for it, which another program has."""
+    domain = server.domain
+    with ExitStack() as stack:
+        while True:
+            sock = stack.enter_context(participant(OUTSIDE))
+            locator = HostPort(OUTSIDE, sock.getsockname()[1])
+            wanted = stand_in_port(f"{B.hex()} {locator}", lambda _: 0, domain.outside._is_taken)
+            assert wanted is not None
+            with suppress(OSError):  # another program has that already
+                stack.enter_context(bind(PROXY, wanted))
+                break
+        domain.settings.peers = (locator,)
+        yield sock, wanted
+
+
+async def test_no_stand_in_is_announced_that_can_not_be_opened(
+    server: DomainServer, well_known: tuple[str, int]
+) -> None:
     """Inside believes the first locators of a participant for as long as that lives."""
-    with participant(INSIDE) as insider, participant(OUTSIDE) as outsider:
+    discovery = PROXY, server.domain.settings.discovery_port
+    with participant(INSIDE) as insider, outsider_without_a_port(server) as (outsider, wanted):
         inside_port, outside_port = (s.getsockname()[1] for s in (insider, outsider))
-        locator = HostPort(OUTSIDE, outside_port)
-        wanted = stand_in_port(f"{B.hex()} {locator}", lambda _: 0, lambda _: False)
-        assert wanted is not None
-        with bind(PROXY, wanted):
-            outsider.sendto(spdp(B, OUTSIDE, outside_port), (PROXY, RANGE.first))
-            insider.sendto(
-                spdp(A, INSIDE, inside_port), (PROXY, server.domain.settings.unicast_port)
-            )
-            async with asyncio.timeout(PATIENCE):
-                while wanted not in server.domain.outside.blocked:
-                    await asyncio.sleep(0.01)
-            outsider.sendto(spdp(B, OUTSIDE, outside_port), (PROXY, RANGE.first))
+        outsider.sendto(spdp(B, OUTSIDE, outside_port), discovery)
+        insider.sendto(spdp(A, INSIDE, inside_port), well_known)
+        await announcement(outsider, A)  # what names no such port goes on
+        await until(lambda: wanted in server.domain.outside.blocked, "it can't be opened")
+        outsider.sendto(spdp(B, OUTSIDE, outside_port), discovery)
 
-            (told,) = await stand_ins_told(insider, B)
+        told, *_ = reached_at(await announcement(insider, B))
 
         (opened,) = server.domain.outside.stand_ins
         assert told == HostPort(PROXY, opened)
@@ -84,13 +107,13 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(server: DomainSer
 
 
 async def test_who_is_not_selected_has_an_allowance_of_discovery(
-    server: DomainServer, monkeypatch: pytest.MonkeyPatch
+    server: DomainServer, well_known: tuple[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is held back of it has to be read, too, which takes long."""
     server.select([])
     held = server._selected.held_announcements
     with participant(INSIDE) as insider:
-        port, target = insider.getsockname()[1], (PROXY, server.domain.settings.unicast_port)
+        port = insider.getsockname()[1]
         with monkeypatch.context() as patch:
             asked = asyncio.Event()
 
@@ -99,11 +122,9 @@ async def test_who_is_not_selected_has_an_allowance_of_discovery(
                 return False
 
             patch.setattr(DiscoveryRates, "take", none_left)
-            insider.sendto(spdp(A, INSIDE, port), target)
+            insider.sendto(spdp(A, INSIDE, port), well_known)
             async with asyncio.timeout(PATIENCE):
                 await asked.wait()
-        insider.sendto(spdp(B, INSIDE, port), target)
-        async with asyncio.timeout(PATIENCE):
-            while not held:
-                await asyncio.sleep(0.01)
+        insider.sendto(spdp(B, INSIDE, port), well_known)
+        await until(lambda: held, "one is held")
     assert held[INSIDE].keys() == {B}

@@ -27,6 +27,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     DomainSettings,
     Outgoing,
 )
+from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, by_source
 from rosproxy.ros2.registry.selected import SelectedAddresses
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -276,11 +277,17 @@ class DomainServer:
     def _open_and_send(self, outgoing: Iterable[Outgoing]) -> None:
         """Send what may name new stand-ins.
 
-        They have to be open before. If one can't be, nothing is sent: participants would believe it
-        for good, and what was announced comes again.
+        They have to be open before. What names one that can't be opened is not sent: inside would
+        believe it for good, and what outside has announced comes again.
         """
-        if self._sync_stand_ins():
-            self._send(outgoing)
+        closed = self._sync_stand_ins()
+        self._send(out for out in outgoing if not (closed and self._names_any(closed, out)))
+
+    def _names_any(self, ports: Iterable[int], out: Outgoing) -> bool:
+        """Whether a datagram says that somebody is reached at one of these ports of the proxy's."""
+        near = self.domain.settings.proxy_address_for(out.target.host)
+        locators = (pack_locator(HostPort(near, p), order) for p in ports for order in "<>")
+        return any(locator in out.datagram for locator in locators)
 
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
         for out in outgoing:
@@ -299,13 +306,12 @@ class DomainServer:
             self._told_changes = changes
             self._changed()
 
-    def _sync_stand_ins(self) -> bool:
-        """Open and close the ports for participants outside; whether all are open."""
-        outside = self.domain.outside
+    def _sync_stand_ins(self) -> list[int]:
+        """Open and close the ports for participants outside; those that can't be opened."""
+        outside, closed = self.domain.outside, list[int]()
         if outside.changes == self._synced_changes:
-            return True
+            return closed
         self._synced_changes, wanted = outside.changes, outside.stand_ins
-        before = len(wanted)
         for port in self._stand_ins.keys() - wanted.keys():
             self._stop_reading(self._stand_ins.pop(port))
         for port in wanted.keys() - self._stand_ins.keys():
@@ -314,10 +320,11 @@ class DomainServer:
             except OSError as error:
                 log.debug("port %d can't be opened as a stand-in: %s", port, error)
                 outside.block(port, error.errno == errno.EADDRINUSE)
+                closed.append(port)
                 continue
             self._stand_ins[port] = sock
             self._loop.add_reader(sock, self._take_in, sock, self._at_stand_in(port))
-        return len(wanted) == before
+        return closed
 
 
 def _families(bind: str) -> list[socket.AddressFamily]:
