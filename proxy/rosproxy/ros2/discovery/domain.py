@@ -148,9 +148,13 @@ class Domain(DomainParticipants):
         self.fragments.clear()  # they were judged by the former policy
         for insider in self.inside.by_prefix.values():
             if has_changed(self.settings.judge, insider):
-                insider.verdicts.clear()
-                separate = partial(self.rediscovery.separate, insider, now)
-                sent += self._unless_malformed(insider.address, separate)
+                sent += self._unless_malformed(insider.address, partial(self._part, insider, now))
+        return sent
+
+    def _part(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+        """Part one from all outside, of whom the policy is asked anew then. Raises RtpsError."""
+        sent = self.rediscovery.separate(insider, now)
+        insider.verdicts.clear()
         return sent
 
     def _unless_malformed(self, source: str, step: Callable[[], list[Outgoing]]) -> list[Outgoing]:
@@ -247,15 +251,15 @@ class Domain(DomainParticipants):
             return self._drop("unknown_participant", source, "it has not announced itself")
         if insider.is_apart:
             return []
-        # One port may stand for several: those that are named get it, or all if nobody is.
-        named = destinations(message.datagram)
-        users = [user for user in users if user[0].prefix in named] or users
-        for outsider, _ in users:
-            self.rediscovery.note_met(insider, outsider.prefix)
+        readers = [outsider.prefix for outsider, _ in _meant(users, message.datagram)]
+        if len(users) == 1 or destinations(message.datagram):
+            for reader in readers:
+                self.rediscovery.note_met(insider, reader)
+        reader = readers[0] if readers else users[0][0].prefix
         count, exported = len(insider.leases), partial(self.inside.exported, insider, now=now)
-        passed, questions = self.fragments.rewritten(port, message, users[0][0].prefix, exported)
+        passed, questions = self.fragments.rewritten(port, message, reader, exported)
         back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count)
-        return back + [sent for d in passed for sent in self._to_outside(users, d)]
+        return back + [sent for d in passed for sent in self._to_outside(_meant(users, d), d)]
 
     def _reminders(self, insider: InsideParticipant, former_count: int) -> list[Outgoing]:
         """What makes a participant keep new ports at once, if it has more than ``former_count``.
@@ -322,6 +326,15 @@ class Domain(DomainParticipants):
             return False
         self.refused("rate", source, "more discovery than one source may send in a second")
         return True
+
+
+def _meant(users: _StandInUsers, datagram: bytes) -> _StandInUsers:
+    """Those of a stand-in that a message names; all if it is for everybody. Raises RtpsError.
+
+    One that stands for a single participant takes everything, as that one does itself.
+    """
+    named = destinations(datagram) if len(users) > 1 else None
+    return [user for user in users if user[0].prefix in named] if named else users
 
 
 def _pass_on_each(datagram: bytes, pass_on: Callable[[DiscoveryMessage], _Passing]) -> _Passing:

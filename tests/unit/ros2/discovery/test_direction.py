@@ -1,9 +1,15 @@
 """Both directions by the proxy: stand-ins for what those outside have, and nothing else."""
 
+import struct
+from math import inf
+
 import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.locator_ports import MOST_SHARING
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery import domains
@@ -13,6 +19,7 @@ from tests.unit.ros2.discovery.domains import (
     NOW,
     OTHER,
     ROBOT,
+    SEDP_WRITERS,
     A,
     B,
     meet,
@@ -21,7 +28,7 @@ from tests.unit.ros2.discovery.domains import (
     spdp,
     to,
 )
-from tests.unit.ros2.protocol.messages import message, submessage
+from tests.unit.ros2.protocol.messages import fragment, message, payload, submessage
 
 USER = message(submessage(0x07, 0, bytes(28)), prefix=A)
 
@@ -127,6 +134,46 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     named = sedp(A, INSIDE, 7001, to=bytes([9, 1]) + B[2:])
     targets = {sent.target.port for sent in domain.at_stand_in(20_000, named, INSIDE, NOW)}
     assert targets == {7420, 7421}
+    elsewhere = sedp(A, INSIDE, 7001, to=bytes(range(12)))
+    assert domain.at_stand_in(20_000, elsewhere, INSIDE, NOW) == []
+
+
+def test_fragments_go_to_whom_each_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last of them has those of all go on."""
+    monkeypatch.setattr(
+        "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
+    )
+    domain, readers = domains.make_domain(), (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
+    meet(domain)
+    for number, reader in enumerate(readers):
+        domain.heard_outside(spdp(reader, ROBOT, 7420 + 10 * number), ROBOT, NOW)
+    whole = payload([(Pid.TOPIC_NAME, struct.pack("<I", 200) + bytes([65] * 199) + bytes(1))])
+    sent = list[Outgoing]()
+    for number, chunk in enumerate((whole[:128], whole[128:]), 1):
+        for reader in readers:
+            part = fragment(chunk, number, 128, len(whole), writer=SEDP_WRITERS)
+            datagram = message(submessage(0x0E, 0, reader), part, prefix=A)
+            sent += domain.at_stand_in(20_000, datagram, INSIDE, NOW)
+    to_each = {
+        reader: [out.target.port for out in sent if destination(out.datagram) == reader]
+        for reader in readers
+    }
+    assert to_each == {readers[0]: [7420, 7420], readers[1]: [7430, 7430]}
+
+
+def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
+    )
+    domain, readers = domains.make_domain(), (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
+    meet(domain)
+    for number, reader in enumerate(readers):
+        domain.heard_outside(spdp(reader, ROBOT, 7420 + 10 * number), ROBOT, NOW)
+    domain.inside.by_prefix[A].farewell_times = dict.fromkeys(readers, NOW)
+    domain.at_stand_in(20_000, sedp(A, INSIDE, 7001), INSIDE, NOW)
+    assert domain.inside.by_prefix[A].farewell_times == dict.fromkeys(readers, NOW)
+    domain.at_stand_in(20_000, sedp(A, INSIDE, 7001, to=readers[1]), INSIDE, NOW)
+    assert domain.inside.by_prefix[A].farewell_times == {readers[0]: NOW, readers[1]: inf}
 
 
 def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:
