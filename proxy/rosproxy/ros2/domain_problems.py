@@ -54,7 +54,7 @@ _SHORTAGE_CURES = {
     ShortageKind.BOUND.value: (
         "where it runs: fewer addresses (the interface list of its profile, or CYCLONEDDS_URI), "
         "fewer readers and writers with ports of their own (unique network flows), or several "
-        "processes; no range is too short for it"
+        "processes; a longer range does not help"
     ),
 }
 _DEFAULT_CURE = "give both the same {policy}"

@@ -3,7 +3,8 @@
 Reading discovery costs a hundred times what passing on a user's datagram does, and one announcement
 goes on to everybody on the other side. So each source has an allowance of datagrams, in and out,
 that fills up again with the time; a long one counts as several, since it takes as long to read.
-What users send is not charged, also where it comes to a port for both, as that of Cyclone DDS.
+What users send is not charged, also where it comes to a port for both, as that of Cyclone DDS: but
+for what has to be read to tell, as it is encrypted, unknown, or of more submessages than is usual.
 What is over it is dropped, as datagrams may be anywhere: discovery is repeated, and its readers
 ask for what they lack.
 """

@@ -155,7 +155,7 @@ class FragmentStore:
     _samples: dict[_Key, _PendingSample] = field(default_factory=dict)
     _waiting_datagrams: dict[int, _WaitingDatagram] = field(default_factory=dict)
     _waiting_by_key: dict[_Key, set[int]] = field(default_factory=dict)
-    _held_count: int = 0
+    _last_number: int = 0
     _sample_bytes: int = 0
     _waiting_bytes: int = 0
 
@@ -202,11 +202,11 @@ class FragmentStore:
 
     def _hold(self, datagram: _WaitingDatagram) -> None:
         """Have a datagram wait."""
-        self._held_count += 1
-        self._waiting_datagrams[self._held_count] = datagram
+        self._last_number += 1
+        self._waiting_datagrams[self._last_number] = datagram
         self._waiting_bytes += datagram.cost
         for key in datagram.keys:
-            self._waiting_by_key.setdefault(key, set()).add(self._held_count)
+            self._waiting_by_key.setdefault(key, set()).add(self._last_number)
         while self._waiting_bytes > MOST_BYTES:
             self._let_go(next(iter(self._waiting_datagrams)))
 

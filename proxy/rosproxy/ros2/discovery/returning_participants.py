@@ -116,7 +116,7 @@ class ReturningParticipants:
 
     def _forget_waiting(self, prefix: bytes) -> None:
         self._counts -= Counter((self.waiting.pop(prefix)[0],))
-        self.keeper.forget(prefix)
+        self.forget_participant(prefix)
 
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
         return (

@@ -440,6 +440,7 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
 def test_who_ends_while_he_waits_is_not_announced() -> None:
     """Outside was told of him once all others were, and took him for there."""
     domain = make_domain()
+    domain.returning.note_former({A: [45003]}, ())
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     domain.heard_inside(spdp(B, OTHER), OTHER, 0.1)
     domain.heard_inside(farewell(B), INSIDE, 0.2)  # nobody ends one at another address
@@ -449,6 +450,7 @@ def test_who_ends_while_he_waits_is_not_announced() -> None:
 
     assert {source_prefix(told) for told in to(sent, ROBOT)} == {B}
     assert domain.inside.by_prefix.keys() == {B}
+    assert not domain.returning.former
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 7.0)
     assert domain.returning.waiting.keys() == {A}
 

@@ -199,8 +199,12 @@ def test_a_datagram_waits_for_all_that_it_has_a_part_of() -> None:
         len(both),
         len(message(parts[2, 2])),
     ]
-    (of_one,) = store.by_prefix.values()
-    assert (of_one._waiting_datagrams, of_one._waiting_by_key, of_one._waiting_bytes) == ({}, {}, 0)
+    (of_sender,) = store.by_prefix.values()
+    assert (of_sender._waiting_datagrams, of_sender._waiting_by_key, of_sender._waiting_bytes) == (
+        {},
+        {},
+        0,
+    )
 
 
 def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch) -> None:

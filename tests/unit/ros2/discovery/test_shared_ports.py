@@ -59,14 +59,14 @@ def shared() -> tuple[Domain, int, int]:
     return domain, port, stand_in
 
 
-def left(domain: Domain, source: str) -> float:
+def allowance_left(domain: Domain, source: str) -> float:
     return domain.rates._remaining[source][0]
 
 
 def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:
     """It was charged by its bytes: who sent more than 1.2 MB in a second lost it, and discovery."""
     domain, port, stand_in = shared()
-    before = left(domain, INSIDE), left(domain, ROBOT)
+    before = allowance_left(domain, INSIDE), allowance_left(domain, ROBOT)
     inwards = message(TIME, TO_A, SAID, prefix=B)
     outwards = message(TIME, SAID, prefix=A)
     for _ in range(40_000):
@@ -76,7 +76,7 @@ def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:
         assert domain.at_stand_in(stand_in, outwards, INSIDE, NOW) == [
             Outgoing(HostPort(ROBOT, 7410), outwards)
         ]
-    assert (left(domain, INSIDE), left(domain, ROBOT)) == before
+    assert (allowance_left(domain, INSIDE), allowance_left(domain, ROBOT)) == before
     assert domain.refused.count == 0
 
 
@@ -86,7 +86,7 @@ def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:
 def test_discovery_behind_what_users_send_is_read_and_charged(in_front: bytes) -> None:
     domain, port, stand_in = shared()
     for kind in (spdp, sedp):
-        before = left(domain, INSIDE), left(domain, ROBOT)
+        before = allowance_left(domain, INSIDE), allowance_left(domain, ROBOT)
         outwards = message(in_front, kind(A, INSIDE, 7000)[20:], prefix=A)
         inwards = message(in_front, kind(B, ROBOT, 7000)[20:], prefix=B)
         for sent in (
@@ -95,8 +95,8 @@ def test_discovery_behind_what_users_send_is_read_and_charged(in_front: bytes) -
         ):
             assert len(sent[-1].datagram) in (len(outwards), len(inwards))
             assert sent[-1].datagram not in (outwards, inwards)  # its locators lead elsewhere
-        assert left(domain, INSIDE) == before[0] - 1 - len(outwards) // STEP
-        assert left(domain, ROBOT) == before[1] - 1 - len(inwards) // STEP
+        assert allowance_left(domain, INSIDE) == before[0] - 1 - len(outwards) // STEP
+        assert allowance_left(domain, ROBOT) == before[1] - 1 - len(inwards) // STEP
 
 
 def test_what_users_send_passes_where_discovery_is_used_up() -> None:
