@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import msgspec
 
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
+from rosproxy.ros2.protocol.rtps import FAST_DDS
 from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault, ShortageKind
 from rosproxy.telemetry.text import plural
 
@@ -26,7 +27,7 @@ class DomainProblem(msgspec.Struct, frozen=True):
     grave: bool = True
 
 
-FAST_DDS, CYCLONE_DDS = VENDORS[b"\x01\x0f"], VENDORS[b"\x01\x10"]
+_FAST_DDS, CYCLONE_DDS = VENDORS[FAST_DDS], VENDORS[b"\x01\x10"]
 _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.TCP: (
         "it is reached by TCP alone, and the proxy passes on UDP",
@@ -162,7 +163,7 @@ def _security(
         fix += "; or a way out for those inside, and --direction out"
     # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
     yield DomainProblem(
-        "security", participant.guid_prefix, text, fix, grave=participant.vendor == FAST_DDS
+        "security", participant.guid_prefix, text, fix, grave=participant.vendor == _FAST_DDS
     )
 
 

@@ -5,6 +5,7 @@ ids, and INFO_DST in front of it whose they are.
 """
 
 from rosproxy.ros2.protocol.rtps import (
+    FAST_DDS,
     INFO_DST,
     PREFIX,
     Overwrite,
@@ -13,7 +14,7 @@ from rosproxy.ros2.protocol.rtps import (
     SubmessageId,
     apply,
     require_size,
-    source_prefix,
+    source_vendor,
     submessages,
 )
 
@@ -40,6 +41,8 @@ _NAMELESS = frozenset(
     )
 )
 """Submessages that are from no writer, and only tell of those that follow."""
+_NAMELESS_OF = {FAST_DDS: _NAMELESS | {SubmessageId.STATISTICS.value}}
+"""The same of vendors that have others."""
 _BUILT_IN = 0xC0
 """The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
 
@@ -99,10 +102,10 @@ def may_be_discovery(datagram: bytes) -> bool:
     can look into: those of DDS Security, and unknown ones.
     """
     try:
-        source_prefix(datagram)
+        nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
         for count, (kind, _, body) in enumerate(submessages(datagram)):
             if count >= MOST_OF_USERS or (
-                kind not in _NAMELESS and _names_built_in(datagram, kind, body)
+                kind not in nameless and _names_built_in(datagram, kind, body)
             ):
                 return True
     except RtpsError:

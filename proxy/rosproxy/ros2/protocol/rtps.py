@@ -23,7 +23,7 @@ from enum import IntEnum
 import msgspec
 
 MAGIC = b"RTPS"
-VERSION, NO_VENDOR, RTI = b"\x02\x03", b"\x00\x00", b"\x01\x01"
+VERSION, NO_VENDOR, RTI, FAST_DDS = b"\x02\x03", b"\x00\x00", b"\x01\x01", b"\x01\x0f"
 HEADER = 20
 """Bytes of a message's header."""
 ALIGNMENT = 4
@@ -56,7 +56,10 @@ class RtpsError(ValueError):
 
 
 class SubmessageId(IntEnum):
-    """The submessages that the proxy reads."""
+    """The submessages that the proxy reads; those from 0x80 on have a meaning for each vendor.
+
+    ``STATISTICS`` is of Fast DDS, at the end of each message: where that went, and how many bytes.
+    """
 
     HEADER_EXTENSION = 0x00
     PAD = 0x01
@@ -70,6 +73,7 @@ class SubmessageId(IntEnum):
     HEARTBEAT_FRAG = 0x13
     DATA = 0x15
     DATA_FRAG = 0x16
+    STATISTICS = 0x80
     RTI_CRC = 0x80
 
 

@@ -15,14 +15,14 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.qos import EndpointQos
-from rosproxy.ros2.protocol.rtps import NO_VENDOR, RTI
+from rosproxy.ros2.protocol.rtps import FAST_DDS, NO_VENDOR, RTI
 
 VENDORS = {
     NO_VENDOR: "rosproxy",
     RTI: "RTI Connext",
     b"\x01\x02": "OpenSplice",
     b"\x01\x03": "OpenDDS",
-    b"\x01\x0f": "Fast DDS",
+    FAST_DDS: "Fast DDS",
     b"\x01\x10": "Cyclone DDS",
     b"\x01\x12": "RustDDS",
     b"\x01\x14": "Dust DDS",

@@ -28,6 +28,7 @@ from rosproxy.ros2.protocol.parameters import (
 )
 from rosproxy.ros2.protocol.reliable import withheld
 from rosproxy.ros2.protocol.rtps import (
+    FAST_DDS,
     NO_VENDOR,
     PREFIX,
     Fragments,
@@ -55,7 +56,7 @@ MULTICAST = (
 _IDENTITIES = (Pid.PARTICIPANT_GUID, Pid.ENDPOINT_GUID, Pid.KEY_HASH)
 """Parameters by which an announcement says what it is about; each begins with a GUID prefix.
 Receivers act on these, whoever has sent the message (Fast DDS: EDPSimplePUBListener)."""
-TAKEN_FOR_FAST_DDS = (b"\x01\x0f", NO_VENDOR)
+TAKEN_FOR_FAST_DDS = (FAST_DDS, NO_VENDOR)
 """Vendors whose parameters Fast DDS reads as its own."""
 _DISPOSED_OR_UNREGISTERED = 0x03
 LONGEST_OF_PARTICIPANT = 8192

@@ -1,0 +1,154 @@
+"""What real participants have sent is read, rewritten, and told as it is."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from socket import inet_aton
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.protocol.addressing import may_be_discovery
+from rosproxy.ros2.protocol.parameters import FastDdsPid
+from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_vendor
+from rosproxy.ros2.registry.matching import mismatched_pairs
+from rosproxy.ros2.registry.participants import EndpointKind, Participant
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
+from tests.unit.ros2.discovery.domains import HOST, NOW, make_domain
+from tests.unit.ros2.recorded import PUBLISHER, SUBSCRIBER, VENDORS, Datagram, recorded
+
+OF_EACH = pytest.mark.parametrize("vendor", VENDORS)
+VENDOR_IDS = {"cyclone": b"\x01\x10", "jazzy": b"\x01\x0f", "kilted": b"\x01\x0f"}
+ALL = [datagram for vendor in VENDORS for datagram in recorded(vendor)]
+
+
+def messages(vendor: str, host: str = "") -> list[DiscoveryMessage]:
+    """What an implementation has sent, from both machines or from one."""
+    return [
+        read_discovery(message)
+        for datagram in recorded(vendor)
+        if datagram.host == (host or datagram.host)
+        for message in by_source(datagram.content)
+    ]
+
+
+def led_out(pid: int, locator: HostPort) -> HostPort | None:
+    return HostPort(HOST, 45000 + locator.port % 1000) if locator.host == PUBLISHER else None
+
+
+def exported(message: DiscoveryMessage) -> bytes:
+    return rewritten(message, led_out, lambda _: False)
+
+
+def passed(domain: Domain, datagram: Datagram) -> list[Outgoing]:
+    """What the proxy sends because of a datagram, if it is between the two."""
+    host, _, port = datagram.target.partition(":")
+    target, content = HostPort(host, int(port)), datagram.content
+    if datagram.host == PUBLISHER:
+        if host != SUBSCRIBER:
+            return domain.heard_inside(content, PUBLISHER, NOW)
+        stand_ins = [
+            p for p, users in domain.outside.stand_ins.items() if users[0][1].target == target
+        ]
+        return [out for p in stand_ins for out in domain.at_stand_in(p, content, PUBLISHER, NOW)]
+    if host != PUBLISHER:
+        return domain.heard_outside(content, SUBSCRIBER, NOW)
+    leases = [p for p, (_, lease) in domain.inside.leases.items() if lease.target == target]
+    return [out for p in leases for out in domain.at_lease(p, content, SUBSCRIBER, NOW)]
+
+
+@OF_EACH
+def test_it_is_read(vendor: str) -> None:
+    told = messages(vendor)
+    assert {source_vendor(message.datagram) for message in told} == {VENDOR_IDS[vendor]}
+    assert len({message.prefix for message in told}) == 2
+    # Of Cyclone DDS the publisher says much of itself; Fast DDS has no fragments below 64 KB.
+    assert any(message.fragments for message in told) is (vendor == "cyclone")
+    last_words = [m for m in told if m.of_participant and m.of_participant.ended]
+    assert {message.prefix for message in last_words} == {message.prefix for message in told}
+
+
+@OF_EACH
+def test_users_data_is_known_from_discovery(vendor: str) -> None:
+    users = [datagram for datagram in recorded(vendor) if not may_be_discovery(datagram.content)]
+    assert any(b"hello" in datagram.content for datagram in users)
+    for datagram in users:
+        for message in map(read_discovery, by_source(datagram.content)):
+            assert not message.announcements
+            assert not message.fragments
+
+
+@OF_EACH
+def test_no_address_of_inside_is_left_and_nothing_else_changes(vendor: str) -> None:
+    changed = 0
+    for message in messages(vendor, PUBLISHER):
+        before, after = message.datagram, exported(message)
+        assert inet_aton(PUBLISHER) not in after
+        assert len(after) == len(before)
+        parameters = {
+            at
+            for announcement in message.announcements
+            for p in announcement.parameters.parameters
+            for at in range(p.offset, p.value.end)
+        }
+        differing = {at for at, byte in enumerate(before) if after[at] != byte}
+        assert differing <= parameters
+        changed += bool(differing)
+    assert changed
+
+
+@OF_EACH
+def test_no_machine_takes_itself_for_the_other(vendor: str) -> None:
+    """Both have the same machine id, as the containers of one image may."""
+    before = [p for m in messages(vendor, PUBLISHER) for p in _pids(m)]
+    after = [p for m in messages(vendor, PUBLISHER) for p in _pids(read_discovery(exported(m)))]
+    assert (FastDdsPid.MACHINE_ID in before) is (vendor == "kilted")
+    assert len(after) == len(before)
+    if vendor != "cyclone":
+        assert not {FastDdsPid.MACHINE_ID, FastDdsPid.DATA_SHARING} & {*after}
+
+
+def _pids(message: DiscoveryMessage) -> list[int]:
+    return [p.pid for a in message.announcements for p in a.parameters.parameters]
+
+
+@OF_EACH
+def test_two_that_meet_through_the_proxy(vendor: str) -> None:
+    domain, sent = make_domain(peers=(SUBSCRIBER,), ear=None), list[Outgoing]()
+    inside, outside = set[tuple[EndpointKind, str]](), set[tuple[EndpointKind, str]]()
+    for datagram in recorded(vendor):
+        sent += passed(domain, datagram)
+        insiders, outsiders = domain.inside.by_prefix.values(), domain.outside.by_prefix.values()
+        inside |= _endpoints(insiders)
+        outside |= _endpoints(outsiders)
+        assert mismatched_pairs(insiders, outsiders) == []
+    assert (EndpointKind.WRITER, "rt/chatter") in inside
+    assert (EndpointKind.READER, "rt/chatter") in outside
+    assert domain.refused.count == 0
+    outwards = [out.datagram for out in sent if out.target.host == SUBSCRIBER]
+    assert outwards
+    assert all(inet_aton(PUBLISHER) not in datagram for datagram in outwards)
+    assert not domain.inside.by_prefix  # both have ended
+    assert not domain.outside.by_prefix
+
+
+def _endpoints(participants: Iterable[Participant]) -> set[tuple[EndpointKind, str]]:
+    return {(e.kind, e.topic) for p in participants for e in p.endpoints.values()}
+
+
+@given(st.sampled_from(ALL), st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255))))
+def test_nothing_made_of_it_breaks_the_proxy(
+    datagram: Datagram, changes: list[tuple[int, int]]
+) -> None:
+    content = bytearray(datagram.content)
+    for at, byte in changes:
+        content[at % len(content)] = byte
+    domain = make_domain(peers=(SUBSCRIBER,))
+    domain.heard_inside(datagram.content, PUBLISHER, NOW)
+    domain.heard_inside(bytes(content), PUBLISHER, NOW)
+    domain.heard_outside(bytes(content), SUBSCRIBER, NOW)
+    with suppress(RtpsError):
+        exported(read_discovery(bytes(content)))
