@@ -13,10 +13,10 @@ from tests.ros2.lab import Lab
 PROXY = False
 EAR = True
 OPTIONS = ("--ros2-ear", "172.30.1.1:47090")
-OFFERS = {"jazzy": "pub,serve,act,hold", "cyclone": "pub"}
-USES = {"jazzy": "sub,call,pursue,tune,names", "cyclone": "sub"}
+OFFERS = {"rclpy": "pub,serve,act,hold", "cyclone": "pub"}
+USES = {"rclpy": "sub,call,pursue,tune,names", "cyclone": "sub"}
 GOT = {
-    "jazzy": [
+    "rclpy": [
         "^got hello ",
         "^reply .* hello",
         "^result 0 1 1 ",
@@ -25,6 +25,7 @@ GOT = {
     ],
     "cyclone": ["^got hello "],
 }
+PROGRAM = {"jazzy": "rclpy", "kilted": "rclpy", "cyclone": "cyclone"}
 
 
 OUTWARD, INWARD = ("c1", "c2", "out"), ("out", "out", "c1")
@@ -35,20 +36,23 @@ OUTWARD, INWARD = ("c1", "c2", "out"), ("out", "out", "c1")
     [
         pytest.param("jazzy", *OUTWARD, marks=pytest.mark.smoke),
         ("jazzy", *INWARD),
+        ("kilted", *OUTWARD),
+        ("kilted", *INWARD),
         ("cyclone", *OUTWARD),
         ("cyclone", *INWARD),
     ],
-    ids=["jazzy-outward", "jazzy-inward", "cyclone-outward", "cyclone-inward"],
+    ids=lambda value: value,
 )
 def test_nothing_passes_without_the_proxy(
     lab: Lab, vendor: str, origin: str, near: str, far: str
 ) -> None:
-    options = {"topic": "/all", "of": "source"} if vendor == "jazzy" else {"topic": "/all"}
-    far_node = lab.node(vendor, far, USES[vendor], name="far", **options)
+    program = PROGRAM[vendor]
+    options = {"topic": "/all", "of": "source"} if program == "rclpy" else {"topic": "/all"}
+    far_node = lab.node(vendor, far, USES[program], name="far", **options)
     far_node.wait_for("^ready")
-    source = lab.node(vendor, origin, OFFERS[vendor], name="source", topic="/all")
-    listener = lab.node(vendor, near, USES[vendor], name="near", **options)
-    for pattern in GOT[vendor][:4]:
+    source = lab.node(vendor, origin, OFFERS[program], name="source", topic="/all")
+    listener = lab.node(vendor, near, USES[program], name="near", **options)
+    for pattern in GOT[program][:4]:
         listener.wait_for(pattern)
     listener.wait_for_count("^got hello ", 15)
     assert source.returncode is None
@@ -58,5 +62,5 @@ def test_nothing_passes_without_the_proxy(
 
     lab.start_proxy()
 
-    for pattern in GOT[vendor]:
+    for pattern in GOT[program]:
         far_node.wait_for(pattern)

@@ -40,8 +40,8 @@ def test_latched_topics(lab: Lab, order: str, source: str, sink: str) -> None:
 
 @ways
 def test_messages_in_fragments(lab: Lab, source: str, sink: str) -> None:
-    lab.node("jazzy", source, "pub", topic="/image", size=1_000_000, period=0.5)
-    lab.node("jazzy", sink, "sub", topic="/image").wait_for_count("^got hello .* size 1000000", 5)
+    lab.node("jazzy", source, "pub", topic="/image", size=8_000_000, period=1)
+    lab.node("jazzy", sink, "sub", topic="/image").wait_for_count("^got hello .* size 8000000", 5)
 
 
 @ways
