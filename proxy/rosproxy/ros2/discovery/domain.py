@@ -317,8 +317,11 @@ class Domain(DomainParticipants):
 
     def _note_former_use(self, port: int, datagram: bytes, source: str, now: float) -> None:
         """Note whom outside means by a port that nobody has, soon after the start. RtpsError."""
-        if self.ports.may_have_returning(now) and not self._is_too_much(datagram, source, now):
-            self.ports.note_use(port, datagram, self.settings.is_peer(source), now)
+        if not self.ports.may_have_returning(now):
+            return
+        if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
+            return
+        self.ports.note_use(port, datagram, self.settings.is_peer(source), now)
 
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether a source makes more discovery than it may; what is not is charged to it."""

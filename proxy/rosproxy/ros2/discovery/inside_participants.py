@@ -35,6 +35,10 @@ from rosproxy.ros2.registry.participants import (
 )
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, require_rewritable, rewritten
 
+PART_FOR_OTHERS = 8
+"""One of so many parts of the range is out of reach for a single address: a container that takes
+all that it can get leaves something for others."""
+
 
 @dataclass(slots=True)
 class InsideParticipants(ParticipantTable[InsideParticipant]):
@@ -163,7 +167,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         locator: HostPort,
     ) -> HostPort | None:
         """The address and port at which outside reaches a locator; None if it does not."""
-        if locator.host != participant.address:
+        if locator.host != participant.address or self._is_own(locator):
             return None
         is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
         kind = LeaseKind.METATRAFFIC if is_metatraffic else LeaseKind.DATA
@@ -181,6 +185,21 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         host = self.settings.host_for(locator.host)
         return HostPort(host, self.settings.ports.advertised(lease.port))
 
+    def _is_own(self, locator: HostPort) -> bool:
+        """Whether a locator is a port of the range itself: a datagram there would never end."""
+        in_range = locator.port in self.settings.ports.listen
+        return in_range and locator.host == self.settings.proxy_address_for(locator.host)
+
+    def _has_its_share(self, address: str) -> bool:
+        """Whether those at an address have as many ports as they may together.
+
+        That does not depend on what others have: so all get the same again after a restart,
+        whoever comes first.
+        """
+        size = len(self.settings.ports.listen)
+        at_address = (p for p in self.by_prefix.values() if p.address == address)
+        return sum(len(p.leases) for p in at_address) >= size - size // PART_FOR_OTHERS
+
     def _lend(
         self,
         participant: InsideParticipant,
@@ -193,9 +212,14 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             text = f"has more than {MOST_LEASES} locators; {locator} got no port"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.BOUND, text)
             return None
+        ports = self.settings.ports.listen
+        if self._has_its_share(participant.address):
+            text = f"{locator} got no port: {participant.address} has as many of {ports} as one "
+            text += "address may have"
+            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
+            return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)
         if port is None:
-            ports = self.settings.ports.listen
             text = f"no port of {ports} is free for {locator}: give a longer --port-range"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None

@@ -10,6 +10,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
+from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain_settings import MOST_INSIDE, MOST_PER_ADDRESS, MOST_PER_HOST
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
@@ -30,8 +31,10 @@ from rosproxy.ros2.rewriting import discovery
 from tests.unit.ros2.discovery.domains import (
     EAR,
     INSIDE,
+    NEAR,
     NOW,
     OTHER,
+    RANGE,
     ROBOT,
     SEDP_WRITERS,
     STRANGER,
@@ -149,7 +152,36 @@ def test_an_exhausted_range_is_not_searched_for_each_locator(
     meet(domain)
     long = message(data(payload([TOPIC, *locators]), writer=SEDP_WRITERS), prefix=A)
     domain.heard_inside(long, INSIDE, NOW)
-    assert len(set(ordered)) == 15  # the ports that there are
+    assert len(set(ordered)) == 14  # the ports that one address may have
+
+
+def test_one_address_leaves_ports_for_others() -> None:
+    """Sixty participants at one address, as many as there may be, took all ports of the range."""
+    domain = make_domain()
+    prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(30)]
+    for number, prefix in enumerate(prefixes):
+        domain.heard_inside(spdp(prefix, INSIDE, 7410 + 10 * number), INSIDE, NOW)
+    assert domain.ports.pool.free == 1  # of 16 the first is the proxy's own, and two are for others
+    assert "as many" in domain.inside.port_shortages[prefixes[-1]].text
+    meet(domain, B, OTHER)
+    assert len(domain.inside.by_prefix[B].leases) == 1
+
+
+def test_no_port_of_the_range_leads_to_the_range() -> None:
+    """A datagram there never ended: a process on the proxy's own machine could do that."""
+    domain = make_domain()
+    domain.heard_inside(spdp(A, NEAR, RANGE.listen.first + 2), NEAR, NOW)
+    assert not domain.inside.leases
+    domain.heard_inside(spdp(B, NEAR, 7410), NEAR, NOW)
+    assert len(domain.inside.leases) == 2
+
+
+def test_users_data_of_before_a_restart_is_not_charged() -> None:
+    domain, user = make_domain(), message(submessage(0x07, 0, bytes(28)), prefix=B)
+    for _ in range(int(BURST) + 5):
+        domain.at_lease(45007, user, ROBOT, 0.5)
+    assert domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.6) == []
+    assert B in domain.outside.by_prefix
 
 
 def test_announcements_and_topics_have_a_length() -> None:
