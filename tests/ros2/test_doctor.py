@@ -164,9 +164,12 @@ def test_a_peer_that_does_not_get_in(lab: Lab) -> None:
 
 def test_cyclone_with_ports_of_its_own(lab: Lab) -> None:
     """Where it has multicast, as most machines have, no peer knows its ports."""
-    lab.node("jazzy", "c1", "pub", topic="/chatter").wait_for("^sent")
+    lab.node("cyclone", "out", "sub", topic="/chatter").wait_for("^ready")
+    lab.node("jazzy", "c1", "pub", topic="/chatter")
+    passer_by = lab.node("jazzy", "out", "sub", topic="/chatter")
+    passer_by.wait_for("^got hello ")  # so announcements have gone there
+    passer_by.stop()
     lab.wait_for_participants(1, 0)
-    lab.node("cyclone", "out", "sub", topic="/chatter")
     told = " ".join(lab.tool("doctor").split())
     peer = f'<Peer address="{HostPort(lab.host, PORTS.first)}"/>'
     assert "no participant outside has been heard" in told

@@ -21,7 +21,10 @@ def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
     if not participants:
         yield "No participant has been heard yet."
         return
-    sides = ["inside"] * len(domain.inside) + ["outside"] * len(domain.outside)
+    # Where somebody is inside, those outside send there, and nothing has come from one of these.
+    unheard = "outside?" if domain.inside else "outside"
+    sides = ["inside"] * len(domain.inside)
+    sides += ["outside" if p.proven else unheard for p in domain.outside]
     rows = [HEADING, *(_row(p, side) for p, side in zip(participants, sides, strict=True))]
     heading, *lines = table(rows, 4, max(columns - besides_first(rows), len(HEADING[0])))
     yield heading
@@ -51,8 +54,7 @@ def _plane(plane: document.DataPlaneStatus) -> str:
 def _row(participant: document.ParticipantStatus, side: str) -> tuple[str, ...]:
     return (
         clean(participant.guid_prefix),
-        # It has not shown yet that it gets what is sent to it.
-        side if participant.proven else f"{side}?",
+        side,
         clean(participant.address),
         clean(participant.vendor),
         *(

@@ -27,7 +27,7 @@ class DomainProblem(msgspec.Struct, frozen=True):
     grave: bool = True
 
 
-_FAST_DDS, CYCLONE_DDS = VENDORS[FAST_DDS], VENDORS[b"\x01\x10"]
+_FAST_DDS_NAME, _CYCLONE_DDS_NAME = VENDORS[FAST_DDS], VENDORS[b"\x01\x10"]
 _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.TCP: (
         "it is reached by TCP alone, and the proxy passes on UDP",
@@ -152,7 +152,7 @@ def _security(
     Fast DDS repeats its addresses with each reader and writer; Cyclone DDS only announces them with
     the participant itself, which is never protected.
     """
-    if participant.security != DdsSecurity.PROTECTED or participant.vendor == CYCLONE_DDS:
+    if participant.security != DdsSecurity.PROTECTED or participant.vendor == _CYCLONE_DDS_NAME:
         return
     text = f"{label}: DDS Security protects its discovery, so that the proxy can't change the "
     side = "outside" if is_inside else "inside"
@@ -163,7 +163,7 @@ def _security(
         fix += "; or a way out for those inside, and --direction out"
     # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
     yield DomainProblem(
-        "security", participant.guid_prefix, text, fix, grave=participant.vendor == _FAST_DDS
+        "security", participant.guid_prefix, text, fix, grave=participant.vendor == _FAST_DDS_NAME
     )
 
 

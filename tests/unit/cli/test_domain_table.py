@@ -50,6 +50,13 @@ def shown(domain: DomainStatus) -> str:
     return render(ProxyStatus(settings=settings, domains=(domain,)), 120)
 
 
+def test_who_has_nobody_to_send_to_is_not_in_doubt() -> None:
+    assert "outside?" in shown(DOMAIN)
+    alone = shown(replace(DOMAIN, inside=()))
+    assert "outside" in alone
+    assert "outside?" not in alone
+
+
 def test_a_domain_and_its_participants_are_shown() -> None:
     text = shown(DOMAIN)
     for expected in (

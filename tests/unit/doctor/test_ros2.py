@@ -72,12 +72,13 @@ def test_who_hears_nobody_is_told_where_to_look() -> None:
 
 def test_a_peer_of_whom_nobody_is_heard_is_told() -> None:
     """Cyclone DDS takes ports of its own where it has multicast: announcements miss it."""
-    peers = ("10.0.0.9", "10.0.0.7", "10.0.0.6:11400")
+    peers = ("10.0.0.9", "fd00::9", "10.0.0.7", "10.0.0.6:11400")
     told = diagnose_domain(
         DomainStatus(peers=peers, discovery="10.0.0.1:11400", inside=(INSIDE,), outside=(OUTSIDE,))
     )
     assert ("outside", "peer 10.0.0.9") not in told
-    for peer in peers[1:]:
+    assert ("outside", "peer fd00::9") not in told  # the same one's other address
+    for peer in peers[2:]:
         severity, text = told["outside", f"peer {peer}"]
         assert severity is Severity.INFO
         assert '<Peer address="10.0.0.1:11400"/>' in text

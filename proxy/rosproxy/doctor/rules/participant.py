@@ -84,7 +84,10 @@ def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
     heard = {participant.address for participant in domain.outside}
     for peer in domain.peers:
         target = parse_host_port(peer)
-        if (target.host if target else peer) not in heard:
+        host = target.host if target else peer
+        # A name may have an address of each family, and be heard by one of them.
+        is_main_family = (":" in host) == domain.discovery.startswith("[")
+        if host not in heard and is_main_family:
             yield note("outside", f"peer {peer}", "no participant there has been heard", fix)
 
 

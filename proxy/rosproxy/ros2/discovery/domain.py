@@ -153,9 +153,10 @@ class Domain(DomainParticipants):
 
     def _part(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
         """Part one from all outside, of whom the policy is asked anew then. Raises RtpsError."""
-        sent = self.rediscovery.separate(insider, now)
-        insider.verdicts.clear()
-        return sent
+        try:
+            return self.rediscovery.separate(insider, now)
+        finally:
+            insider.verdicts.clear()
 
     def _unless_malformed(self, source: str, step: Callable[[], list[Outgoing]]) -> list[Outgoing]:
         """What a step gives to send, or nothing: one participant must not keep it from others."""
@@ -278,9 +279,11 @@ class Domain(DomainParticipants):
     ) -> _Passing:
         """Metatraffic from outside as a participant inside gets it. Raises RtpsError."""
         prefix, spdp = message.prefix, message.of_participant
+        outsider = self.outside.find(prefix, source)
+        if outsider is not None:
+            outsider.has_come_in = True
         if prefix in self.inside.by_prefix or insider.is_apart:
             return [], []
-        outsider = self.outside.find(prefix, source)
         if spdp is not None:
             if outsider is None and not self.settings.is_peer(source):
                 text = "a participant that was not heard before, at an address that is no peer's"
@@ -290,7 +293,6 @@ class Domain(DomainParticipants):
         if outsider is None:
             return [], []
         outsider.note_sent(message.datagram, insider.prefix)
-        outsider.has_come_in = True
         imported = partial(self.outside.imported, outsider, insider)
         passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
         back = self.outside.allowed_questions(outsider, questions)

@@ -8,6 +8,7 @@ from rosproxy.ros2.protocol.rtps import (
     FAST_DDS,
     INFO_DST,
     PREFIX,
+    STATISTICS,
     Overwrite,
     RtpsError,
     Span,
@@ -41,7 +42,7 @@ _NAMELESS = frozenset(
     )
 )
 """Submessages that are from no writer, and only tell of those that follow."""
-_NAMELESS_OF = {FAST_DDS: _NAMELESS | {SubmessageId.STATISTICS.value}}
+_NAMELESS_OF = {FAST_DDS: _NAMELESS | {STATISTICS}}
 """The same of vendors that have others."""
 _BUILT_IN = 0xC0
 """The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
@@ -68,7 +69,7 @@ def destinations(datagram: bytes) -> set[bytes]:
     for kind, _, body in submessages(datagram):
         if kind == INFO_DST:
             prefix = datagram[body.start : body.start + PREFIX]
-        elif kind not in _NAMELESS:
+        elif kind in _WRITER_AT:
             if not any(prefix):
                 return set()
             prefixes.add(prefix)

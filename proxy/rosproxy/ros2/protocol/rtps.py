@@ -56,10 +56,7 @@ class RtpsError(ValueError):
 
 
 class SubmessageId(IntEnum):
-    """The submessages that the proxy reads; those from 0x80 on have a meaning for each vendor.
-
-    ``STATISTICS`` is of Fast DDS, at the end of each message: where that went, and how many bytes.
-    """
+    """The submessages that the proxy reads."""
 
     HEADER_EXTENSION = 0x00
     PAD = 0x01
@@ -73,9 +70,11 @@ class SubmessageId(IntEnum):
     HEARTBEAT_FRAG = 0x13
     DATA = 0x15
     DATA_FRAG = 0x16
-    STATISTICS = 0x80
-    RTI_CRC = 0x80
 
+
+STATISTICS, RTI_CRC = 0x80, 0x80
+"""Submessages from 0x80 on have a meaning for each vendor. Of Fast DDS it is at the end of each
+message, where that went and how many bytes; of RTI Connext a checksum."""
 
 # Plain numbers: a member of an enumeration is slow to look up, and this is done for each datagram.
 _INFO_SRC, INFO_DST = SubmessageId.INFO_SRC.value, SubmessageId.INFO_DST.value
@@ -157,7 +156,7 @@ def has_checksum(datagram: bytes) -> bool:
     is_of_rti = source_vendor(datagram) == RTI
     return any(
         (kind == SubmessageId.HEADER_EXTENSION and flags & _CHECKSUM)
-        or (kind == SubmessageId.RTI_CRC and is_of_rti)
+        or (kind == RTI_CRC and is_of_rti)
         for kind, flags, _ in submessages(datagram)
     )
 

@@ -29,7 +29,8 @@ STAND_INS = PortRange(20_000, 32_767)
 TRIES = 32
 """How many ports are tried for a locator outside."""
 MOST_NAMED = 8
-"""Participants that may be named at one port, for each kind; more of them tell nothing."""
+"""Participants that may be named at one port; more tell nothing. One that is named for both kinds
+counts twice."""
 MOST_SHARING = 4
 """Locators outside that one port may stand for."""
 SETTLING = 1.0

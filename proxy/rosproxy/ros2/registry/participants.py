@@ -240,7 +240,7 @@ class OutsideParticipant(Participant):
 
     Until it is ``proven`` that it gets what is sent to it, it is sent no more bytes than came from
     it; ``credit`` is how many are left. One that is ``trusted``, at a peer's address, may be sent
-    anything. ``has_come_in``: something from it has arrived at a port that was lent.
+    anything. ``has_come_in``: discovery from it has arrived at a port that was lent.
     """
 
     trusted: bool = False

@@ -196,3 +196,5 @@ def test_all_that_a_message_names_are_meant() -> None:
     assert destinations(message(ack, to_first, ack)) == set()
     assert destinations(message(to_first, ack, to_all, ack)) == set()
     assert destinations(message(info)) == set()
+    extension, unknown = submessage(0x00, 1, bytes(8)), submessage(0x80, 1, bytes(56))
+    assert destinations(message(extension, to_first, ack, to_all, unknown)) == {first}
