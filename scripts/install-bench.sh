@@ -8,6 +8,7 @@ cd "$(dirname "$0")/.."
 
 scripts/install-ros.sh
 scripts/install-ros2.sh
+scripts/install-browser.sh
 scripts/install-kubernetes.sh
 need install-bench \
     socat haproxy nginx libnginx-mod-stream nftables conntrack iproute2 procps \

@@ -25,6 +25,7 @@ TITLES = {
     "nodes": "Many nodes",
     "ros": "Real ROS nodes",
     "ros2": "ROS 2",
+    "page": "The live page",
     "cluster": "The operator in a growing cluster",
     "docker": "The operator on a Docker host",
 }

@@ -28,6 +28,16 @@ const line = cy.edges().filter((one) =>
   one.source().data("label") === ends[0] && one.target().data("label") === ends[1]);
 return line.empty() ? null : { colour: line.style("line-color"), label: line.data("label") };
 """
+CHOOSE = """
+const { cy } = window.rosproxyPage;
+cy.edges().filter((one) => one.source().data("label") === arguments[0]
+  && one.target().data("label") === arguments[1]).select();
+return document.querySelector("#details").textContent;
+"""
+PLACES = """
+return Object.fromEntries(
+  window.rosproxyPage.cy.nodes().map((one) => [one.data("label"), one.position().x]));
+"""
 CUT = """
 table ip cut {{
   chain forward {{

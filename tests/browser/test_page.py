@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import re
 import socket
+import sys
+from pathlib import Path
 
+from examples.demo.proxy_process import clean_environment
 from rosproxy.ros1.protocol.tcpros import encode_header
-from tests.browser.page import UNKNOWN, URL, colour, cut, line, port_of, row, rows
+from tests.browser.page import CHOOSE, PLACES, UNKNOWN, URL, colour, cut, line, port_of, row, rows
 from tests.browser.webdriver import Browser
 from tests.ros.lab import Lab
-from tests.ros.processes import wait_until
+from tests.ros.processes import Process, wait_until
 from tests.ros.topology import OUT_HOST
 
+MOST_ROWS = 400
+"""What the page shows at once."""
 HOSTILE = "/<img src=x onerror=document.title='mine'>"
 
 
@@ -30,11 +37,27 @@ def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
     well = row(browser, "/chatter", State="ok", To="/listener", **{"Last message": "just now"})
     assert (well["Carried by"], well["Port"]) == ("splice", str(port))
     assert line(browser, "/talker", "/listener")["colour"] == colour(browser, "ok")
+    wait_until(
+        "the line tells what flows",
+        lambda: re.fullmatch(
+            r"/chatter\n[\d.]+ Hz, [\d.<]+ MB/s, splice",
+            line(browser, "/talker", "/listener")["label"],
+        ),
+        60,
+    )
+    assert "last message just now, carried by splice" in browser.run(CHOOSE, "/talker", "/listener")
+    places = browser.run(PLACES)
+    assert places["/listener"] < places["rosproxy"] < places["/talker"], "each in its lane"
+    used = browser.run("return document.querySelector('#summary').textContent")
+    assert re.search(r"ports \d+-\d+: [1-9]\d* used, \d+ free", used)
     with cut(lab, port):
         broken = row(browser, "/chatter", State="BROKEN", To="/listener")
         assert f"on the machine of /listener: nc -vz {OUT_HOST} {port}" in broken["fix"]
-        red = line(browser, "/talker", "/listener")["colour"]
-        assert red == colour(browser, "broken")
+        red = line(browser, "/talker", "/listener")
+        assert red["colour"] == colour(browser, "broken")
+        assert red["label"].startswith("BROKEN: /chatter\n")
+        assert f"nc -vz {OUT_HOST} {port}" in red["label"]
+        assert f"nc -vz {OUT_HOST} {port}" in browser.run(CHOOSE, "/talker", "/listener")
         told = browser.run("return document.querySelector('#findings').textContent")
         assert f"nc -vz {OUT_HOST} {port}" in told
         assert browser.run("return document.title") == "(1 broken) rosproxy"
@@ -141,6 +164,46 @@ def test_light_dark_and_a_phone(lab: Lab, browser: Browser) -> None:
     browser.resize(360, 740)
     narrow = "return document.documentElement.scrollWidth <= innerWidth"
     wait_until("nothing is wider than a phone", lambda: browser.run(narrow))
+    with cut(lab, port_of(lab, "talker")):
+        row(browser, "/chatter", State="BROKEN", To="/listener")
+        assert browser.run(narrow), "nor with a long command"
+
+
+def test_the_keyboard_alone_gets_everywhere(lab: Lab, browser: Browser) -> None:
+    talk(lab)
+    browser.open(URL)
+    row(browser, "/chatter", State="ok", To="/listener")
+    focus = "const one = document.activeElement; return one.id || one.className"
+    visited = []
+    for _ in range(6):
+        browser.press("\ue004")
+        visited.append(browser.run(focus))
+    assert visited[:4] == ["skip", "filter", "quiet", "unfold"]
+    assert "scroll" in visited, "the table"
+
+
+def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
+    """They are made up; what is not shown of them is said, and only changes are sent."""
+    place, port = lab.place("px"), 21312
+    command = [sys.executable, "-m", "tests.browser.many", str(port), "1000"]
+    paths = os.pathsep.join(path for path in sys.path if path)
+    environment = clean_environment(PYTHONPATH=paths, PYTHONUNBUFFERED="1")
+    server = Process("many", place, command, environment, tmp_path / "many.log")
+    try:
+        server.wait_for("^serving", timeout=60)
+        browser.open(f"http://127.0.0.1:{port}/")
+        wait_until("there are rows", lambda: len(rows(browser)) == MOST_ROWS, 60)
+        told = browser.run("return document.querySelector('#more').textContent")
+        assert told == "600 more: narrow it down by a name."
+        before = [page_row["MB/s"] for page_row in rows(browser)]
+        wait_until(
+            "rates follow", lambda: before != [page_row["MB/s"] for page_row in rows(browser)], 60
+        )
+        browser.run("document.querySelector('#filter').focus()")
+        browser.press("node499/")
+        wait_until("two are left", lambda: len(rows(browser)) == 2, 60)
+    finally:
+        server.kill()
 
 
 def test_a_screen_reader_finds_it_all(lab: Lab, browser: Browser) -> None:

@@ -1,7 +1,9 @@
 """The live pages of several proxies as one document.
 
 Each proxy has its own nodes inside. Outside is the same for all proxies of one master, so its
-nodes appear once. A proxy that can't be asked is a node that says why.
+nodes appear once; and what is outside for one proxy may be inside for another. Participants of ROS
+2 are the same wherever they have one name, which is made to be nobody else's. A proxy that can't be
+asked is a node that says why.
 """
 
 from collections.abc import Mapping
@@ -24,7 +26,7 @@ from rosproxy.page.page_document import (
 )
 
 Json = dict[str, Any]
-PROXY = "proxy"
+PROXY, PARTICIPANT = "proxy", "participant"
 
 
 def read_document(text: str) -> Document:
@@ -35,18 +37,26 @@ def read_document(text: str) -> Document:
         raise ValueError(str(error)) from None
 
 
-def merged(documents: Mapping[str, Document | str], version: str) -> Json:
-    """One document of those of all proxies, by name; a text says why one can't be asked."""
+def merged(documents: Mapping[str, Document | str], version: str, logs: str) -> Json:
+    """One document of those of all proxies, by name; a text says why one can't be asked.
+
+    ``logs`` is the command that shows a proxy's, but for its name.
+    """
     nodes: dict[str, PageNode] = {}
     links: list[tuple[str, PageLink]] = []
     findings: list[PageFinding] = []
     left_out = 0
+    inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
-            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, f"it can't be asked: {document}")
+            text, fix = f"it can't be asked: {document}", f"{logs} {name}"
+            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, fix)
             continue
         names = {key: _key(name, document, key, node) for key, node in document.nodes.items()}
         for key, node in document.nodes.items():
+            if node.lane != CONTAINER and names[key] in inside:
+                names[key] = inside[names[key]]  # another proxy tells of it, who knows it better
+                continue
             label = name if node.kind == PROXY else node.label or key
             owner = name if node.lane == CONTAINER else ""
             nodes[names[key]] = replace(node, label=label, proxy=owner)
@@ -69,8 +79,25 @@ def merged(documents: Mapping[str, Document | str], version: str) -> Json:
     }
 
 
+def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:
+    """The keys of the nodes inside, by those that they have for proxies outside which they are."""
+    return {
+        _outside_key(name, document, key, node): _key(name, document, key, node)
+        for name, document in documents.items()
+        if not isinstance(document, str)
+        for key, node in document.nodes.items()
+        if node.lane == CONTAINER
+    }
+
+
 def _key(name: str, document: Document, key: str, node: PageNode) -> str:
     """A node's key, different for each proxy, but the same for one node outside."""
-    if node.lane == CONTAINER or node.kind == PROXY or not document.proxy.master:
+    if node.lane == CONTAINER or node.kind == PROXY:
         return f"{name} {key}"
-    return f"{document.proxy.master} {key}"
+    return _outside_key(name, document, key, node)
+
+
+def _outside_key(name: str, document: Document, key: str, node: PageNode) -> str:
+    if node.kind == PARTICIPANT:
+        return key
+    return f"{document.proxy.master or name} {key}"

@@ -23,13 +23,13 @@ EVERY = 2.0
 Documents = Callable[[], Awaitable[Mapping[str, Document | str]]]
 
 
-def operator_page(documents: Documents) -> Page:
-    """The page over what ``documents`` asks of the proxies, by their names."""
+def operator_page(documents: Documents, logs: str) -> Page:
+    """The page over what ``documents`` asks of the proxies, by their names; ``logs``: `merged`."""
 
     async def make() -> AsyncGenerator[dict[str, Any]]:
         while True:
             proxy_documents = await documents()
-            yield await asyncio.to_thread(merged, proxy_documents, __version__)
+            yield await asyncio.to_thread(merged, proxy_documents, __version__, logs)
             await asyncio.sleep(EVERY)
 
     return Page(Feed(Tasks(), make), Visitors(None, time.monotonic, local=True))

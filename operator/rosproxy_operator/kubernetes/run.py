@@ -64,7 +64,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         )
         server = WebhookServer(settings.webhook.bind, rotation)
         webhook = Injector(api, settings.plan, metrics, controller.wake), server
-    page = operator_page(controller.documents)
+    page = operator_page(controller.documents, "kubectl -n NAMESPACE logs")
     unready = _first_reason(controller.unready, *([webhook[1].unready] if webhook else []))
     health = HealthServer(metrics.registry, controller.dead, unready, page)
     await health.start(settings.admin)

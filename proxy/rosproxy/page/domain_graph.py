@@ -40,6 +40,7 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
     """The participants of all domains, and the links between them."""
     nodes: dict[str, PageNode] = {}
     links: list[PageLink] = []
+    both_ways = status.settings.direction == "both"
     for domain in status.domains:
         problems = {problem.subject: problem for problem in domain_problems(domain)}
         for side in (domain.inside, domain.outside):
@@ -48,7 +49,7 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
                     participant, side is domain.inside, problems.get(participant.guid_prefix)
                 )
                 nodes[_key(domain, participant)] = node
-        links += _links(domain, problems)
+        links += _links(domain, problems, "" if both_ways else "direct")
     return nodes, links
 
 
@@ -95,9 +96,13 @@ def _state(problem: DomainProblem | None) -> str:
     return BROKEN if problem.grave else WARNING
 
 
-def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator[PageLink]:
-    yield from _crossing(domain, domain.inside, domain.outside, problems)
-    yield from _crossing(domain, domain.outside, domain.inside, problems)
+def _links(
+    domain: DomainStatus, problems: dict[str, DomainProblem], way_out: str
+) -> Iterator[PageLink]:
+    """The links of a domain; ``way_out`` is how what goes by no port of the proxy's is carried."""
+    for writers, readers in ((domain.inside, domain.outside), (domain.outside, domain.inside)):
+        way = way_out if writers is domain.inside else ""
+        yield from _crossing(domain, writers, readers, problems, way)
     for participant in domain.inside:
         for service in participant.services:
             quiet = is_quiet_service(service) or service.endswith(_QUIET_ENDINGS)
@@ -107,6 +112,8 @@ def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator
                 shown_name(service),
                 _key(domain, participant),
                 state=_state(problem),
+                text=shown_text(problem.text) if problem else "",
+                fix=shown_text(problem.fix) if problem else "",
                 quiet=quiet,
             )
 
@@ -116,6 +123,7 @@ def _crossing(
     writers: tuple[ParticipantStatus, ...],
     readers: tuple[ParticipantStatus, ...],
     problems: dict[str, DomainProblem],
+    way: str,
 ) -> Iterator[PageLink]:
     """The topics that cross the boundary in one direction."""
     readers_by_topic: dict[str, list[ParticipantStatus]] = {}
@@ -128,16 +136,17 @@ def _crossing(
             for reader in readers_by_topic.get(topic, ()):
                 problem = problems.get(writer.guid_prefix) or problems.get(reader.guid_prefix)
                 problem = problem or mismatched.get((topic, writer.guid_prefix, reader.guid_prefix))
-                yield _link(domain, topic, writer, reader, problem)
+                yield _link(domain, topic, (writer, reader), problem, way)
 
 
 def _link(
     domain: DomainStatus,
     topic: str,
-    writer: ParticipantStatus,
-    reader: ParticipantStatus,
+    ends: tuple[ParticipantStatus, ParticipantStatus],
     problem: DomainProblem | None,
+    way: str,
 ) -> PageLink:
+    writer, reader = ends
     state = _state(problem)
     data = [lease for lease in reader.leases if lease.kind == LeaseKind.DATA.value]
     return PageLink(
@@ -145,7 +154,7 @@ def _link(
         shown_name(topic),
         _key(domain, writer),
         _key(domain, reader),
-        carried=data[0].plane if data and state != BROKEN else "",
+        carried="" if state == BROKEN else data[0].plane if data else way,
         port=data[0].port if data else None,
         state=state,
         text=shown_text(problem.text) if problem else "",

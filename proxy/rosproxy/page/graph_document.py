@@ -17,7 +17,7 @@ from rosproxy.doctor.rules import diagnose_running
 from rosproxy.doctor.rules.pair import judge_pair
 from rosproxy.net.addresses import is_loopback
 from rosproxy.page import domain_graph
-from rosproxy.page.measures import FLOWS, Key, Measures
+from rosproxy.page.measures import Key, Measures
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -277,8 +277,8 @@ class _Ros1Links:
         carried, port = self._way(key)
         judged = key in self._judged.pairs or key in self._relayed
         state = _STATES[finding.severity] if finding else OK if judged else UNKNOWN
-        age = None if link.last is None else self._now - link.last
-        flows = age is not None and age < FLOWS and state != BROKEN
+        last = link.last(self._now)
+        flows = link.flows(self._now) and state != BROKEN
         return PageLink(
             "topic",
             shown_name(topic),
@@ -288,7 +288,7 @@ class _Ros1Links:
             port=port,
             rate=None if link.rate is None else rounded(link.rate),
             hz=None if link.hz is None else rounded(link.hz),
-            since=None if link.last is None or flows else round(self._epoch + link.last),
+            since=None if last is None or flows else round(self._epoch + last),
             flows=flows,
             state=state,
             text=shown_text(finding.text) if finding else "",
@@ -318,16 +318,12 @@ class _Ros1Links:
         )
         _, port = self._way(key)
         host = self._status.settings.advertise_host
-        fix = (
-            f"restart {subscriber}"
-            if subscriber in self._inside
-            else f"look at the network of {subscriber}"
-        )
-        if port and subscriber not in self._inside:
-            fix = (
-                f"on the machine of {subscriber}: nc -vz {host} {port}; "
-                "a firewall or a broken network"
-            )
+        fix = f"look at the network of {subscriber}"
+        if subscriber in self._inside:
+            fix = f"restart {subscriber}"
+        elif port:
+            fix = f"on the machine of {subscriber}: nc -vz {host} {port}; "
+            fix += "a firewall or a broken network"
         return error("pair", f"{topic} from {publisher} to {subscriber}", text, fix)
 
     def _way(self, key: Key) -> tuple[str, int | None]:
@@ -382,6 +378,8 @@ class _Ros1Links:
                     if clients
                     else None,
                     state=state,
+                    text=shown_text(f"{name}: {finding.text}") if finding else "",
+                    fix=shown_text(finding.fix) if finding else "",
                     quiet=is_quiet_service(service),
                 )
 

@@ -5,6 +5,9 @@ nothing. There are three counters: the publisher's and the subscriber's own of m
 which they are asked for now and then (``getBusStats``), and the proxy's of bytes, where it relays.
 What the subscriber has counted has arrived. The proxy's counter stops only once buffers are full;
 the publisher's tells what was to be sent.
+
+The proxy's counter is read each second, the nodes' as seldom as a thousand of them need. So what
+the proxy relays is the news, as long as nothing shows that it does not arrive.
 """
 
 from collections.abc import Iterable, Mapping
@@ -71,10 +74,23 @@ class Link:
         """Bytes per second: those of the proxy, else those that a node has counted."""
         return self._first("rate", "relayed", "taken bytes", "given bytes")
 
-    @property
-    def last(self) -> float | None:
-        """When something was last seen to have come."""
-        return self._first("grew", "taken", "relayed", "given")
+    def last(self, now: float) -> float | None:
+        """When something was last seen to have come; None: that is not known."""
+        names = ("taken",) if self.is_stalled(now) else ("taken", "relayed")
+        counters = [self.counters[name] for name in names if name in self.counters]
+        if not counters:
+            return self._first("grew", "given")
+        return max((c.grew for c in counters if c.grew is not None), default=None)
+
+    def flows(self, now: float) -> bool:
+        """Whether messages come just now, or came so often when they were counted last."""
+        last = self.last(now)
+        if last is None or self.is_stalled(now):
+            return False
+        counter = self.counters.get("taken") or self.counters.get("given")
+        if now - last < FLOWS or counter is None or "relayed" in self.counters:
+            return now - last < FLOWS
+        return counter.grew == counter.at and (counter.rate or 0.0) * FLOWS >= 1.0
 
     def note_progress(self) -> None:
         """Remember how far the publisher was whenever the subscriber got something."""

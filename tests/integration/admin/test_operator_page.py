@@ -35,7 +35,9 @@ async def opened(proxies: dict[str, tuple[HostPort, str]], client: ProxyClient) 
     async def documents() -> dict[str, Document | str]:
         return await client.documents(proxies)
 
-    return HealthServer(CollectorRegistry(), lambda: None, lambda: None, operator_page(documents))
+    return HealthServer(
+        CollectorRegistry(), lambda: None, lambda: None, operator_page(documents, "docker logs")
+    )
 
 
 async def test_all_proxies_stand_on_one_page(

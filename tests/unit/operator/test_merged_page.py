@@ -46,7 +46,7 @@ def shown(name: str, links: int = 1, **changes: Any) -> Document:
 
 
 def test_inside_is_apart_and_outside_the_same() -> None:
-    document = merged({"one": shown("a"), "two": shown("b")}, "1.0")
+    document = merged({"one": shown("a"), "two": shown("b")}, "1.0", "docker logs")
     nodes = document["nodes"]
     assert {key for key, node in nodes.items() if node["lane"] == "container"} == {
         "one /talker",
@@ -64,12 +64,51 @@ def test_inside_is_apart_and_outside_the_same() -> None:
     assert document["findings"][0]["subject"] == "one: ports"
 
 
+def test_who_is_inside_elsewhere_is_one_box() -> None:
+    """A node behind the second proxy is outside for the first, and the other way round."""
+    nodes = {
+        "one": {"/a": {"lane": "container"}, "/b": {"lane": "robot"}, "/c": {"lane": "host"}},
+        "two": {"/b": {"lane": "container"}, "/a": {"lane": "robot"}, "/c": {"lane": "host"}},
+    }
+    link = {"kind": "topic", "name": "/t", "source": "/a", "target": "/b", "state": "ok"}
+    documents = {
+        name: read_document(
+            json.dumps({"proxy": {"master": MASTER}, "nodes": n, "links": {"t": link}})
+        )
+        for name, n in nodes.items()
+    }
+    document = merged({**documents, "other": shown("c", proxy={"master": "http://x:1"})}, "1", "")
+    boxes = {key: node["lane"] for key, node in document["nodes"].items() if key[:5] != "other"}
+    assert boxes == {
+        "one /a": "container",
+        "two /b": "container",
+        f"{MASTER} /c": "host",
+        "http://x:1 master": "robot",
+        "http://x:1 /listener": "robot",
+    }
+    ends = {(k["source"], k["target"]) for k in document["links"].values() if k["name"] == "/t"}
+    assert ends == {("one /a", "two /b")}
+
+
+def test_participants_are_the_same_for_all_proxies() -> None:
+    far = {"lane": "robot", "kind": "participant", "label": "far"}
+    near = {"lane": "container", "kind": "participant"}
+    documents = {
+        name: read_document(json.dumps({"nodes": {"0 far": far, f"0 {name}": near, "0 one": far}
+                                        | {f"0 {name}": near}, "links": {}}))
+        for name in ("one", "two")
+    }  # fmt: skip
+    keys = set(merged(documents, "1", "")["nodes"])
+    assert keys == {"one 0 one", "two 0 two", "0 far"}
+
+
 def test_a_proxy_that_cannot_be_asked_says_why() -> None:
-    document = merged({"one": "10.0.0.1:11312 refuses connections"}, "1.0")
+    document = merged({"one": "10.0.0.1:11312 refuses connections"}, "1.0", "docker logs")
     node = document["nodes"]["one"]
-    assert (node["state"], node["text"]) == (
+    assert (node["state"], node["text"], node["fix"]) == (
         BROKEN,
         "it can't be asked: 10.0.0.1:11312 refuses connections",
+        "docker logs one",
     )
 
 
@@ -77,7 +116,7 @@ def test_what_is_broken_stays_where_not_all_fits() -> None:
     node = PageNode("container")
     link = PageLink("topic", "/last", "/talker", state=BROKEN, text="why", fix="what to do")
     wrong = Document({"/talker": node}, {"x": link}, (PageFinding("error", "s", "t", "f"),))
-    document = merged({"many": shown("a", MOST_LINKS), "wrong": wrong}, "1.0")
+    document = merged({"many": shown("a", MOST_LINKS), "wrong": wrong}, "1.0", "docker logs")
     assert len(document["links"]) == MOST_LINKS
     assert document["left_out"] == 1
     assert next(iter(document["links"].values()))["fix"] == "what to do"

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pytest
 from msgspec.structs import replace
 
 from rosproxy.admin.status_document import (
@@ -25,11 +26,12 @@ OUTSIDE = ParticipantStatus(
 LINK = "topic /chatter 0 01.10.bb 0 01.0f.aa"
 
 
-def made(**changes: Any) -> dict[str, Any]:
+def made(direction: str = "out", /, **changes: Any) -> dict[str, Any]:
     domain = DomainStatus(
         **{"peers": ("robot",), "inside": (INSIDE,), "outside": (OUTSIDE,), **changes}
     )
-    status = ProxyStatus(settings=StatusSettings(ros=("2",)), domains=(domain,))
+    settings = StatusSettings(ros=("2",), direction=direction)
+    status = ProxyStatus(settings=settings, domains=(domain,))
     return graph_document(status, None, Measures(), (), 0.0, 0.0)
 
 
@@ -82,6 +84,25 @@ def test_a_participant_that_is_wrong_breaks_its_links() -> None:
     document = made(outside=(wrong,))
     assert document["nodes"]["0 01.10.bb"]["state"] == "broken"
     assert "passes on UDP" in document["links"][LINK]["text"]
+
+
+def test_a_service_of_a_participant_that_is_wrong_has_the_cure() -> None:
+    wrong = ParticipantStatus(
+        "01.0f.aa", "172.30.0.5", "Fast DDS", services=("/add",), locator_fault="tcp"
+    )
+    link = made(inside=(wrong,))["links"]["service /add 0 01.0f.aa "]
+    assert (link["state"], "passes on UDP" in link["text"]) == ("broken", True)
+    assert link["fix"]
+
+
+@pytest.mark.parametrize(("direction", "carried"), [("out", "direct"), ("both", None)])
+def test_what_goes_outwards_by_itself_is_carried_directly(
+    direction: str, carried: str | None
+) -> None:
+    talker = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS", publishes=("/chatter",))
+    listener = ParticipantStatus("01.10.bb", "10.0.0.9", "Fast DDS", subscribes=("/chatter",))
+    document = made(direction, inside=(talker,), outside=(listener,))
+    assert document["links"]["topic /chatter 0 01.0f.aa 0 01.10.bb"].get("carried") == carried
 
 
 def test_what_concerns_nobody_alone_is_a_finding() -> None:

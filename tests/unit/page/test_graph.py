@@ -155,6 +155,15 @@ def test_before_anybody_was_asked_the_status_tells() -> None:
     }
 
 
+def test_a_service_of_a_node_that_is_wrong_has_the_cure() -> None:
+    status = make_status(make_node(state="silent", services=["/add"]))
+    facts = make_facts(status=status)
+    link = made(judge(facts), status)["links"]["service /add /talker "]
+    assert link["state"] == "broken"
+    assert link["text"].startswith("/talker: does not answer")
+    assert link["fix"].startswith("restart it")
+
+
 def test_what_every_node_has_is_quiet() -> None:
     graph = SystemState(
         {"/rosout": ["/talker"], "/chatter": ["/talker"]}, {"/rosout": ["/rosout"]}, {}

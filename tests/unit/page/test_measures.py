@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SlaveReport, slave_report
 from rosproxy.net.addresses import HostPort
 from rosproxy.page import measures as module
-from rosproxy.page.measures import STALLED, Measures
+from rosproxy.page.measures import FLOWS, STALLED, Measures
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 
 KEY = ("/chatter", "/talker", "/listener")
@@ -39,14 +39,14 @@ def read(*rounds: tuple[float, int | None, int | None]) -> Measures:
 
 def test_nothing_is_known_at_first() -> None:
     link = Measures().get(KEY)
-    assert (link.hz, link.rate, link.last, link.is_stalled(100.0)) == (None, None, None, False)
+    assert (link.hz, link.rate, link.last(9.0), link.is_stalled(100.0)) == (None, None, None, False)
     once = read((1.0, 5, 5)).get(KEY)
-    assert (once.hz, once.last) == (None, None)
+    assert (once.hz, once.last(9.0)) == (None, None)
 
 
 def test_rates_are_those_of_what_arrives() -> None:
     link = read((1.0, 100, 50), (3.0, 140, 70)).get(KEY)
-    assert (link.hz, link.rate, link.last) == (10.0, 100.0, 3.0)
+    assert (link.hz, link.rate, link.last(3.0)) == (10.0, 100.0, 3.0)
 
 
 def test_where_the_subscriber_does_not_count_the_publisher_does() -> None:
@@ -59,7 +59,7 @@ def test_where_nobody_counts_nothing_is_said() -> None:
 
 def test_the_age_is_that_of_the_last_message_that_arrived() -> None:
     link = read((1.0, 10, 10), (3.0, 20, 20), (5.0, 30, 20), (7.0, 40, 20)).get(KEY)
-    assert link.last == 3.0
+    assert link.last(7.0) == 3.0
     assert link.hz == 0.0
 
 
@@ -90,9 +90,39 @@ def test_what_the_proxy_relays_counts_while_it_does() -> None:
     measures = Measures()
     measures.read_relays({KEY: 1000}, 1.0)
     measures.read_relays({KEY: 3000}, 2.0)
-    assert (measures.get(KEY).rate, measures.get(KEY).last) == (2000.0, 2.0)
+    assert (measures.get(KEY).rate, measures.get(KEY).last(2.0)) == (2000.0, 2.0)
     measures.read_relays({}, 3.0)
     assert measures.get(KEY).rate is None
+
+
+def test_what_the_proxy_relays_is_newer_than_what_nodes_are_asked_for() -> None:
+    """With a thousand nodes each is asked once in a minute; the proxy counts each second."""
+    measures = read((1.0, 10, 10), (31.0, 310, 310))
+    for second in range(31, 62):
+        measures.read_relays({KEY: 1000 * second}, float(second))
+    link = measures.get(KEY)
+    assert (link.last(61.0), link.flows(61.0)) == (61.0, True)
+    assert not link.flows(61.0 + FLOWS)
+    assert link.last(61.0 + FLOWS) == 61.0
+
+
+def test_what_the_proxy_relays_hides_no_connection_that_carries_nothing() -> None:
+    """Its counter grows until the buffers behind it are full."""
+    measures = read((1.0, 10, 10), (3.0, 20, 20), (9.0, 80, 20))
+    measures.read_relays({KEY: 1000}, 8.0)
+    measures.read_relays({KEY: 2000}, 9.0)
+    link = measures.get(KEY)
+    assert link.is_stalled(9.0)
+    assert (link.last(9.0), link.flows(9.0)) == (3.0, False)
+
+
+@pytest.mark.parametrize(("count", "flows"), [(310, True), (11, False), (10, False)])
+def test_where_nodes_alone_count_it_flows_if_it_came_often_between_two_questions(
+    count: int, flows: bool
+) -> None:
+    link = read((1.0, 10, 10), (31.0, count, count)).get(KEY)
+    assert link.flows(60.0) == flows
+    assert read((1.0, 10, 10), (31.0, 310, 310), (61.0, 310, 310)).get(KEY).flows(90.0) is False
 
 
 def test_links_that_are_no_more_are_forgotten() -> None:

@@ -9,6 +9,7 @@ import { age, apply, boxesOf, hertz, labelOf, linesOf, megabytes, positions, vis
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
 const MOST_LABELS = 80;
+const LONGEST_CURE = 120;
 const AGAIN = 5000;
 
 const $ = (id) => document.getElementById(id);
@@ -161,6 +162,8 @@ function showGraph(found) {
   const lines = linesOf(found, boxOf);
   const places = positions(boxes);
   const wanted = new Map();
+  const now = Date.now() / 1000 + clock;
+  let cures = 0;
   for (const box of boxes.values()) {
     const count = box.fold ? ` (${box.count})` : "";
     wanted.set(box.id, { group: "nodes", position: places.get(box.id),
@@ -168,9 +171,10 @@ function showGraph(found) {
   }
   for (const line of lines.values()) {
     const same = boxes.get(line.from).lane === boxes.get(line.to).lane ? "yes" : "no";
-    const few = lines.size <= MOST_LABELS;
+    const wrong = line.state === "broken" || line.state === "warning";
+    const labelled = wrong ? (cures += 1) <= MOST_LABELS : lines.size <= MOST_LABELS;
     wanted.set(line.id, { group: "edges", data: { id: line.id, source: line.from, target: line.to, state: line.state,
-      same, flows: line.flows ? "yes" : "no", label: few ? lineLabel(line) : "" } });
+      same, flows: line.flows ? "yes" : "no", label: labelled ? lineLabel(line, now) : "" } });
   }
   cy.batch(() => {
     cy.elements().forEach((one) => { if (!wanted.has(one.id())) one.remove(); });
@@ -191,13 +195,21 @@ function showGraph(found) {
   showFolds(folds);
 }
 
-function lineLabel(line) {
-  if (line.links.length > 1) return `${line.links.length} links`;
-  const { link } = line.links[0];
-  if (link.state === "broken") return `${link.name}\nbroken`;
+// What stands at a line: what is wrong first with its cure; else what is known of its one link.
+function lineLabel(line, now) {
+  const { link } = line.links[0]; // the worst: see visibleLinks
+  const more = line.links.length > 1 ? ` and ${line.links.length - 1} more` : "";
+  if (line.state === "broken" || line.state === "warning") {
+    return [`${WORDS[line.state]}: ${link.name}${more}`, short(link.fix || link.text)].filter(Boolean).join("\n");
+  }
+  if (more) return `${line.links.length} links`;
   const measures = [link.hz === undefined ? "" : `${hertz(link)} Hz`, link.rate === undefined ? "" : `${megabytes(link)} MB/s`,
-    link.carried || ""];
+    link.carried || "", link.flows || link.since === undefined ? "" : age(link, now)];
   return [link.name, measures.filter(Boolean).join(", ")].filter(Boolean).join("\n");
+}
+
+function short(text = "") {
+  return text.length > LONGEST_CURE ? `${text.slice(0, LONGEST_CURE)}…` : text;
 }
 
 function showFolds(folds) {
@@ -240,10 +252,11 @@ function details(element) {
   const ends = [element.source().id(), element.target().id()];
   const { boxOf } = boxesOf(state.nodes, new Set(state.nodes.keys()), chosen);
   const line = linesOf(visibleLinks(state.links, state.nodes, chosen), boxOf).get(element.id());
+  const now = Date.now() / 1000 + clock;
   const parts = [["h3", ends.map((id) => cy.getElementById(id).data("label")).join(" to ")]];
   for (const { link } of (line ? line.links : []).slice(0, 20)) {
     parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}, ${hertz(link)} Hz, ${megabytes(link)} MB/s, ` +
-      `carried by ${link.carried || "–"}, port ${link.port || "–"}`]);
+      `last message ${age(link, now)}, carried by ${link.carried || "–"}, port ${link.port || "–"}`]);
     if (link.text) parts.push(["p", link.text], ["code", link.fix || ""]);
   }
   return parts;
@@ -264,13 +277,13 @@ function style() {
     { selector: "node[kind = 'proxy'], node[kind = 'master']", style: { shape: "hexagon" } },
     { selector: "edge", style: { width: 2, "curve-style": "straight", "target-arrow-shape": "triangle", "arrow-scale": 0.8,
       "source-label": "data(label)", "source-text-offset": 78, "source-text-rotation": "autorotate",
-      "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-background-color": colour("box"),
+      "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-max-width": 230, "text-background-color": colour("box"),
       "text-background-opacity": 0.85, "text-background-padding": 2, "min-zoomed-font-size": 6 } },
     { selector: "edge[same = 'yes']", style: { "curve-style": "unbundled-bezier", "control-point-distances": 110, "control-point-weights": 0.5 } },
     { selector: "edge[flows = 'no']", style: { "line-style": "dashed" } },
     ...states.map((name) => ({ selector: `node[state = '${name}']`, style: { "border-color": colour(name) } })),
     ...states.map((name) => ({ selector: `edge[state = '${name}']`, style: { "line-color": colour(name), "target-arrow-color": colour(name) } })),
-    { selector: "edge[state = 'broken']", style: { width: 4 } },
+    { selector: "edge[state = 'broken']", style: { width: 4, "text-background-opacity": 1, "z-index": 2 } },
     { selector: ":selected", style: { "border-width": 4, "overlay-opacity": 0.12 } },
   ];
 }

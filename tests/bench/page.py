@@ -1,0 +1,94 @@
+"""The live page of 10 to 1,000 nodes, each of whose links changes every second, in Chromium.
+
+The nodes are made up (`tests.browser.many`), the page and what serves it are the proxy's own.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import sys
+import time
+from statistics import median
+
+from tests.bench.book import Book, percentile
+from tests.bench.world import World, cpu_seconds, world
+from tests.browser.webdriver import Browser
+from tests.ros.processes import wait_until
+
+SIZES, QUICK_SIZES = (10, 100, 1000), (10, 100)
+PORT = 11312
+WATCHED, QUICK_WATCHED = 10.0, 3.0
+"""Seconds for which frames are counted."""
+PATIENCE = 60
+FIRST_ROWS = "return document.querySelector('#rows tr') ? performance.now() : null"
+COUNT_FRAMES = """
+window.gaps = [];
+let before = performance.now();
+const count = (now) => { gaps.push(now - before); before = now; requestAnimationFrame(count); };
+requestAnimationFrame(count);
+"""
+PATH = "page"
+
+
+def run(book: Book, rounds: int, quick: bool) -> None:
+    """Add the figures of all sizes, each with a new browser."""
+    for _ in range(rounds):
+        for size in QUICK_SIZES if quick else SIZES:
+            with world() as machines:
+                measure(book, machines, size, QUICK_WATCHED if quick else WATCHED)
+    book.note("a document is made each second; frames without a graphics card, on these processors")
+
+
+def measure(book: Book, machines: World, size: int, seconds: float) -> None:
+    """Look at one page for a while, and at what is sent to it."""
+
+    def add(row: str, value: float) -> None:
+        book.add(row, PATH, value, size)
+
+    argv = (sys.executable, "-m", "tests.browser.many", str(PORT), str(size))
+    with machines.running("host", *argv) as server:
+        server.wait_for("^serving", timeout=PATIENCE)
+        browser = Browser(machines.places["host"], machines.folder)
+        try:
+            browser.open(f"http://127.0.0.1:{PORT}/")
+            wait_until("there are rows", lambda: browser.run(FIRST_ROWS), PATIENCE)
+            add("first rows, s", browser.run(FIRST_ROWS) / 1000)
+            time.sleep(1)  # what is shown first is laid out
+            browser.run(COUNT_FRAMES)
+            began, used = time.perf_counter(), cpu_seconds(server.pid)
+            time.sleep(seconds)
+            gaps = browser.run("return gaps")
+            took = time.perf_counter() - began
+            add("server's CPU, ms/s", (cpu_seconds(server.pid) - used) / took * 1000)
+            add("frames, 95th percentile, ms", percentile(gaps, 95))
+            add("longest frame, ms", max(gaps))
+        finally:
+            browser.close()
+        with machines.entered("host"):
+            first, changes = events(3)
+            add("whole document, kB", first / 1000)
+            add("changes of a second, kB", median(changes) / 1000)
+            add("making a document, ms", median(costs()) * 1000)
+
+
+def events(count: int) -> tuple[int, list[int]]:
+    """How many bytes the first event has, and so many after it."""
+    connection = http.client.HTTPConnection("127.0.0.1", PORT, timeout=PATIENCE)
+    connection.request("GET", "/events")
+    reply, sizes = connection.getresponse(), list[int]()
+    while len(sizes) <= count:
+        line = reply.readline()
+        if line.startswith(b"data: {"):
+            sizes.append(len(line))
+    connection.close()
+    return sizes[0], sizes[1:]
+
+
+def costs() -> list[float]:
+    """What each document took, in seconds."""
+    connection = http.client.HTTPConnection("127.0.0.1", PORT, timeout=PATIENCE)
+    connection.request("GET", "/cost")
+    took: list[float] = json.loads(connection.getresponse().read())
+    connection.close()
+    return took
