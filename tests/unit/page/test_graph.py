@@ -184,6 +184,24 @@ def test_what_every_node_has_is_quiet() -> None:
     assert "state" not in links["topic /chatter /talker "], "nobody has looked at it"
 
 
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static", "/rosout_agg", "/parameter_events"])
+def test_a_topic_that_nearly_every_node_has_is_quiet(topic: str) -> None:
+    connection = make_connection(name=topic)
+    links = made(None, make_status(make_node(connections=[connection])))["links"]
+    assert links[f"topic {topic} /talker /listener"]["quiet"]
+
+
+def test_a_topic_that_is_copied() -> None:
+    status = make_status(make_node(connections=[make_connection()]))
+    status["data_plane"] = {"mode": "copy", "plane": "copy", "reason": "asked for"}
+    assert made(None, status)["links"][LINK]["carried"] == "copy"
+
+
+def test_the_ports_that_are_used_and_left() -> None:
+    about = made(judged())["proxy"]
+    assert (about["ports"], about["used"], about["free"]) == ("45000-45099", 1, 99)
+
+
 def test_what_the_policy_hides_says_so() -> None:
     status = make_status(make_node())
     status["policy"] = {"hidden": [{"name": "/chatter", "node": "/talker", "reason": "deny it"}]}
