@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from examples.demo.proxy_process import clean_environment
 from tests.browser.webdriver import Browser, Json
 from tests.ros.lab import ADMIN_PORT, Lab
-from tests.ros.processes import wait_until
+from tests.ros.processes import Process, wait_until
 from tests.ros.topology import run_command
 
 UNKNOWN = "\N{EN DASH}"
+MANY_PORT = 21312
+"""Where made-up nodes are shown."""
 URL = f"http://127.0.0.1:{ADMIN_PORT}/"
 ROWS = """
 return [...document.querySelectorAll("#rows tr")].map((row) => ({
@@ -105,6 +111,23 @@ def cut(lab: Lab, port: int) -> Iterator[None]:
         yield
     finally:
         run_command(*enter, "nft", "delete", "table", "ip", "cut")
+
+
+@contextmanager
+def made_up(lab: Lab, browser: Browser, folder: Path, nodes: int) -> Iterator[Process]:
+    """The browser shows so many nodes that are made up; what serves them."""
+    command = [sys.executable, "-m", "tests.browser.many", str(MANY_PORT), str(nodes)]
+    paths = os.pathsep.join(path for path in sys.path if path)
+    environment = clean_environment(PYTHONPATH=paths, PYTHONUNBUFFERED="1")
+    server = Process("many", lab.place("px"), command, environment, folder / "many.log")
+    try:
+        server.wait_for("^serving", timeout=60)
+        browser.open(f"http://127.0.0.1:{MANY_PORT}/")
+        yield server
+        # Away from it first: a page that loses its proxy says so in the console.
+        browser.open("about:blank")
+    finally:
+        server.kill()
 
 
 def play(lab: Lab) -> dict[str, Any]:

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-import os
 import re
 import socket
-import sys
 from pathlib import Path
 
-from examples.demo.proxy_process import clean_environment
 from rosproxy.ros1.protocol.tcpros import encode_header
-from tests.browser.page import CHOOSE, PLACES, UNKNOWN, URL, colour, cut, line, port_of, row, rows
+from tests.browser.page import (
+    CHOOSE,
+    PLACES,
+    UNKNOWN,
+    URL,
+    colour,
+    cut,
+    line,
+    made_up,
+    port_of,
+    row,
+    rows,
+)
 from tests.browser.webdriver import Browser
 from tests.ros.lab import Lab
-from tests.ros.processes import Process, wait_until
+from tests.ros.processes import wait_until
 from tests.ros.topology import OUT_HOST
 
 MOST_ROWS = 400
@@ -26,6 +35,11 @@ def talk(lab: Lab, library: str = "roscpp") -> None:
     lab.node(library, "c1", "pub", name="talker", topic="/chatter", rate=10)
     heard = lab.node(library, "out", "sub", name="listener", topic="/chatter")
     heard.wait_for_count("^got ", 3)
+
+
+def chosen_line(browser: Browser) -> str:
+    """What the page tells of that line once it is chosen."""
+    return str(browser.run(CHOOSE, "/talker", "/listener"))
 
 
 def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
@@ -45,7 +59,11 @@ def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
         ),
         60,
     )
-    assert "last message just now, carried by splice" in browser.run(CHOOSE, "/talker", "/listener")
+    wait_until(
+        "what was chosen tells it, too",
+        lambda: "last message just now, carried by splice" in chosen_line(browser),
+        60,
+    )
     places = browser.run(PLACES)
     assert places["/listener"] < places["rosproxy"] < places["/talker"], "each in its lane"
     used = browser.run("return document.querySelector('#summary').textContent")
@@ -57,7 +75,7 @@ def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
         assert red["colour"] == colour(browser, "broken")
         assert red["label"].startswith("BROKEN: /chatter\n")
         assert f"nc -vz {OUT_HOST} {port}" in red["label"]
-        assert f"nc -vz {OUT_HOST} {port}" in browser.run(CHOOSE, "/talker", "/listener")
+        assert f"nc -vz {OUT_HOST} {port}" in chosen_line(browser)
         told = browser.run("return document.querySelector('#findings').textContent")
         assert f"nc -vz {OUT_HOST} {port}" in told
         assert browser.run("return document.title") == "(1 broken) rosproxy"
@@ -184,14 +202,7 @@ def test_the_keyboard_alone_gets_everywhere(lab: Lab, browser: Browser) -> None:
 
 def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
     """They are made up; what is not shown of them is said, and only changes are sent."""
-    place, port = lab.place("px"), 21312
-    command = [sys.executable, "-m", "tests.browser.many", str(port), "1000"]
-    paths = os.pathsep.join(path for path in sys.path if path)
-    environment = clean_environment(PYTHONPATH=paths, PYTHONUNBUFFERED="1")
-    server = Process("many", place, command, environment, tmp_path / "many.log")
-    try:
-        server.wait_for("^serving", timeout=60)
-        browser.open(f"http://127.0.0.1:{port}/")
+    with made_up(lab, browser, tmp_path, 1000):
         wait_until("there are rows", lambda: len(rows(browser)) == MOST_ROWS, 60)
         told = browser.run("return document.querySelector('#more').textContent")
         assert told == "600 more: narrow it down by a name."
@@ -202,8 +213,6 @@ def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
         browser.run("document.querySelector('#filter').focus()")
         browser.press("node499/")
         wait_until("two are left", lambda: len(rows(browser)) == 2, 60)
-    finally:
-        server.kill()
 
 
 def test_a_screen_reader_finds_it_all(lab: Lab, browser: Browser) -> None:

@@ -1,17 +1,18 @@
 """The live pages of several proxies as one document.
 
 Each proxy has its own nodes inside. Outside is the same for all proxies of one master, so its
-nodes appear once; and what is outside for one proxy may be inside for another. Participants of ROS
-2 are the same wherever they have one name, which is made to be nobody else's. A proxy that can't be
-asked is a node that says why.
+nodes appear once; and what is outside for one proxy may be inside for another. A master on loopback
+is another one on each host. Participants of ROS 2 are the same wherever they have one name, which
+is made to be nobody else's. A proxy that can't be asked is a node that says why.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
+from rosproxy.net.addresses import is_loopback, parse_authority
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
@@ -19,6 +20,7 @@ from rosproxy.page.page_document import (
     MOST_FINDINGS,
     MOST_LINKS,
     MOST_NODES,
+    WARNING,
     Document,
     PageFinding,
     PageLink,
@@ -27,6 +29,8 @@ from rosproxy.page.page_document import (
 
 Json = dict[str, Any]
 PROXY, PARTICIPANT = "proxy", "participant"
+_RANKS = {WARNING: 1, BROKEN: 2}
+"""How bad a state is; others are not."""
 
 
 def read_document(text: str) -> Document:
@@ -37,10 +41,12 @@ def read_document(text: str) -> Document:
         raise ValueError(str(error)) from None
 
 
-def merged(documents: Mapping[str, Document | str], version: str, logs: str) -> Json:
+def merged(
+    documents: Mapping[str, Document | str], version: str, logs: Callable[[str], str]
+) -> Json:
     """One document of those of all proxies, by name; a text says why one can't be asked.
 
-    ``logs`` is the command that shows a proxy's, but for its name.
+    ``logs`` gives the command that shows those of a proxy.
     """
     nodes: dict[str, PageNode] = {}
     links: list[tuple[str, PageLink]] = []
@@ -49,14 +55,17 @@ def merged(documents: Mapping[str, Document | str], version: str, logs: str) -> 
     inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
-            text, fix = f"it can't be asked: {document}", f"{logs} {name}"
-            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, fix)
+            text = f"it can't be asked: {document}"
+            nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, logs(name))
             continue
         names = {key: _key(name, document, key, node) for key, node in document.nodes.items()}
         for key, node in document.nodes.items():
             if node.lane != CONTAINER and names[key] in inside:
                 names[key] = inside[names[key]]  # another proxy tells of it, who knows it better
                 continue
+            known = nodes.get(names[key])
+            if known and _RANKS.get(known.state, 0) > _RANKS.get(node.state, 0):
+                continue  # a proxy before has found more wrong with it
             label = name if node.kind == PROXY else node.label or key
             owner = name if node.lane == CONTAINER else ""
             nodes[names[key]] = replace(node, label=label, proxy=owner)
@@ -100,4 +109,7 @@ def _key(name: str, document: Document, key: str, node: PageNode) -> str:
 def _outside_key(name: str, document: Document, key: str, node: PageNode) -> str:
     if node.kind == PARTICIPANT:
         return key
-    return f"{document.proxy.master or name} {key}"
+    master = document.proxy.master or name
+    address = parse_authority(master)
+    host = f"{document.proxy.host} " if address and is_loopback(address.host) else ""
+    return f"{host}{master} {key}"

@@ -23,7 +23,7 @@ EVERY = 2.0
 Documents = Callable[[], Awaitable[Mapping[str, Document | str]]]
 
 
-def operator_page(documents: Documents, logs: str) -> Page:
+def operator_page(documents: Documents, logs: Callable[[str], str]) -> Page:
     """The page over what ``documents`` asks of the proxies, by their names; ``logs``: `merged`."""
 
     async def make() -> AsyncGenerator[dict[str, Any]]:

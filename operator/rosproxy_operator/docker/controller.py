@@ -87,7 +87,7 @@ async def _run(
 ) -> None:
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics, mistakes=mistakes)
-    page = operator_page(controller.documents, "docker logs")
+    page = operator_page(controller.documents, "docker logs {}".format)
     health = HealthServer(
         metrics.registry, controller.dead, controller.unready, page, controller.status
     )

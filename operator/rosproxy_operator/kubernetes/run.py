@@ -43,6 +43,12 @@ def run(settings: KubernetesSettings) -> None:
     asyncio.run(_run(settings, Api(settings.namespaces)))
 
 
+def logs_command(proxy: str) -> str:
+    """The command that shows the log of a proxy, by the namespace and name of its pod."""
+    namespace, _, pod = proxy.partition("/")
+    return f"kubectl -n {namespace} logs {pod}"
+
+
 def _raise_limit() -> None:
     """Allow as many open files as possible: each proxy takes a connection that waits."""
     _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -64,7 +70,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         )
         server = WebhookServer(settings.webhook.bind, rotation)
         webhook = Injector(api, settings.plan, metrics, controller.wake), server
-    page = operator_page(controller.documents, "kubectl -n NAMESPACE logs")
+    page = operator_page(controller.documents, logs_command)
     unready = _first_reason(controller.unready, *([webhook[1].unready] if webhook else []))
     health = HealthServer(metrics.registry, controller.dead, unready, page)
     await health.start(settings.admin)

@@ -21,6 +21,8 @@ STALLED = 5.0
 """Seconds in which a subscriber has got nothing that was sent to it, until that is told."""
 MISSED = 2
 """Messages that must have been sent meanwhile: one may be under way."""
+LATE_ROUNDS = 2
+"""Rounds of questions after which what a node has counted is no news, if it answers no more."""
 FLOWS = 3.0
 """Seconds after a message in which one is said to come just now."""
 Key = tuple[str, str, str]
@@ -29,12 +31,16 @@ Key = tuple[str, str, str]
 
 @dataclass(slots=True)
 class Counter:
-    """Something that only grows: its ``value`` ``at`` a time, ``rate``, and when it last grew."""
+    """Something that only grows: its ``value`` ``at`` a time, ``rate``, and when it last grew.
+
+    ``every``: seconds between the last two times.
+    """
 
     value: int
     at: float
     rate: float | None = None
     grew: float | None = None
+    every: float = 0.0
 
     def read(self, value: int, at: float) -> None:
         """Take in another value; a smaller one is that of a new connection."""
@@ -43,6 +49,7 @@ class Counter:
         self.rate = (value - self.value) / (at - self.at) if value >= self.value else None
         if value > self.value:
             self.grew = at
+        self.every = at - self.at
         self.value, self.at = value, at
 
 
@@ -90,6 +97,8 @@ class Link:
         counter = self.counters.get("taken") or self.counters.get("given")
         if now - last < FLOWS or counter is None or "relayed" in self.counters:
             return now - last < FLOWS
+        if now - counter.at > LATE_ROUNDS * counter.every + FLOWS:
+            return False
         return counter.grew == counter.at and (counter.rate or 0.0) * FLOWS >= 1.0
 
     def note_progress(self) -> None:

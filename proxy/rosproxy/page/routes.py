@@ -25,7 +25,7 @@ from rosproxy.page.visitors import SESSION, Visitors, cookie_name
 
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 HEARTBEAT = 15.0
-"""Seconds after which something is sent, so that who has gone is noticed."""
+"""Seconds after which something is sent, so that whoever has gone is noticed on either side."""
 FIRST = 10.0
 """Seconds in which the first document must be there."""
 MOST_OF_FORM = 4096
@@ -144,13 +144,12 @@ class Page:
 
     async def _send(self, response: web.StreamResponse) -> None:
         """Raises Ended, and ConnectionError once the browser has gone."""
-        # The page tells how old something is, and the browser's clock may be another.
-        await response.write(f"event: clock\ndata: {time.time():.3f}\n\n".encode())
+        await response.write(_clock_event())
         former: Json | None = None
         while True:
             newest = await self.feed.after(former, HEARTBEAT)
-            # A line that begins with a colon is a comment (HTML standard, server-sent events).
-            await response.write(b":\n\n" if newest is None else self._event(former, newest))
+            # Of a comment, which is shorter, a browser tells the page nothing.
+            await response.write(_clock_event() if newest is None else self._event(former, newest))
             former = newest or former
 
     def _event(self, former: Json | None, newest: Json) -> bytes:
@@ -162,6 +161,11 @@ class Page:
             data = json.dumps(news, separators=(",", ":"))
             self._encoded = cached = (former, newest, f"event: {kind}\ndata: {data}\n\n".encode())
         return cached[2]
+
+
+def _clock_event() -> bytes:
+    """The page tells how old something is, and the browser's clock may be another."""
+    return f"event: clock\ndata: {time.time():.3f}\n\n".encode()
 
 
 async def _send_file(request: web.BaseRequest) -> web.StreamResponse:

@@ -36,7 +36,10 @@ async def opened(proxies: dict[str, tuple[HostPort, str]], client: ProxyClient) 
         return await client.documents(proxies)
 
     return HealthServer(
-        CollectorRegistry(), lambda: None, lambda: None, operator_page(documents, "docker logs")
+        CollectorRegistry(),
+        lambda: None,
+        lambda: None,
+        operator_page(documents, "docker logs {}".format),
     )
 
 

@@ -39,7 +39,7 @@ class RunningOperator:
         async def documents() -> dict[str, Any]:
             return {}
 
-        page = operator_page(documents, "docker logs")
+        page = operator_page(documents, "docker logs {}".format)
         self.server = HealthServer(CollectorRegistry(), lambda: None, lambda: None, page, status)
 
 

@@ -147,7 +147,16 @@ async def test_a_link_comes_flows_and_goes(proxy: Proxy, node: FakeNode) -> None
             assert str(link["port"]) in proxy.uri(node)
         await page.link("topic /chatter /talker ")
         assert page.kinds[:2] == ["clock", "all"]
-        assert set(page.kinds[2:]) == {"change"}
+        assert set(page.kinds[2:]) <= {"change", "clock"}
+
+
+async def test_where_nothing_changes_the_page_hears_that_it_is_connected(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy.page.routes.HEARTBEAT", 0.1)
+    async with opened(proxy) as page:
+        while page.kinds.count("clock") < 3:
+            await page.follow()
 
 
 async def test_hertz_are_those_that_the_node_counts(

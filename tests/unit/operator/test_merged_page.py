@@ -16,6 +16,7 @@ from rosproxy.page.page_document import (
 from rosproxy_operator.common.merged_page import merged, read_document
 
 MASTER = "http://robot:11311"
+LOGS = "docker logs {}".format
 
 
 def shown(name: str, links: int = 1, **changes: Any) -> Document:
@@ -46,7 +47,7 @@ def shown(name: str, links: int = 1, **changes: Any) -> Document:
 
 
 def test_inside_is_apart_and_outside_the_same() -> None:
-    document = merged({"one": shown("a"), "two": shown("b")}, "1.0", "docker logs")
+    document = merged({"one": shown("a"), "two": shown("b")}, "1.0", LOGS)
     nodes = document["nodes"]
     assert {key for key, node in nodes.items() if node["lane"] == "container"} == {
         "one /talker",
@@ -77,7 +78,7 @@ def test_who_is_inside_elsewhere_is_one_box() -> None:
         )
         for name, n in nodes.items()
     }
-    document = merged({**documents, "other": shown("c", proxy={"master": "http://x:1"})}, "1", "")
+    document = merged({**documents, "other": shown("c", proxy={"master": "http://x:1"})}, "1", LOGS)
     boxes = {key: node["lane"] for key, node in document["nodes"].items() if key[:5] != "other"}
     assert boxes == {
         "one /a": "container",
@@ -98,12 +99,36 @@ def test_participants_are_the_same_for_all_proxies() -> None:
                                         | {f"0 {name}": near}, "links": {}}))
         for name in ("one", "two")
     }  # fmt: skip
-    keys = set(merged(documents, "1", "")["nodes"])
+    keys = set(merged(documents, "1", LOGS)["nodes"])
     assert keys == {"one 0 one", "two 0 two", "0 far"}
 
 
+def test_a_master_on_loopback_is_another_one_on_each_host() -> None:
+    local = "http://localhost:11311"
+    documents = {
+        name: shown(name, proxy={"master": local, "host": host})
+        for name, host in (("one", "robot1"), ("two", "robot1"), ("three", "robot2"))
+    }
+    outside = {
+        key
+        for key, node in merged(documents, "1", LOGS)["nodes"].items()
+        if key.endswith("/listener") and node["lane"] == "robot"
+    }
+    assert outside == {f"robot1 {local} /listener", f"robot2 {local} /listener"}
+
+
+@pytest.mark.parametrize("states", [("broken", "ok"), ("ok", "broken"), ("broken", "warning")])
+def test_what_one_proxy_finds_wrong_outside_stays(states: tuple[str, str]) -> None:
+    documents = {
+        state: shown(state, nodes={"/listener": {"lane": "robot", "state": state, "text": state}})
+        for state in states
+    }
+    node = merged(documents, "1", LOGS)["nodes"][f"{MASTER} /listener"]
+    assert (node["state"], node["text"]) == ("broken", "broken")
+
+
 def test_a_proxy_that_cannot_be_asked_says_why() -> None:
-    document = merged({"one": "10.0.0.1:11312 refuses connections"}, "1.0", "docker logs")
+    document = merged({"one": "10.0.0.1:11312 refuses connections"}, "1.0", LOGS)
     node = document["nodes"]["one"]
     assert (node["state"], node["text"], node["fix"]) == (
         BROKEN,
@@ -116,7 +141,7 @@ def test_what_is_broken_stays_where_not_all_fits() -> None:
     node = PageNode("container")
     link = PageLink("topic", "/last", "/talker", state=BROKEN, text="why", fix="what to do")
     wrong = Document({"/talker": node}, {"x": link}, (PageFinding("error", "s", "t", "f"),))
-    document = merged({"many": shown("a", MOST_LINKS), "wrong": wrong}, "1.0", "docker logs")
+    document = merged({"many": shown("a", MOST_LINKS), "wrong": wrong}, "1.0", LOGS)
     assert len(document["links"]) == MOST_LINKS
     assert document["left_out"] == 1
     assert next(iter(document["links"].values()))["fix"] == "what to do"

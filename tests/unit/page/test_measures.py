@@ -125,6 +125,13 @@ def test_where_nodes_alone_count_it_flows_if_it_came_often_between_two_questions
     assert read((1.0, 10, 10), (31.0, 310, 310), (61.0, 310, 310)).get(KEY).flows(90.0) is False
 
 
+def test_what_a_node_counted_that_answers_no_more_is_no_news() -> None:
+    link = read((1.0, 10, 10), (31.0, 310, 310)).get(KEY)
+    assert link.flows(90.0), "a round may take longer than the one before"
+    assert not link.flows(95.0)
+    assert link.last(95.0) == 31.0
+
+
 def test_links_that_are_no_more_are_forgotten() -> None:
     measures = read((1.0, 10, 10), (3.0, 20, 20))
     measures.read_nodes(facts(30, 30, 5.0), [])

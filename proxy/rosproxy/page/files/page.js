@@ -8,15 +8,23 @@ import { age, apply, boxesOf, hertz, labelOf, linesOf, megabytes, positions, vis
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
+const MOST_FINDINGS = 30;
 const MOST_LABELS = 80;
 const LONGEST_CURE = 120;
 const AGAIN = 5000;
+const SILENT = 40000; // the proxy says something every 15 s
+const LOST = "Not connected; what is shown may be old. Trying again…";
 
 const $ = (id) => document.getElementById(id);
 const state = { nodes: new Map(), links: new Map(), proxy: {}, findings: [], left_out: 0 };
 const chosen = { unfolded: new Set(), unfoldAll: false, quiet: false, filter: "" };
 const rows = new Map();
+const findings = new Map();
+const folds = new Map();
+let source = null;
+let heard = 0;
 let drawing = null;
+let lines = new Map(); // those of the graph as it is drawn
 let clock = 0; // how many seconds the proxy's is ahead
 let selected = "";
 let fitted = 0;
@@ -25,23 +33,33 @@ let cy = null;
 // Events
 
 function listen() {
-  const source = new EventSource("events");
-  source.addEventListener("clock", (event) => { clock = Number(event.data) - Date.now() / 1000; });
-  source.addEventListener("all", (event) => {
+  if (source) source.close();
+  const own = source = new EventSource("events");
+  heard = Date.now();
+  const on = (kind, use) => own.addEventListener(kind, (event) => { heard = Date.now(); use(event.data); });
+  on("clock", (data) => { clock = Number(data) - Date.now() / 1000; });
+  on("all", (data) => {
     state.nodes.clear();
     state.links.clear();
-    take(JSON.parse(event.data));
-    $("connection").textContent = "Live";
+    take(JSON.parse(data));
+    put($("connection"), "Live");
   });
-  source.addEventListener("change", (event) => take(JSON.parse(event.data)));
-  source.addEventListener("error", () => {
-    $("connection").textContent = "Not connected; what is shown may be old. Trying again…";
-    if (source.readyState === EventSource.CLOSED) {
-      setTimeout(listen, AGAIN);
+  on("change", (data) => take(JSON.parse(data)));
+  own.addEventListener("error", () => {
+    put($("connection"), LOST);
+    if (own === source && own.readyState === EventSource.CLOSED) {
+      setTimeout(() => { if (own === source) listen(); }, AGAIN);
       // Who is to give the token again sees nothing else than that here.
       fetch("graph").then((answer) => { if (answer.status === 403) location.reload(); }, () => {});
     }
   });
+}
+
+// A connection may be cut off without an end, and a browser waits for one for hours.
+function watch() {
+  if (Date.now() - heard < SILENT) return;
+  put($("connection"), LOST);
+  listen();
 }
 
 function take(news) {
@@ -51,8 +69,9 @@ function take(news) {
   draw();
 }
 
+// By the clock: a page in the background has no frames, but its title is to be seen.
 function draw() {
-  if (drawing === null) drawing = setTimeout(() => { drawing = null; requestAnimationFrame(show); }, AT_MOST_EVERY);
+  if (drawing === null) drawing = setTimeout(() => { drawing = null; show(); }, AT_MOST_EVERY);
 }
 
 // Drawing
@@ -96,19 +115,20 @@ function showFindings() {
     if (node.state === "broken" || node.state === "warning") tell(labelOf(id, node), node.state, node.text || "", node.fix || "");
   }
   const items = [...told.values()].sort((a, b) => (a.kind === "broken" ? 0 : 1) - (b.kind === "broken" ? 0 : 1));
-  const key = JSON.stringify(items);
-  if ($("findings").dataset.key === key) return; // a screen reader would say it again
-  $("findings").dataset.key = key;
-  const shown = items.slice(0, 30).map((item) => {
+  const shown = new Map(items.slice(0, MOST_FINDINGS).map((item) => {
     const more = item.what.length > 3 ? ` and ${item.what.length - 3} more` : "";
-    const li = make("li", "", item.kind);
-    li.append(make("div", `${WORDS[item.kind]}: ${item.what.slice(0, 3).join("; ")}${more}`, "what"));
-    li.append(make("div", item.text));
-    if (item.fix) li.append(make("code", item.fix, "fix"));
+    const what = `${WORDS[item.kind]}: ${item.what.slice(0, 3).join("; ")}${more}`;
+    return [JSON.stringify([item.kind, item.text, item.fix]), [item.kind, what, item.text, item.fix]];
+  }));
+  const rest = items.length - shown.size;
+  if (rest > 0) shown.set("rest", ["", `and ${rest} more`, "", ""]);
+  if (!items.length) shown.set("none", ["none", "Nothing wrong was found.", "", ""]);
+  // A screen reader says what is put in: so what is there already stays.
+  arrange($("findings"), findings, shown, ([kind]) => {
+    const li = make("li", "", kind);
+    li.append(make("div", "", "what"), make("div"), make("code", "", "fix"));
     return li;
-  });
-  if (items.length > shown.length) shown.push(make("li", `and ${items.length - shown.length} more`));
-  $("findings").replaceChildren(...(shown.length ? shown : [make("li", "Nothing wrong was found.", "none")]));
+  }, (li, [, ...texts]) => texts.forEach((text, index) => put(li.children[index], text)));
 }
 
 const HEADS = ["State", "Name", "From", "To", "Carried by", "Port", "Hz", "MB/s", "Last message", "What is wrong"];
@@ -157,9 +177,9 @@ function showGraph(found) {
   const shown = new Set();
   for (const [id, node] of state.nodes) if ((node.kind || "node") !== "node") shown.add(id);
   for (const { link } of found) { shown.add(link.source); if (link.target) shown.add(link.target); }
-  if (!chosen.filter) for (const id of state.nodes.keys()) if (chosen.quiet || id !== "/rosout") shown.add(id);
-  const { boxOf, boxes, folds } = boxesOf(state.nodes, shown, chosen);
-  const lines = linesOf(found, boxOf);
+  if (!chosen.filter) for (const [id, node] of state.nodes) if (chosen.quiet || labelOf(id, node) !== "/rosout") shown.add(id);
+  const { boxOf, boxes, folds: spaces } = boxesOf(state.nodes, shown, chosen);
+  lines = linesOf(found, boxOf);
   const places = positions(boxes);
   const wanted = new Map();
   const now = Date.now() / 1000 + clock;
@@ -191,8 +211,9 @@ function showGraph(found) {
     cy.add(added.filter((one) => one.group === "nodes"));
     cy.add(added.filter((one) => one.group === "edges"));
   });
+  if (selected && cy.getElementById(selected).empty()) selected = "";
   if (fitted !== boxes.size && !selected) { fitted = boxes.size; cy.fit(undefined, 24); }
-  showFolds(folds);
+  showFolds(spaces);
 }
 
 // What stands at a line: what is wrong first with its cure; else what is known of its one link.
@@ -212,18 +233,18 @@ function short(text = "") {
   return text.length > LONGEST_CURE ? `${text.slice(0, LONGEST_CURE)}…` : text;
 }
 
-function showFolds(folds) {
-  const key = JSON.stringify(folds);
-  if ($("folds").dataset.key === key) return;
-  $("folds").dataset.key = key;
-  $("namespaces").hidden = folds.length === 0;
-  $("folds").replaceChildren(...folds.map((fold) => {
-    const button = make("button", `${fold.label} (${fold.count})`);
+function showFolds(spaces) {
+  const sorted = [...spaces].sort((a, b) => (a.key < b.key ? -1 : 1));
+  $("namespaces").hidden = sorted.length === 0;
+  arrange($("folds"), folds, new Map(sorted.map((fold) => [fold.key, fold])), (fold) => {
+    const button = make("button");
     button.type = "button";
-    button.setAttribute("aria-expanded", String(fold.open));
     button.addEventListener("click", () => toggle(fold.key));
     return button;
-  }));
+  }, (button, fold) => {
+    put(button, `${fold.label} (${fold.count})`);
+    if (button.getAttribute("aria-expanded") !== String(fold.open)) button.setAttribute("aria-expanded", String(fold.open));
+  });
 }
 
 function toggle(key) {
@@ -235,10 +256,10 @@ function toggle(key) {
 function showDetails() {
   const element = selected && cy ? cy.getElementById(selected) : null;
   const parts = element && element.nonempty() ? details(element) : [];
-  const key = JSON.stringify(parts);
-  if ($("details").dataset.key === key) return;
-  $("details").dataset.key = key;
-  $("details").replaceChildren(...parts.map(([kind, text]) => make(kind, text)));
+  const kinds = parts.map(([kind]) => kind).join(" ");
+  if ($("details").dataset.kinds !== kinds) $("details").replaceChildren(...parts.map(([kind]) => make(kind)));
+  $("details").dataset.kinds = kinds;
+  parts.forEach(([, text], index) => put($("details").children[index], text));
 }
 
 function details(element) {
@@ -250,8 +271,7 @@ function details(element) {
       ["p", node.text || ""], ["code", node.fix || ""]].filter(([, text]) => text);
   }
   const ends = [element.source().id(), element.target().id()];
-  const { boxOf } = boxesOf(state.nodes, new Set(state.nodes.keys()), chosen);
-  const line = linesOf(visibleLinks(state.links, state.nodes, chosen), boxOf).get(element.id());
+  const line = lines.get(element.id());
   const now = Date.now() / 1000 + clock;
   const parts = [["h3", ends.map((id) => cy.getElementById(id).data("label")).join(" to ")]];
   for (const { link } of (line ? line.links : []).slice(0, 20)) {
@@ -276,7 +296,7 @@ function style() {
     { selector: "node[kind = 'fold']", style: { "border-style": "double", "border-width": 4 } },
     { selector: "node[kind = 'proxy'], node[kind = 'master']", style: { shape: "hexagon" } },
     { selector: "edge", style: { width: 2, "curve-style": "straight", "target-arrow-shape": "triangle", "arrow-scale": 0.8,
-      "source-label": "data(label)", "source-text-offset": 78, "source-text-rotation": "autorotate",
+      "source-label": "data(label)", "source-text-offset": 122, "source-text-rotation": "autorotate",
       "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-max-width": 230, "text-background-color": colour("box"),
       "text-background-opacity": 0.85, "text-background-padding": 2, "min-zoomed-font-size": 6 } },
     { selector: "edge[same = 'yes']", style: { "curve-style": "unbundled-bezier", "control-point-distances": 110, "control-point-weights": 0.5 } },
@@ -299,7 +319,7 @@ function start() {
   $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; fitted = 0; draw(); });
   $("quiet").addEventListener("change", (event) => { chosen.quiet = event.target.checked; fitted = 0; draw(); });
   $("unfold").addEventListener("change", (event) => { chosen.unfoldAll = event.target.checked; fitted = 0; draw(); });
-  setInterval(draw, 1000); // ages grow
+  setInterval(() => { draw(); watch(); }, 1000); // ages grow
   // For tests, and whoever looks into it: the graph itself.
   window.rosproxyPage = { cy, state };
   listen();
@@ -310,6 +330,19 @@ function make(tag, text = "", name = "") {
   if (text) element.textContent = text;
   if (name) element.className = name;
   return element;
+}
+
+// Elements in this order, one for each key: what is there stays, with the focus or what is marked.
+function arrange(parent, elements, wanted, create, update) {
+  for (const [key, element] of elements) if (!wanted.has(key)) { element.remove(); elements.delete(key); }
+  let place = parent.firstChild;
+  for (const [key, one] of wanted) {
+    if (!elements.has(key)) elements.set(key, create(one));
+    const element = elements.get(key);
+    update(element, one);
+    if (element === place) place = place.nextSibling;
+    else parent.insertBefore(element, place);
+  }
 }
 
 function put(element, text) {

@@ -44,7 +44,9 @@ export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
     if (!shown.has(id)) continue;
     const space = node.kind === "node" || !node.kind ? namespaceOf(labelOf(id, node)) : "";
     const key = space ? `${node.lane} ${node.proxy || ""} ${space}` : "";
-    if (key) members.set(key, [...(members.get(key) || []), id]);
+    if (!key) continue;
+    if (!members.has(key)) members.set(key, { space, ids: [] });
+    members.get(key).ids.push(id);
   }
   const boxOf = new Map();
   const boxes = new Map();
@@ -53,10 +55,10 @@ export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
     if (node) boxOf.set(id, `n:${id}`);
   }
   const folds = [];
-  for (const [key, ids] of members) {
+  for (const [key, { space, ids }] of members) {
     if (ids.length < 2) continue;
     const open = unfoldAll || unfolded.has(key);
-    folds.push({ key, open, label: key.split(" ").pop(), count: ids.length });
+    folds.push({ key, open, label: space, count: ids.length });
     if (!open) for (const id of ids) boxOf.set(id, `f:${key}`);
   }
   for (const [id, box] of boxOf) {
@@ -69,7 +71,7 @@ export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
       continue;
     }
     const fold = box.startsWith("f:") ? box.slice(2) : "";
-    const label = fold ? fold.split(" ").pop() : labelOf(id, node);
+    const label = fold ? members.get(fold).space : labelOf(id, node);
     boxes.set(box, { id: box, fold, node: id, label, lane: node.lane, state, count: 1,
       kind: node.kind || "node" });
   }
@@ -83,7 +85,7 @@ export function linesOf(found, boxOf) {
     const from = boxOf.get(one.link.source);
     const to = one.link.target ? boxOf.get(one.link.target) : undefined;
     if (!from || !to || from === to) continue;
-    const id = `l:${from}>${to}`;
+    const id = `l:${JSON.stringify([from, to])}`;
     const state = one.link.state || "unknown";
     const line = lines.get(id);
     if (!line) {

@@ -18,6 +18,7 @@ from rosproxy_operator.kubernetes.proxies.proxy_sync import ClusterProxySync, to
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod
 from rosproxy_operator.kubernetes.resources.names import token_of
 from rosproxy_operator.kubernetes.resources.objects import proxy_pod
+from rosproxy_operator.kubernetes.run import logs_command
 from tests.unit.operator.kubernetes.api_server import until
 from tests.unit.operator.kubernetes.builders_api import proxy_obj
 
@@ -491,6 +492,8 @@ async def test_where_the_live_page_asks_each_proxy_and_with_which_token(talk: Ta
     talk.all.follow([proxy()], KEY)
     ((name, way),) = talk.all.admin_endpoints.items()
     assert name == str(proxy().pod.id)
+    id_ = proxy().pod.id
+    assert logs_command(name) == f"kubectl -n {id_.namespace} logs {id_.name}"
     assert way == (HostPort("10.244.1.7", 11312), token_for(proxy(), KEY))
     talk.all.follow([], KEY)
     assert not talk.all.admin_endpoints

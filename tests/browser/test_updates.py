@@ -1,0 +1,158 @@
+"""What stays while the live page follows: the focus, what is chosen, what is said, the connection.
+
+The nodes are made up (`tests.browser.many`).
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.browser.page import CHOOSE, made_up, rows
+from tests.browser.webdriver import Browser, Json
+from tests.ros.lab import Lab
+from tests.ros.processes import Process, wait_until
+
+DETAILS = "return document.querySelector('#details').textContent"
+CONNECTION = "return document.querySelector('#connection').textContent"
+FOCUS = """
+const one = document.activeElement;
+return [one.textContent, one.getAttribute("aria-expanded")];
+"""
+BREAK = """
+const { state } = window.rosproxyPage;
+const link = [...state.links].find(([, one]) => one.name === arguments[0])[1];
+Object.assign(link, { state: "broken", text: `${link.name} is cut`, fix: arguments[1] });
+"""
+COVERED = """
+const { cy } = window.rosproxyPage;
+const [line] = cy.edges("[state = 'broken']").toArray();
+if (!line) return null;
+const text = line.boundingBox({ includeNodes: false, includeEdges: false, includeMainLabels: false,
+  includeTargetLabels: false, includeOverlays: false });
+const box = line.source().boundingBox({ includeLabels: false, includeOverlays: false });
+return { width: text.w, within: text.x2 > box.x1 };
+"""
+FINDINGS = """
+return [...document.querySelectorAll("#findings li")].map((one) => [
+  one.querySelector(".what")?.textContent, one.querySelector(".fix")?.textContent,
+  one.seen || false]);
+"""
+MARK = "document.querySelectorAll(arguments[0]).forEach((one) => { one.seen = true; });"
+SEEN = "return [...document.querySelectorAll(arguments[0])].every((one) => one.seen);"
+
+
+@pytest.fixture
+def server(lab: Lab, browser: Browser, tmp_path: Path) -> Iterator[Process]:
+    """The page of some nodes, in namespaces of two or three."""
+    with made_up(lab, browser, tmp_path, 100) as server:
+        wait_until("there are rows", lambda: len(rows(browser)) == 100)
+        yield server
+
+
+@contextmanager
+def stopped(server: Process) -> Iterator[None]:
+    """It does nothing, and its connections stand."""
+    os.kill(server.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(server.pid, signal.SIGCONT)
+
+
+def rates(browser: Browser) -> list[str]:
+    return [page_row["MB/s"] for page_row in rows(browser)]
+
+
+@pytest.mark.usefixtures("server")
+def test_a_namespace_keeps_the_focus(browser: Browser) -> None:
+    browser.run("document.querySelector('#namespaces').open = true")
+    browser.run("document.querySelector('#folds button').focus()")
+    label, expanded = browser.run(FOCUS)
+    assert (label, expanded) == ("/group0 (3)", "false")
+    browser.press("\ue007")
+    assert browser.run(FOCUS) == [label, "true"]
+    browser.press("\ue007")
+    assert browser.run(FOCUS) == [label, "false"]
+
+
+@pytest.mark.usefixtures("server")
+def test_what_is_chosen_is_told_where_the_rest_is_hidden(browser: Browser) -> None:
+    """Alone of its namespace it has a box of its own; and what is marked in the text stays so."""
+    browser.run("document.querySelector('#filter').focus()")
+    browser.press("node3/")
+    wait_until("two are left", lambda: len(rows(browser)) == 2)
+    told = "/group3/node3/topic0"
+    wait_until("it is drawn", lambda: told in browser.run(CHOOSE, "/group3/node3", "/outside3"), 20)
+    browser.run(MARK, "#details *")
+    before = browser.run(DETAILS)
+    wait_until("rates follow", lambda: browser.run(DETAILS) != before)
+    assert browser.run(SEEN, "#details *")
+
+
+@pytest.mark.usefixtures("server")
+def test_what_is_chosen_and_goes_is_chosen_no_more(browser: Browser) -> None:
+    browser.run("document.querySelector('#filter').focus()")
+    browser.press("node3/")
+    wait_until("it is drawn", lambda: browser.run(CHOOSE, "/group3/node3", "/outside3"), 20)
+    browser.press("x")
+    wait_until("it is gone", lambda: not browser.run(DETAILS))
+    browser.press("\ue003")
+    wait_until("it is back", lambda: len(rows(browser)) == 2)
+    assert not browser.run(DETAILS)
+
+
+def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Process) -> None:
+    def found(*wanted: str) -> bool:
+        told = [(what, fix) for what, fix, _ in browser.run(FINDINGS)]
+        return told == [(f"BROKEN: {what}", "mend it") for what in wanted]
+
+    first = "/group0/node0/topic0 from /group0/node0 to /outside0"
+    second = "/group1/node1/topic0 from /group1/node1 to /outside1"
+    with stopped(server):  # it would send the links anew, as they are there
+        browser.run(BREAK, "/group0/node0/topic0", "mend it")
+        wait_until("the first is told", lambda: found(first))
+        browser.run(MARK, "#findings li")
+        browser.run(BREAK, "/group1/node1/topic0", "mend it")
+        wait_until("both are told", lambda: found(first, second))
+        assert [seen for _, _, seen in browser.run(FINDINGS)] == [True, False]
+
+
+def test_no_box_covers_a_cure(browser: Browser, server: Process) -> None:
+    cure = "on the machine of /outside4: nc -vz 192.168.100.100 45001; a firewall or what not"
+    seen: list[Json] = []
+
+    def is_drawn() -> bool:
+        found = browser.run(COVERED)
+        seen.extend([found] if found else [])
+        return bool(seen)
+
+    with stopped(server):
+        browser.run(BREAK, "/group4/node4/topic0", cure)
+        wait_until("it is drawn", is_drawn)
+    assert seen[0]["width"] > 150
+    assert not seen[0]["within"]
+
+
+@pytest.mark.usefixtures("server")
+def test_a_page_in_the_background_follows(browser: Browser) -> None:
+    """It gets no frames, and what it is to draw does not queue up for the next one."""
+    browser.run("window.requestAnimationFrame = () => 0")
+    before = rates(browser)
+    wait_until("rates follow", lambda: rates(browser) != before)
+
+
+def test_a_connection_that_is_silent_is_made_anew(browser: Browser, server: Process) -> None:
+    """Cut off without an end: to the browser it seems open."""
+    assert browser.run(CONNECTION) == "Live"
+    with stopped(server):
+        browser.run("const now = Date.now; Date.now = () => now() + 60000")
+        wait_until("it says so", lambda: browser.run(CONNECTION).startswith("Not connected"))
+    wait_until("it is back", lambda: browser.run(CONNECTION) == "Live")
+    before = rates(browser)
+    wait_until("rates follow", lambda: rates(browser) != before)
