@@ -18,13 +18,12 @@ from rosproxy.page.page_document import (
     CONTAINER,
     HOST,
     MOST_FINDINGS,
-    MOST_LINKS,
-    MOST_NODES,
     WARNING,
     Document,
     PageFinding,
     PageLink,
     PageNode,
+    within_bounds,
 )
 
 Json = dict[str, Any]
@@ -49,7 +48,7 @@ def merged(
     ``logs`` gives the command that shows those of a proxy.
     """
     nodes: dict[str, PageNode] = {}
-    links: list[tuple[str, PageLink]] = []
+    links: dict[str, PageLink] = {}
     findings: list[PageFinding] = []
     left_out = 0
     inside = _inside(documents)
@@ -72,17 +71,15 @@ def merged(
         for link in document.links.values():
             if link.source in names and (not link.target or link.target in names):
                 target = names.get(link.target, "")
-                links.append((name, replace(link, source=names[link.source], target=target)))
+                named = replace(link, source=names[link.source], target=target)
+                links[f"{name} {named.key}"] = named
         findings += (replace(f, subject=f"{name}: {f.subject}") for f in document.findings)
         left_out += document.left_out
-    # Beyond MOST_LINKS the last are left out: links that are broken are the first to be shown.
-    links.sort(key=lambda proxy_link: (proxy_link[1].state != BROKEN, proxy_link[1].quiet))
-    shown = dict(list(nodes.items())[:MOST_NODES])
-    kept = [proxy_link for proxy_link in links if proxy_link[1].source in shown][:MOST_LINKS]
+    shown, kept = within_bounds(nodes, links)
     return {
         "proxy": {"host": f"{len(documents)} proxies", "version": version},
         "nodes": msgspec.to_builtins(shown),
-        "links": {f"{name} {link.key}": msgspec.to_builtins(link) for name, link in kept},
+        "links": msgspec.to_builtins(kept),
         "findings": msgspec.to_builtins(findings[:MOST_FINDINGS]),
         "left_out": left_out + len(nodes) - len(shown) + len(links) - len(kept),
     }

@@ -40,7 +40,6 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
     """The participants of all domains, and the links between them."""
     nodes: dict[str, PageNode] = {}
     links: list[PageLink] = []
-    both_ways = status.settings.direction == "both"
     for domain in status.domains:
         problems = {problem.subject: problem for problem in domain_problems(domain)}
         for side in (domain.inside, domain.outside):
@@ -49,7 +48,7 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
                     participant, side is domain.inside, problems.get(participant.guid_prefix)
                 )
                 nodes[_key(domain, participant)] = node
-        links += _links(domain, problems, "" if both_ways else "direct")
+        links += _links(domain, problems, "" if domain.direction == "both" else "direct")
     return nodes, links
 
 

@@ -4,7 +4,8 @@ Both versions of ROS and both operators make such a document; the page knows no 
 what nodes call themselves and things, shortened, and harmless only as text.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import islice
 from typing import Any
 
 import msgspec
@@ -85,26 +86,37 @@ def document(
     findings: Iterable[DoctorFinding],
     left_out: int = 0,
 ) -> Json:
-    """All of it within bounds; what is broken, and what is not quiet, comes first.
-
-    ``left_out``: how many links are not even among these.
-    """
-    order = sorted(links, key=lambda link: (link.state != BROKEN, link.quiet, link.key))
+    """All of it within bounds; ``left_out``: how many links are not even among these."""
+    by_key = {link.key: link for link in links}
     worst = [f for f in findings if f.severity >= Severity.WARNING]
     worst.sort(key=lambda f: -f.severity)
-    shown_nodes = dict(list(nodes.items())[:MOST_NODES])
-    shown = [
-        link
-        for link in order
-        if link.source in shown_nodes and (not link.target or link.target in shown_nodes)
-    ][:MOST_LINKS]
+    shown_nodes, shown = within_bounds(nodes, by_key)
     return {
         "proxy": proxy,
         "nodes": {key: _plain(node) for key, node in shown_nodes.items()},
-        "links": {link.key: _plain(link) for link in shown},
+        "links": {key: _plain(link) for key, link in shown.items()},
         "findings": [_finding(f) for f in worst[:MOST_FINDINGS]],
-        "left_out": left_out + len(nodes) - len(shown_nodes) + len(order) - len(shown),
+        "left_out": left_out + len(nodes) - len(shown_nodes) + len(by_key) - len(shown),
     }
+
+
+def within_bounds(
+    nodes: Mapping[str, PageNode], links: Mapping[str, PageLink]
+) -> tuple[dict[str, PageNode], dict[str, PageLink]]:
+    """As many nodes and links as are shown: first what is broken, then what is not quiet."""
+    order = sorted(links, key=lambda key: (links[key].state != BROKEN, links[key].quiet, key))
+    broken = [links[key] for key in order if links[key].state == BROKEN]
+    important = {end for link in broken for end in (link.source, link.target)}
+    important |= {key for key, node in nodes.items() if node.state == BROKEN}
+    first = (
+        sorted(nodes, key=lambda key: key not in important) if len(nodes) > MOST_NODES else nodes
+    )
+    shown_nodes = {key: nodes[key] for key in islice(first, MOST_NODES)}
+    targets = {"", *shown_nodes}
+    complete = (
+        key for key in order if links[key].source in shown_nodes and links[key].target in targets
+    )
+    return shown_nodes, {key: links[key] for key in islice(complete, MOST_LINKS)}
 
 
 class PageFinding(msgspec.Struct, frozen=True):

@@ -26,12 +26,11 @@ OUTSIDE = ParticipantStatus(
 LINK = "topic /chatter 0 01.10.bb 0 01.0f.aa"
 
 
-def made(direction: str = "out", /, **changes: Any) -> dict[str, Any]:
+def made(**changes: Any) -> dict[str, Any]:
     domain = DomainStatus(
         **{"peers": ("robot",), "inside": (INSIDE,), "outside": (OUTSIDE,), **changes}
     )
-    settings = StatusSettings(ros=("2",), direction=direction)
-    status = ProxyStatus(settings=settings, domains=(domain,))
+    status = ProxyStatus(settings=StatusSettings(ros=("2",)), domains=(domain,))
     return graph_document(status, None, Measures(), (), 0.0, 0.0)
 
 
@@ -101,7 +100,7 @@ def test_what_goes_outwards_by_itself_is_carried_directly(
 ) -> None:
     talker = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS", publishes=("/chatter",))
     listener = ParticipantStatus("01.10.bb", "10.0.0.9", "Fast DDS", subscribes=("/chatter",))
-    document = made(direction, inside=(talker,), outside=(listener,))
+    document = made(direction=direction, inside=(talker,), outside=(listener,))
     assert document["links"]["topic /chatter 0 01.0f.aa 0 01.10.bb"].get("carried") == carried
 
 

@@ -16,7 +16,14 @@ from rosproxy.page.graph_document import (
     topics_to_ask_about,
 )
 from rosproxy.page.measures import Measures
-from rosproxy.page.page_document import LONGEST, MOST_LINKS
+from rosproxy.page.page_document import (
+    LONGEST,
+    MOST_LINKS,
+    MOST_NODES,
+    PageLink,
+    PageNode,
+    document,
+)
 from tests.unit.doctor.cases import INSIDE_URI, by_name, listener, make_facts, talker
 from tests.unit.status_json import make_connection, make_node, make_status
 
@@ -268,3 +275,18 @@ def test_a_large_graph_is_cut_and_what_is_broken_stays() -> None:
     assert len(document["links"]) <= MOST_LINKS
     assert document["left_out"] >= 80 * 80
     assert document["links"][LINK]["state"] == "broken"
+
+
+def test_of_too_many_nodes_the_broken_ones_stay() -> None:
+    """The last of them had the one broken link, which was not shown."""
+    nodes = {f"/n{number}": PageNode("robot") for number in range(MOST_NODES + 9)}
+    last, ill = f"/n{MOST_NODES + 8}", f"/n{MOST_NODES + 7}"
+    nodes[ill] = PageNode("container", state="broken")
+    link = PageLink("topic", "/chatter", "/n0", last, state="broken")
+    made = document({}, nodes, [link], ())
+    assert len(made["nodes"]) == MOST_NODES
+    assert {"/n0", last, ill} <= made["nodes"].keys()
+    assert list(made["links"]) == [link.key]
+    assert made["left_out"] == 9
+    ends_elsewhere = PageLink("topic", "/chatter", "/n0", "/nobody")
+    assert document({}, nodes, [ends_elsewhere], ())["links"] == {}

@@ -45,7 +45,9 @@ export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
     const space = node.kind === "node" || !node.kind ? namespaceOf(labelOf(id, node)) : "";
     const key = space ? `${node.lane} ${node.proxy || ""} ${space}` : "";
     if (!key) continue;
-    if (!members.has(key)) members.set(key, { space, ids: [] });
+    // Robots often have the same names: of several proxies each box says whose it is.
+    const label = node.proxy ? `${space} (${node.proxy})` : space;
+    if (!members.has(key)) members.set(key, { label, ids: [] });
     members.get(key).ids.push(id);
   }
   const boxOf = new Map();
@@ -55,10 +57,10 @@ export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
     if (node) boxOf.set(id, `n:${id}`);
   }
   const folds = [];
-  for (const [key, { space, ids }] of members) {
+  for (const [key, { label, ids }] of members) {
     if (ids.length < 2) continue;
     const open = unfoldAll || unfolded.has(key);
-    folds.push({ key, open, label: space, count: ids.length });
+    folds.push({ key, open, label, count: ids.length });
     if (!open) for (const id of ids) boxOf.set(id, `f:${key}`);
   }
   for (const [id, box] of boxOf) {
@@ -71,7 +73,7 @@ export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
       continue;
     }
     const fold = box.startsWith("f:") ? box.slice(2) : "";
-    const label = fold ? members.get(fold).space : labelOf(id, node);
+    const label = fold ? members.get(fold).label : labelOf(id, node);
     boxes.set(box, { id: box, fold, node: id, label, lane: node.lane, state, count: 1,
       kind: node.kind || "node" });
   }
