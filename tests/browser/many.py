@@ -2,9 +2,9 @@
 
 python -m tests.browser.many PORT NODES
 
-Half of the nodes are inside, each with two topics that two of the others hear; the rate of each
-differs every second. What serves it is the proxy's own page; ``/cost`` tells in seconds what each
-document took.
+Half of the nodes are inside; each publishes two topics, one for each of two nodes outside. The rate
+of each topic differs every second. What serves it is the proxy's own page; ``/cost`` tells in
+seconds what each document took.
 """
 
 from __future__ import annotations

@@ -27,6 +27,10 @@ return [...document.querySelectorAll("#rows tr")].map((row) => ({
   text: row.lastChild.firstChild.textContent, fix: row.lastChild.lastChild.textContent,
   colour: getComputedStyle(row.cells[0]).color }));
 """
+NODES = """
+return [...document.querySelectorAll("#node-rows tr")].map((row) =>
+  [...row.cells].map((cell) => cell.textContent));
+"""
 LINE = """
 const { cy } = window.rosproxyPage;
 const ends = arguments.length ? [...arguments] : [];
@@ -133,12 +137,12 @@ def made_up(lab: Lab, browser: Browser, folder: Path, nodes: int) -> Iterator[Pr
 def play(lab: Lab) -> dict[str, Any]:
     """Some nodes as a robot has them, on all machines; the names of those that matter."""
     start = lab.node
-    start("roscpp", "c1", "pub", name="detector", topic="/objects", rate=10)
+    start("roscpp", "c1", "pub", name="recognizer", topic="/objects", rate=10)
     start("roscpp", "c1", "sub", name="viewer", topic="/camera/image")
     start("roscpp", "c2", "pub", name="planner", topic="/plan", rate=5, size=2000)
     start("roscpp", "out", "pub", name="camera", topic="/camera/image", rate=20, size=30000)
     start("roscpp", "out", "sub", name="arm", topic="/plan")
     start("roscpp", "out", "sub", name="logger", topic="/objects")
-    for name in ("detector", "viewer", "planner", "camera", "arm", "logger"):
+    for name in ("recognizer", "viewer", "planner", "camera", "arm", "logger"):
         lab.wait_registered(name)
     return {"port": port_of(lab, "planner")}

@@ -6,9 +6,12 @@ import re
 import socket
 from pathlib import Path
 
+import pytest
+
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.browser.page import (
     CHOOSE,
+    NODES,
     PLACES,
     UNKNOWN,
     URL,
@@ -196,8 +199,7 @@ def test_the_keyboard_alone_gets_everywhere(lab: Lab, browser: Browser) -> None:
     for _ in range(6):
         browser.press("\ue004")
         visited.append(browser.run(focus))
-    assert visited[:4] == ["skip", "filter", "quiet", "unfold"]
-    assert "scroll" in visited, "the table"
+    assert visited == ["skip", "filter", "quiet", "unfold", "scroll", "scroll"], "with both tables"
 
 
 def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
@@ -215,16 +217,35 @@ def test_a_thousand_nodes(lab: Lab, browser: Browser, tmp_path: Path) -> None:
         wait_until("two are left", lambda: len(rows(browser)) == 2, 60)
 
 
-def test_a_screen_reader_finds_it_all(lab: Lab, browser: Browser) -> None:
+@pytest.mark.parametrize("width", [1200, 360])
+def test_a_screen_reader_finds_it_all(lab: Lab, browser: Browser, width: int) -> None:
     talk(lab)
+    browser.resize(width, 740)
     browser.open(URL)
     row(browser, "/chatter", State="ok", To="/listener")
     nodes = browser.devtools("Accessibility.getFullAXTree")["nodes"]
     told = {(node["role"]["value"], node.get("name", {}).get("value", "")) for node in nodes}
     roles = {role for role, _ in told}
-    assert {"table", "columnheader", "status", "searchbox", "checkbox", "heading"} <= roles
-    assert ("cell", "/chatter") in told
+    assert {"table", "row", "status", "searchbox", "checkbox", "heading"} <= roles
+    assert {("columnheader", "Carried by"), ("columnheader", "Ports")} <= told
+    assert {("cell", "/chatter"), ("cell", "container, inside")} <= told
     unnamed = {
         role for role, name in told if role in ("button", "searchbox", "checkbox") and not name
     }
     assert not unnamed
+
+
+def test_nodes_with_their_addresses_and_ports(lab: Lab, browser: Browser) -> None:
+    talk(lab)
+    browser.open(URL)
+    row(browser, "/chatter", State="ok", To="/listener")
+    nodes = {cells[1]: cells for cells in browser.run(NODES)}
+    state, _, where, address, ports, *_ = nodes["/talker"]
+    assert (state, where) == ("ok", "container, inside")
+    assert re.match(r"[\d.]+:\d+$", address)
+    assert str(port_of(lab, "talker")) in ports
+    assert nodes["/listener"][2] == "robot, outside"
+    assert "/rosout" not in nodes
+    browser.run("document.querySelector('#filter').focus()")
+    browser.press("talk")
+    wait_until("one is left", lambda: [cells[1] for cells in browser.run(NODES)] == ["/talker"])

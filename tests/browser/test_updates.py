@@ -43,6 +43,8 @@ return [...document.querySelectorAll("#findings li")].map((one) => [
   one.querySelector(".what")?.textContent, one.querySelector(".fix")?.textContent,
   one.seen || false]);
 """
+WIDEST = 260
+"""The widest text at a line, with its margins."""
 MARK = "document.querySelectorAll(arguments[0]).forEach((one) => { one.seen = true; });"
 SEEN = "return [...document.querySelectorAll(arguments[0])].every((one) => one.seen);"
 
@@ -123,8 +125,14 @@ def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Pro
         assert [seen for _, _, seen in browser.run(FINDINGS)] == [True, False]
 
 
-def test_no_box_covers_a_cure(browser: Browser, server: Process) -> None:
-    cure = "on the machine of /outside4: nc -vz 192.168.100.100 45001; a firewall or what not"
+@pytest.mark.parametrize(
+    "cure",
+    [
+        "on the machine of /outside4: nc -vz 192.168.100.100 45001; a firewall or what not",
+        "/a_name_without_a_blank" * 5,
+    ],
+)
+def test_no_box_covers_a_cure(browser: Browser, server: Process, cure: str) -> None:
     seen: list[Json] = []
 
     def is_drawn() -> bool:
@@ -135,7 +143,7 @@ def test_no_box_covers_a_cure(browser: Browser, server: Process) -> None:
     with stopped(server):
         browser.run(BREAK, "/group4/node4/topic0", cure)
         wait_until("it is drawn", is_drawn)
-    assert seen[0]["width"] > 150
+    assert 150 < seen[0]["width"] < WIDEST
     assert not seen[0]["within"]
 
 

@@ -3,8 +3,8 @@
 // All that comes from nodes goes through textContent, or is painted on a canvas; nothing is parsed.
 // However many changes come, it is drawn twice a second at most, and only what differs is touched.
 
-import { age, apply, boxesOf, hertz, labelOf, linesOf, megabytes, positions, visibleLinks, WORDS }
-  from "./view.js";
+import { age, apply, boxesOf, hertz, labelOf, linesOf, megabytes, positions, visibleLinks, visibleNodes,
+  WORDS } from "./view.js";
 
 const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
@@ -19,6 +19,7 @@ const $ = (id) => document.getElementById(id);
 const state = { nodes: new Map(), links: new Map(), proxy: {}, findings: [], left_out: 0 };
 const chosen = { unfolded: new Set(), unfoldAll: false, quiet: false, filter: "" };
 const rows = new Map();
+const nodeRows = new Map();
 const findings = new Map();
 const folds = new Map();
 let source = null;
@@ -80,7 +81,8 @@ function show() {
   const found = visibleLinks(state.links, state.nodes, chosen);
   showHead(found);
   showFindings();
-  showTable(found);
+  showLinks(found);
+  showNodes();
   showGraph(found);
   showDetails();
 }
@@ -131,45 +133,64 @@ function showFindings() {
   }, (li, [, ...texts]) => texts.forEach((text, index) => put(li.children[index], text)));
 }
 
-const HEADS = ["State", "Name", "From", "To", "Carried by", "Port", "Hz", "MB/s", "Last message", "What is wrong"];
-const NUMBERS = new Set([5, 6, 7, 8]);
+const LINK_HEADS = ["State", "Name", "From", "To", "Carried by", "Port", "Hz", "MB/s", "Last message", "What is wrong"];
+const NODE_HEADS = ["State", "Name", "Where", "Address", "Ports", "MB/s", "What is wrong"];
+const NUMBERS = new Set(["Port", "Hz", "MB/s", "Last message"]);
+const PLACES = { robot: "robot, outside", host: "host", container: "container, inside" };
 
-function showTable(found) {
+function showLinks(found) {
   const now = Date.now() / 1000 + clock;
   const listed = found.slice(0, MOST_ROWS);
-  const wanted = new Set(listed.map((one) => one.id));
-  for (const [id, row] of rows) if (!wanted.has(id)) { row.remove(); rows.delete(id); }
-  let before = null;
-  for (const { id, link, from, to } of listed) {
-    let row = rows.get(id);
-    if (!row) {
-      row = make("tr");
-      HEADS.forEach((head, index) => {
-        const cell = make("td", "", index === 0 ? "state" : NUMBERS.has(index) ? "number" : "");
-        cell.dataset.head = head;
-        row.append(cell);
-      });
-      row.lastChild.append(make("span"), make("code", "", "fix"));
-      rows.set(id, row);
-    }
-    const state = link.state || "unknown";
+  showRows($("rows"), rows, LINK_HEADS, listed.map(({ id, link, from, to }) => {
     const kind = link.kind === "topic" ? "" : ` (${link.kind})`;
-    [WORDS[state], link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
-      hertz(link), megabytes(link), age(link, now)].forEach((text, index) => put(row.cells[index], String(text)));
-    if (row.dataset.state !== state) {
-      row.dataset.state = state;
-      row.cells[0].className = `state ${state}`;
+    return { id, one: link, texts: [link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
+      hertz(link), megabytes(link), age(link, now)] };
+  }));
+  put($("more"), [tellRest(found.length - listed.length),
+    state.left_out ? `${state.left_out} more are not sent to the page.` : ""].filter(Boolean).join(" "));
+}
+
+function showNodes() {
+  const found = visibleNodes(state.nodes, chosen);
+  const listed = found.slice(0, MOST_ROWS);
+  showRows($("node-rows"), nodeRows, NODE_HEADS, listed.map(({ id, node, label }) => {
+    const kind = (node.kind || "node") === "node" ? "" : ` (${node.kind})`;
+    const where = PLACES[node.lane] + (node.proxy ? ` of ${node.proxy}` : "");
+    return { id, one: node, texts: [label + kind, where, node.address || "–", node.ports || "–", megabytes(node)] };
+  }));
+  put($("more-nodes"), tellRest(found.length - listed.length));
+}
+
+function tellRest(count) {
+  return count > 0 ? `${count} more: narrow it down by a name.` : "";
+}
+
+// The rows of a table, in this order: each with its state first, and with what is wrong last.
+function showRows(body, elements, heads, listed) {
+  arrange(body, elements, new Map(listed.map((row) => [row.id, row])), () => makeRow(heads), (row, { one, texts }) => {
+    const kind = one.state || "unknown";
+    [WORDS[kind], ...texts].forEach((text, index) => put(row.cells[index], String(text)));
+    if (row.dataset.state !== kind) {
+      row.dataset.state = kind;
+      row.cells[0].className = `state ${kind}`;
     }
-    put(row.lastChild.firstChild, link.text || "");
-    put(row.lastChild.lastChild, link.fix || "");
-    const place = before ? before.nextSibling : $("rows").firstChild;
-    if (place !== row) $("rows").insertBefore(row, place);
-    before = row;
-  }
-  const hidden = found.length - listed.length;
-  const parts = [hidden > 0 ? `${hidden} more: narrow it down by a name.` : "",
-    state.left_out ? `${state.left_out} more are not sent to the page.` : ""];
-  put($("more"), parts.filter(Boolean).join(" "));
+    put(row.lastChild.firstChild, one.text || "");
+    put(row.lastChild.lastChild, one.fix || "");
+  });
+}
+
+// Its roles are said: on a phone rows and cells are blocks, which have none of their own.
+function makeRow(heads) {
+  const row = make("tr");
+  row.setAttribute("role", "row");
+  heads.forEach((head) => {
+    const cell = make("td", "", head === "State" ? "state" : NUMBERS.has(head) ? "number" : "");
+    cell.setAttribute("role", "cell");
+    cell.dataset.head = head;
+    row.append(cell);
+  });
+  row.lastChild.append(make("span"), make("code", "", "fix"));
+  return row;
 }
 
 function showGraph(found) {
@@ -297,7 +318,7 @@ function style() {
     { selector: "node[kind = 'proxy'], node[kind = 'master']", style: { shape: "hexagon" } },
     { selector: "edge", style: { width: 2, "curve-style": "straight", "target-arrow-shape": "triangle", "arrow-scale": 0.8,
       "source-label": "data(label)", "source-text-offset": 122, "source-text-rotation": "autorotate",
-      "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-max-width": 230, "text-background-color": colour("box"),
+      "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-overflow-wrap": "anywhere", "text-max-width": 230, "text-background-color": colour("box"),
       "text-background-opacity": 0.85, "text-background-padding": 2, "min-zoomed-font-size": 6 } },
     { selector: "edge[same = 'yes']", style: { "curve-style": "unbundled-bezier", "control-point-distances": 110, "control-point-weights": 0.5 } },
     { selector: "edge[flows = 'no']", style: { "line-style": "dashed" } },

@@ -37,6 +37,19 @@ export function visibleLinks(links, nodes, { quiet, filter }) {
     order(b) - order(a) || (keys.get(a) < keys.get(b) ? -1 : 1));
 }
 
+// The nodes that are wanted, those that are broken first, then by lane and name.
+export function visibleNodes(nodes, { quiet, filter }) {
+  const wanted = filter.trim().toLowerCase();
+  const found = [];
+  for (const [id, node] of nodes) {
+    const label = labelOf(id, node);
+    if (wanted ? !label.toLowerCase().includes(wanted) : label === "/rosout" && !quiet) continue;
+    const order = RANK[node.state || "ok"] >= 2 ? RANK[node.state] : 0;
+    found.push({ id, node: { ...node, state: node.state || "ok" }, label, order, key: `${LANES.indexOf(node.lane)} ${label} ${id}` });
+  }
+  return found.sort((a, b) => b.order - a.order || (a.key < b.key ? -1 : 1));
+}
+
 // The boxes of nodes: each node's, or that of its folded namespace. `unfolded` has keys of boxes.
 export function boxesOf(nodes, shown, { unfoldAll, unfolded }) {
   const members = new Map();
