@@ -163,7 +163,7 @@ ROS1_CLIENTS = Layer(
     "clients", setup=(ROS, NODES, CLIENTS), workers=2, obstacle=debian_root_obstacle
 )
 ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
-BROWSER = Layer("browser", setup=(ROS, NODES, CHROMIUM), obstacle=debian_root_obstacle)
+BROWSER = Layer("browser", setup=(ROS, NODES, ROS2, CHROMIUM), obstacle=debian_root_obstacle)
 DOCKER_ENGINE = Layer(
     "docker",
     MARKED,

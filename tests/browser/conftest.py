@@ -10,7 +10,7 @@ from tests.browser.webdriver import Browser
 from tests.ros.cpp import compiled_node
 from tests.ros.forks import Forks
 from tests.ros.lab import Lab
-from tests.ros.topology import SHARED, Topology, remove_leftovers
+from tests.ros.topology import SHARED, Place, Topology, remove_leftovers
 
 
 @pytest.fixture(scope="session")
@@ -40,9 +40,15 @@ def lab(lab_of_all: Lab) -> Iterator[Lab]:
 
 
 @pytest.fixture
-def browser(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """A browser on the proxy's machine; at the end its console must be clean."""
-    browser = Browser(lab.place("px"), tmp_path_factory.mktemp("browser"))
+def machine(lab: Lab) -> Place:
+    """Where the browser is: beside the proxy."""
+    return lab.place("px")
+
+
+@pytest.fixture
+def browser(machine: Place, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """A browser on a machine of the lab; at the end its console must be clean."""
+    browser = Browser(machine, tmp_path_factory.mktemp("browser"))
     try:
         yield browser
         assert browser.console() == []

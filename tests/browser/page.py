@@ -14,7 +14,7 @@ from examples.demo.proxy_process import clean_environment
 from tests.browser.webdriver import Browser, Json
 from tests.ros.lab import ADMIN_PORT, Lab
 from tests.ros.processes import Process, wait_until
-from tests.ros.topology import run_command
+from tests.ros.topology import Place, run_command
 
 UNKNOWN = "\N{EN DASH}"
 MANY_PORT = 21312
@@ -48,6 +48,12 @@ PLACES = """
 return Object.fromEntries(
   window.rosproxyPage.cy.nodes().map((one) => [one.data("label"), one.position().x]));
 """
+BOX = """
+const box = window.rosproxyPage.cy.nodes().filter((one) => one.data("label") === arguments[0]);
+return box.empty() ? "" : box.style("border-color");
+"""
+TROUBLE = "return document.querySelector('#findings').innerText"
+TITLE = "return document.title"
 CUT = """
 table ip cut {{
   chain forward {{
@@ -86,6 +92,27 @@ def line(browser: Browser, source: str, target: str) -> Json:
     return {**edge, "colour": edge["colour"].replace(" ", "")}
 
 
+def box_colour(browser: Browser, name: str) -> str:
+    """The colour of a box of the graph; empty if there is none."""
+    return str(browser.run(BOX, name)).replace(" ", "")
+
+
+def node_rows(browser: Browser, name: str) -> list[list[str]]:
+    """The rows of a node: state, name, where, address, ports, MB/s, and what is wrong."""
+    table: list[list[str]] = browser.run(NODES)
+    return [cells for cells in table if cells[1] == name]
+
+
+def trouble(browser: Browser) -> str:
+    """All that the page says is wrong."""
+    return str(browser.run(TROUBLE))
+
+
+def title(browser: Browser) -> str:
+    """The page's title."""
+    return str(browser.run(TITLE))
+
+
 def colour(browser: Browser, name: str) -> str:
     """A colour of the style sheet, as the canvas names it."""
     script = """
@@ -118,20 +145,28 @@ def cut(lab: Lab, port: int) -> Iterator[None]:
 
 
 @contextmanager
-def made_up(lab: Lab, browser: Browser, folder: Path, nodes: int) -> Iterator[Process]:
-    """The browser shows so many nodes that are made up; what serves them."""
-    command = [sys.executable, "-m", "tests.browser.many", str(MANY_PORT), str(nodes)]
+def serving(browser: Browser, place: Place, log: Path, port: int, *words: str) -> Iterator[Process]:
+    """A module serves a page at a port of a machine, where the browser is and looks at it."""
     paths = os.pathsep.join(path for path in sys.path if path)
     environment = clean_environment(PYTHONPATH=paths, PYTHONUNBUFFERED="1")
-    server = Process("many", lab.place("px"), command, environment, folder / "many.log")
+    command = [sys.executable, "-m", words[0], str(port), *words[1:]]
+    server = Process(words[0], place, command, environment, log)
     try:
         server.wait_for("^serving", timeout=60)
-        browser.open(f"http://127.0.0.1:{MANY_PORT}/")
+        browser.open(f"http://127.0.0.1:{port}/")
         yield server
-        # Away from it first: a page that loses its proxy says so in the console.
+        # Away from it first: a page that loses its server says so in the console.
         browser.open("about:blank")
     finally:
         server.kill()
+
+
+@contextmanager
+def made_up(lab: Lab, browser: Browser, folder: Path, nodes: int) -> Iterator[Process]:
+    """The browser shows so many nodes that are made up; what serves them."""
+    words = "tests.browser.many", str(nodes)
+    with serving(browser, lab.place("px"), folder / "many.log", MANY_PORT, *words) as server:
+        yield server
 
 
 def play(lab: Lab) -> dict[str, Any]:

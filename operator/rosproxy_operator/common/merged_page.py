@@ -1,9 +1,10 @@
 """The live pages of several proxies as one document.
 
 Each proxy has its own nodes inside. Outside is the same for all proxies of one master, so its
-nodes appear once; and what is outside for one proxy may be inside for another. A master on loopback
-is another one on each host. Participants of ROS 2 are the same wherever they have one name, which
-is made to be nobody else's. A proxy that can't be asked is a node that says why.
+nodes appear once, and a link between two nodes does; and what is outside for one proxy may be
+inside for another. A master on loopback is another one on each host. Participants of ROS 2 are the
+same wherever they have one name, which is made to be nobody else's. A proxy that can't be asked is
+a node that says why.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,6 +19,7 @@ from rosproxy.page.page_document import (
     CONTAINER,
     HOST,
     MOST_FINDINGS,
+    OK,
     WARNING,
     Document,
     PageFinding,
@@ -72,7 +74,7 @@ def merged(
             if link.source in names and (not link.target or link.target in names):
                 target = names.get(link.target, "")
                 named = replace(link, source=names[link.source], target=target)
-                links[f"{name} {named.key}"] = named
+                links[named.key] = max(links.get(named.key, named), named, key=_telling)
         findings += (replace(f, subject=f"{name}: {f.subject}") for f in document.findings)
         left_out += document.left_out
     shown, kept = within_bounds(nodes, links)
@@ -83,6 +85,11 @@ def merged(
         "findings": msgspec.to_builtins(findings[:MOST_FINDINGS]),
         "left_out": left_out + len(nodes) - len(shown) + len(links) - len(kept),
     }
+
+
+def _telling(link: PageLink) -> tuple[int, bool, bool]:
+    """How much a link tells, where several proxies have it: the worst, then who carries it."""
+    return _RANKS.get(link.state, 0), link.state == OK, link.port is not None
 
 
 def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:

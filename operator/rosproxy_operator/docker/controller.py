@@ -157,10 +157,17 @@ class DockerController:
             await self._close()
 
     async def documents(self) -> dict[str, Document | str]:
-        """What the live pages of all running proxies show, or why one can't be asked."""
-        access = self._last[0].access if self._last else {}
-        endpoints = {name: (p.admin, p.token) for name, p in access.items()}
-        return await self._proxies.documents(endpoints)
+        """What the live pages of all proxies show, or why one can't be asked."""
+        if self._last is None:
+            return {}
+        snapshot = self._last[0]
+        endpoints = {name: (p.admin, p.token) for name, p in snapshot.access.items()}
+        stopped = {
+            proxy.container.name: f"its container is {proxy.container.state}"
+            for proxy in snapshot.state.proxies
+            if proxy.container.state not in ("created", "running")
+        }
+        return {**stopped, **await self._proxies.documents(endpoints)}
 
     async def status(self) -> Json:
         """What a new look sees and plans, and what proxies say now. Raises LookFailed."""

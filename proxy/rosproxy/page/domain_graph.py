@@ -6,8 +6,15 @@ those of a participant's ports.
 
 from collections.abc import Iterator
 
+from msgspec.structs import replace
+
 from rosproxy.admin.doctor_finding import DoctorFinding
-from rosproxy.admin.status_document import DomainStatus, ParticipantStatus, ProxyStatus
+from rosproxy.admin.status_document import (
+    DomainStatus,
+    LocatorStatus,
+    ParticipantStatus,
+    ProxyStatus,
+)
 from rosproxy.doctor.facts import DoctorFacts
 from rosproxy.doctor.rules.participant import check
 from rosproxy.net.addresses import is_loopback
@@ -34,6 +41,10 @@ _QUIET_ENDINGS = (
     *("/set_parameters", "/set_parameters_atomically", "/get_type_description"),
 )
 """Services that every node of ROS 2 has."""
+_QUIET_TOPICS = QUIET | {"ros_discovery_info"}
+"""By the last, participants of ROS 2 tell each other which nodes they have."""
+Key = tuple[str, str, str, str]
+"""A link: its kind and name, and the GUID prefixes of its source and its target."""
 
 
 def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
@@ -44,28 +55,50 @@ def graph(status: ProxyStatus) -> tuple[dict[str, PageNode], list[PageLink]]:
         problems = {problem.subject: problem for problem in domain_problems(domain)}
         for side in (domain.inside, domain.outside):
             for participant in side:
-                node = _node(
-                    participant, side is domain.inside, problems.get(participant.guid_prefix)
+                problem = problems.get(participant.guid_prefix)
+                nodes[_key(domain, participant.guid_prefix)] = _node(
+                    domain, participant, side is domain.inside, problem
                 )
-                nodes[_key(domain, participant)] = node
-        links += _links(domain, problems, "" if domain.direction == "both" else "direct")
+        links += _links(domain, problems)
     return nodes, links
 
 
 def findings(status: ProxyStatus) -> list[DoctorFinding]:
-    """What the doctor says of the domains, but for what is shown at participants."""
+    """What the doctor says of the domains, but for what is shown at participants and links."""
     shown = {p.guid_prefix for domain in status.domains for p in (*domain.inside, *domain.outside)}
-    return [f for f in check(DoctorFacts(status=status)) if f.subject not in shown]
+    at_links = {
+        (problem.subject, problem.text)
+        for domain in status.domains
+        for problem in _mismatches(domain).values()
+    }
+    return [
+        f
+        for f in check(DoctorFacts(status=status))
+        if f.subject not in shown and (f.subject, f.text) not in at_links
+    ]
 
 
-def _key(domain: DomainStatus, participant: ParticipantStatus) -> str:
-    return f"{domain.domain} {participant.guid_prefix}"
+def _key(domain: DomainStatus, guid_prefix: str) -> str:
+    return f"{domain.domain} {guid_prefix}"
+
+
+def _data_leases(participant: ParticipantStatus) -> list[LocatorStatus]:
+    """The ports at which user data for a participant arrives, where the proxy passes that on.
+
+    Cyclone DDS has one port for all that comes: then it is that of discovery.
+    """
+    data = [lease for lease in participant.leases if lease.kind == LeaseKind.DATA.value]
+    return data or [*participant.leases]
 
 
 def _node(
-    participant: ParticipantStatus, is_inside: bool, problem: DomainProblem | None
+    domain: DomainStatus,
+    participant: ParticipantStatus,
+    is_inside: bool,
+    problem: DomainProblem | None,
 ) -> PageNode:
-    data = [lease for lease in participant.leases if lease.kind == LeaseKind.DATA.value]
+    is_passed = is_inside or domain.direction == "both"
+    data = _data_leases(participant) if is_passed else []
     outside_lane = HOST if is_loopback(participant.address) else ROBOT
     return PageNode(
         CONTAINER if is_inside else outside_lane,
@@ -95,68 +128,102 @@ def _state(problem: DomainProblem | None) -> str:
     return BROKEN if problem.grave else WARNING
 
 
-def _links(
-    domain: DomainStatus, problems: dict[str, DomainProblem], way_out: str
-) -> Iterator[PageLink]:
-    """The links of a domain; ``way_out`` is how what goes by no port of the proxy's is carried."""
+def _mismatches(domain: DomainStatus) -> dict[Key, DomainProblem]:
+    """What does not match, by the link that shows it."""
+    participants = {p.guid_prefix: p for p in (*domain.inside, *domain.outside)}
+    nobody = ParticipantStatus()
+    mismatches: dict[Key, DomainProblem] = {}
+    for pair, problem in mismatch_problems(domain):
+        writer = participants.get(pair.writer, nobody)
+        reader = participants.get(pair.reader, nobody)
+        if pair.kind == "topic":
+            ends, has_link = (
+                (writer, reader),
+                pair.name in {*writer.publishes} & {*reader.subscribes},
+            )
+        else:  # of a service both write and read
+            ends = (reader, writer) if pair.name in reader.services else (writer, reader)
+            has_link = pair.name in ends[0].services and ends[1] is not nobody
+        if has_link:
+            mismatches[pair.kind, pair.name, ends[0].guid_prefix, ends[1].guid_prefix] = problem
+    return mismatches
+
+
+def _links(domain: DomainStatus, problems: dict[str, DomainProblem]) -> Iterator[PageLink]:
+    """The links of a domain."""
+    mismatches = _mismatches(domain)
     for writers, readers in ((domain.inside, domain.outside), (domain.outside, domain.inside)):
-        way = way_out if writers is domain.inside else ""
-        yield from _crossing(domain, writers, readers, problems, way)
+        is_passed = writers is domain.outside or domain.direction == "both"
+        for topic, writer, reader in _crossing(writers, readers):
+            key = ("topic", topic, writer.guid_prefix, reader.guid_prefix)
+            problem = _worst(
+                problems.get(writer.guid_prefix),
+                problems.get(reader.guid_prefix),
+                mismatches.get(key),
+            )
+            yield _topic_link(domain, topic, (writer, reader), problem, is_passed)
     for participant in domain.inside:
         for service in participant.services:
-            quiet = is_quiet_service(service) or service.endswith(_QUIET_ENDINGS)
-            problem = problems.get(participant.guid_prefix)
-            yield PageLink(
-                "service",
-                shown_name(service),
-                _key(domain, participant),
-                state=_state(problem),
-                text=shown_text(problem.text) if problem else "",
-                fix=shown_text(problem.fix) if problem else "",
-                quiet=quiet,
+            yield _marked(
+                PageLink(
+                    "service",
+                    shown_name(service),
+                    _key(domain, participant.guid_prefix),
+                    quiet=is_quiet_service(service) or service.endswith(_QUIET_ENDINGS),
+                ),
+                problems.get(participant.guid_prefix),
             )
+    # Whose clients are well has no link to them: only the server is shown.
+    for (kind, name, server, client), problem in mismatches.items():
+        if kind == "service":
+            ends = _key(domain, server), _key(domain, client)
+            yield _marked(PageLink("service", shown_name(name), *ends), problem)
 
 
 def _crossing(
-    domain: DomainStatus,
-    writers: tuple[ParticipantStatus, ...],
-    readers: tuple[ParticipantStatus, ...],
-    problems: dict[str, DomainProblem],
-    way: str,
-) -> Iterator[PageLink]:
-    """The topics that cross the boundary in one direction."""
+    writers: tuple[ParticipantStatus, ...], readers: tuple[ParticipantStatus, ...]
+) -> Iterator[tuple[str, ParticipantStatus, ParticipantStatus]]:
+    """The topics that cross the boundary in one direction, each with a writer and a reader."""
     readers_by_topic: dict[str, list[ParticipantStatus]] = {}
     for reader in readers:
         for topic in reader.subscribes:
             readers_by_topic.setdefault(topic, []).append(reader)
-    mismatched = {(m.name, m.writer, m.reader): p for m, p in mismatch_problems(domain)}
     for writer in writers:
         for topic in writer.publishes:
             for reader in readers_by_topic.get(topic, ()):
-                problem = problems.get(writer.guid_prefix) or problems.get(reader.guid_prefix)
-                problem = problem or mismatched.get((topic, writer.guid_prefix, reader.guid_prefix))
-                yield _link(domain, topic, (writer, reader), problem, way)
+                yield topic, writer, reader
 
 
-def _link(
+def _worst(*problems: DomainProblem | None) -> DomainProblem | None:
+    """The first that is grave, else the first of all."""
+    present = [problem for problem in problems if problem]
+    return next((problem for problem in present if problem.grave), next(iter(present), None))
+
+
+def _topic_link(
     domain: DomainStatus,
     topic: str,
     ends: tuple[ParticipantStatus, ParticipantStatus],
     problem: DomainProblem | None,
-    way: str,
+    is_passed: bool,
 ) -> PageLink:
+    """A topic between two participants; ``is_passed``: the proxy passes its data on."""
     writer, reader = ends
-    state = _state(problem)
-    data = [lease for lease in reader.leases if lease.kind == LeaseKind.DATA.value]
-    return PageLink(
+    port = next(iter(_data_leases(reader)), None) if is_passed else None
+    carried = (port.plane if port else "") if is_passed else "direct"
+    link = PageLink(
         "topic",
         shown_name(topic),
-        _key(domain, writer),
-        _key(domain, reader),
-        carried="" if state == BROKEN else data[0].plane if data else way,
-        port=data[0].port if data else None,
-        state=state,
-        text=shown_text(problem.text) if problem else "",
-        fix=shown_text(problem.fix) if problem else "",
-        quiet=topic in QUIET,
+        _key(domain, writer.guid_prefix),
+        _key(domain, reader.guid_prefix),
+        carried="" if _state(problem) == BROKEN else carried,
+        port=port.port if port else None,
+        quiet=topic in _QUIET_TOPICS,
     )
+    return _marked(link, problem)
+
+
+def _marked(link: PageLink, problem: DomainProblem | None) -> PageLink:
+    """The link with what is wrong."""
+    text, fix = (problem.text, problem.fix) if problem else ("", "")
+    return replace(link, state=_state(problem), text=shown_text(text), fix=shown_text(fix))

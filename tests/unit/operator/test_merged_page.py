@@ -87,8 +87,32 @@ def test_who_is_inside_elsewhere_is_one_box() -> None:
         "http://x:1 master": "robot",
         "http://x:1 /listener": "robot",
     }
-    ends = {(k["source"], k["target"]) for k in document["links"].values() if k["name"] == "/t"}
-    assert ends == {("one /a", "two /b")}
+    ends = [(k["source"], k["target"]) for k in document["links"].values() if k["name"] == "/t"]
+    assert ends == [("one /a", "two /b")]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "wanted"),
+    [
+        ({"state": "ok", "carried": "direct"}, {"state": "ok", "port": 1}, 1),
+        ({"state": "ok", "port": 1}, {"state": "ok", "carried": "direct"}, 0),
+        ({"state": "ok", "port": 1}, {"state": "broken"}, 1),
+        ({"state": "warning"}, {"state": "ok", "port": 1}, 0),
+        ({"state": "unknown"}, {"state": "ok"}, 1),
+    ],
+)
+def test_of_a_link_that_two_proxies_have_stands_what_tells_more(
+    first: dict[str, Any], second: dict[str, Any], wanted: int
+) -> None:
+    link = {"kind": "topic", "name": "/t", "source": "/a", "target": "/b"}
+    documents = {}
+    for name, more in (("one", first), ("two", second)):
+        nodes = {"/a": {"lane": "robot"}, "/b": {"lane": "robot"}}
+        text = {"proxy": {"master": MASTER}, "nodes": nodes, "links": {"t": link | more}}
+        documents[name] = read_document(json.dumps(text))
+    (shown_link,) = merged(documents, "1", LOGS)["links"].values()
+    told = (first, second)[wanted]
+    assert {key: shown_link.get(key, "unknown") for key in told} == told
 
 
 def test_participants_are_the_same_for_all_proxies() -> None:

@@ -18,10 +18,14 @@ from rosproxy.page.measures import Measures
 
 DATA = LocatorStatus(11402, "172.30.0.5:7411", "data", rate=123.0, plane="kernel")
 INSIDE = ParticipantStatus(
-    "01.0f.aa", "172.30.0.5", "Fast DDS", (DATA,), subscribes=("/chatter", "/rosout")
+    "01.0f.aa",
+    "172.30.0.5",
+    "Fast DDS",
+    (DATA,),
+    subscribes=("/chatter", "/rosout", "ros_discovery_info"),
 )
 OUTSIDE = ParticipantStatus(
-    "01.10.bb", "10.0.0.9", "Cyclone DDS", publishes=("/chatter", "/rosout")
+    "01.10.bb", "10.0.0.9", "Cyclone DDS", publishes=("/chatter", "/rosout", "ros_discovery_info")
 )
 LINK = "topic /chatter 0 01.10.bb 0 01.0f.aa"
 
@@ -42,7 +46,9 @@ def test_participants_and_what_crosses_the_boundary() -> None:
     link = document["links"][LINK]
     assert (link["carried"], link["port"], link["state"]) == ("kernel", 11402, "ok")
     assert not {"hz", "rate", "since"} & link.keys(), "user data is not read"
-    assert document["links"]["topic /rosout 0 01.10.bb 0 01.0f.aa"]["quiet"]
+    for topic in ("/rosout", "ros_discovery_info"):
+        assert document["links"][f"topic {topic} 0 01.10.bb 0 01.0f.aa"]["quiet"]
+    assert "quiet" not in link
     assert "master" not in document["nodes"]
 
 
@@ -74,6 +80,60 @@ def test_a_mismatch_is_on_its_link_alone() -> None:
     assert "reliability differs" in links[LINK]["text"]
     assert "make the publisher RELIABLE" in links[LINK]["fix"]
     assert links["topic /chatter 0 01.10.cc 0 01.0f.aa"]["state"] == "ok"
+
+
+def test_a_mismatch_that_is_at_its_link_is_no_finding_as_well() -> None:
+    """Nothing else is taken for it: of what a participant leaves out there is no link."""
+    pair = MismatchStatus(
+        "topic", "/chatter", "reliability", "BEST_EFFORT", "RELIABLE", "01.10.bb", "01.0f.aa"
+    )
+    document = made(mismatches=(pair, replace(pair, name="/left_out")))
+    assert [f["subject"] for f in document["findings"]] == ["topic /left_out"]
+
+
+def test_a_service_that_does_not_match_is_broken_between_its_ends() -> None:
+    server = replace(INSIDE, services=("/add",))
+    asks, replies = ("01.10.bb", "01.0f.aa"), ("01.0f.aa", "01.10.bb")
+    for writer, reader in (asks, replies):
+        pair = MismatchStatus("service", "/add", "type", "A", "B", writer, reader)
+        document = made(inside=(server,), mismatches=(pair,))
+        broken = document["links"]["service /add 0 01.0f.aa 0 01.10.bb"]
+        assert (broken["state"], "type differs" in broken["text"]) == ("broken", True)
+        assert broken["fix"]
+        assert document["links"]["service /add 0 01.0f.aa "]["state"] == "ok"
+        assert not document["findings"]
+    alone = made(mismatches=(MismatchStatus("service", "/add", "type", "A", "B", *asks),))
+    assert [f["subject"] for f in alone["findings"]] == ["service /add"]
+
+
+def test_a_mismatch_counts_more_than_a_warning_about_a_participant() -> None:
+    pair = MismatchStatus(
+        "topic", "/chatter", "reliability", "BEST_EFFORT", "RELIABLE", "01.10.bb", "01.0f.aa"
+    )
+    unheard = replace(OUTSIDE, proven=False)
+    link = made(outside=(unheard,), mismatches=(pair,))["links"][LINK]
+    assert (link["state"], "reliability differs" in link["text"]) == ("broken", True)
+    assert made(outside=(unheard,))["links"][LINK]["state"] == "warning"
+
+
+@pytest.mark.parametrize(("direction", "inwards"), [("out", True), ("out", False), ("both", False)])
+def test_a_participant_of_one_port_gets_its_data_there(direction: str, inwards: bool) -> None:
+    """Cyclone DDS has one for discovery and user data; outside it has a stand-in for discovery."""
+    port = replace(DATA, kind="metatraffic", plane="copy")
+    writes, reads = (
+        {"leases": (port,), "publishes": publishes, "subscribes": subscribes}
+        for publishes, subscribes in ((("/chatter",), ()), ((), ("/chatter",)))
+    )
+    near = replace(INSIDE, **(reads if inwards else writes))
+    far = replace(OUTSIDE, **(writes if inwards else reads))
+    document = made(direction=direction, inside=(near,), outside=(far,))
+    (link,) = document["links"].values()
+    is_passed = inwards or direction == "both"
+    assert (link["carried"], link.get("port")) == (
+        ("copy", 11402) if is_passed else ("direct", None)
+    )
+    assert ("rate" in document["nodes"]["0 01.10.bb"]) is (direction == "both")
+    assert document["nodes"]["0 01.0f.aa"]["rate"] == 120.0
 
 
 def test_a_participant_that_is_wrong_breaks_its_links() -> None:

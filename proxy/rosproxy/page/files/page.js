@@ -79,27 +79,29 @@ function draw() {
 
 function show() {
   const found = visibleLinks(state.links, state.nodes, chosen);
-  showHead(found);
-  showFindings();
+  const items = troubles();
+  showHead(found, items);
+  showFindings(items);
   showLinks(found);
   showNodes();
   showGraph(found);
   showDetails();
 }
 
-function showHead(found) {
+function showHead(found, items) {
   const { proxy } = state;
-  const broken = [...state.links.values()].filter((link) => link.state === "broken").length;
   put($("host"), proxy.host || "");
   const ports = proxy.ports ? `ports ${proxy.ports}: ${proxy.used} used, ${proxy.free} free` : "";
   const parts = [`${state.nodes.size} nodes`, `${found.length} links`, ports,
     proxy.plane ? `forwards by ${proxy.plane}` : "", proxy.version ? `version ${proxy.version}` : ""];
   put($("summary"), parts.filter(Boolean).join(" · "));
+  const broken = items.filter((item) => item.kind === "broken").length;
   const title = broken ? `(${broken} broken) rosproxy` : "rosproxy";
   if (document.title !== title) document.title = title;
 }
 
-function showFindings() {
+// All that is wrong, what is broken first: those with one text and one cure are one.
+function troubles() {
   const told = new Map();
   const tell = (what, kind, text, fix) => {
     const key = JSON.stringify([kind, text, fix]);
@@ -116,7 +118,10 @@ function showFindings() {
   for (const [id, node] of state.nodes) {
     if (node.state === "broken" || node.state === "warning") tell(labelOf(id, node), node.state, node.text || "", node.fix || "");
   }
-  const items = [...told.values()].sort((a, b) => (a.kind === "broken" ? 0 : 1) - (b.kind === "broken" ? 0 : 1));
+  return [...told.values()].sort((a, b) => (a.kind === "broken" ? 0 : 1) - (b.kind === "broken" ? 0 : 1));
+}
+
+function showFindings(items) {
   const shown = new Map(items.slice(0, MOST_FINDINGS).map((item) => {
     const more = item.what.length > 3 ? ` and ${item.what.length - 3} more` : "";
     const what = `${WORDS[item.kind]}: ${item.what.slice(0, 3).join("; ")}${more}`;

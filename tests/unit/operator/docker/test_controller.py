@@ -299,6 +299,19 @@ async def test_a_start_that_no_event_told_is_found(
     assert await look() != first
 
 
+@pytest.mark.parametrize(("state", "is_told"), [("exited", True), ("created", False)])
+async def test_the_page_tells_of_a_proxy_that_has_ended(
+    engine: FakeEngine, state: str, is_told: bool
+) -> None:
+    """One that has not started yet is not broken."""
+    engine.rows[-1]["State"] = state
+    controller = DockerController(SETTINGS, 30.0, DockerMetrics())
+    assert await controller.documents() == {}
+    await controller.look()
+    wanted = {proxy_name(KEY): "its container is exited"} if is_told else {}
+    assert await controller.documents() == wanted
+
+
 async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
     del engine.rows[1:]
     metrics = DockerMetrics()

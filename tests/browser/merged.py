@@ -1,0 +1,49 @@
+"""The page of an operator over some proxies, as the operators serve it, without an engine.
+
+python -m tests.browser.merged PORT TOKEN NAME=ADDRESS...
+
+An operator learns of its engine which proxies there are; here they are given. Their documents are
+asked for, merged and served by the operator's own code.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+from prometheus_client import CollectorRegistry
+
+from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.page.page_document import Document
+from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.operator_page import operator_page
+from rosproxy_operator.common.proxy_client import ProxyClient
+
+
+async def serve(port: int, token: str, proxies: dict[str, HostPort]) -> None:
+    """Serve the page for good."""
+    client = ProxyClient()
+
+    async def documents() -> dict[str, Document | str]:
+        return await client.documents({name: (admin, token) for name, admin in proxies.items()})
+
+    page = operator_page(documents, "docker logs {}".format)
+    server = HealthServer(CollectorRegistry(), lambda: None, lambda: None, page)
+    await server.start(HostPort("127.0.0.1", port))
+    print("serving", flush=True)
+    await asyncio.Event().wait()
+
+
+def read_proxies(words: list[str]) -> dict[str, HostPort]:
+    """The admin endpoints of proxies, by their names."""
+    proxies = {}
+    for word in words:
+        name, _, address = word.partition("=")
+        admin = parse_host_port(address)
+        assert admin, word
+        proxies[name] = admin
+    return proxies
+
+
+if __name__ == "__main__":
+    asyncio.run(serve(int(sys.argv[1]), sys.argv[2], read_proxies(sys.argv[3:])))

@@ -1,0 +1,162 @@
+"""The page of all proxies of an operator in Chromium, over two that run.
+
+Each stands before a network of its own, with one master outside: c1 is behind px, c2 behind px2.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.browser.page import (
+    box_colour,
+    colour,
+    line,
+    node_rows,
+    row,
+    rows,
+    serving,
+    title,
+    trouble,
+)
+from tests.browser.webdriver import Browser
+from tests.ros.cpp import compiled_node
+from tests.ros.forks import Forks
+from tests.ros.lab import ADMIN_PORT, MASTER_URI, Lab
+from tests.ros.processes import Process, stop_all, wait_until
+from tests.ros.topology import (
+    OUT_HOST,
+    SPLIT,
+    Place,
+    PortMap,
+    SecondProxy,
+    Topology,
+    remove_leftovers,
+)
+
+PORTS = PortMap(47000, 47029, 47000)
+PLAN = replace(SPLIT, name="m", hairpin=True, second=SecondProxy((2,), PORTS))
+TOKEN = "0123456789abcdef"
+ADMIN = ("--admin-bind", f"0.0.0.0:{ADMIN_PORT}", "--admin-token", TOKEN)
+OPERATOR_PORT = 11313
+PORTS_OF_FIRST = re.compile(r"460[0-2]\d")
+"""As the host publishes them."""
+
+
+class Second:
+    """The proxy on px2."""
+
+    def __init__(self, lab: Lab) -> None:
+        self._lab = lab
+        self.process = self._start()
+
+    def _start(self) -> Process:
+        argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER_URI]
+        argv += ["--advertise-host", OUT_HOST, "--port-range", PORTS.bound, *ADMIN]
+        process = self._lab.spawn_proxy("px2", argv)
+        process.wait_for("listening: ")
+        return process
+
+    def start_again(self) -> None:
+        """Start it; it has been killed."""
+        self.process = self._start()
+
+
+@pytest.fixture
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    """A master outside and the proxy on px."""
+    remove_leftovers()
+    compiled_node()
+    topology, forks = Topology(PLAN), Forks()
+    topology.build()
+    lab = Lab(topology, tmp_path_factory.mktemp("lab"), forks)
+    lab.proxy_options = ADMIN
+    try:
+        lab.ensure_running()
+        yield lab
+        lab.check_proxy()
+    finally:
+        lab.stop()
+        forks.stop()
+        topology.remove()
+
+
+@pytest.fixture
+def second(lab: Lab) -> Iterator[Second]:
+    """The proxy on px2."""
+    second = Second(lab)
+    yield second
+    stop_all([second.process])
+    assert "Traceback" not in second.process.output(), second.process.output()
+
+
+@pytest.fixture
+def machine(lab: Lab) -> Place:
+    """Where the operator and the browser are: at the host, which is on both networks."""
+    return lab.place("host")
+
+
+@pytest.fixture
+def operator(
+    lab: Lab, second: Second, machine: Place, browser: Browser, tmp_path: Path
+) -> Iterator[Process]:
+    """It shows both proxies, as `one` and `two`, to the browser."""
+    addresses = {"one": lab.place("px").address, "two": lab.place("px2").address}
+    words = ["tests.browser.merged", TOKEN]
+    words += [f"{name}={address}:{ADMIN_PORT}" for name, address in addresses.items()]
+    with serving(browser, machine, tmp_path / "operator.log", OPERATOR_PORT, *words) as server:
+        yield server
+    assert "Traceback" not in server.output(), server.output()
+
+
+def hearers(browser: Browser) -> list[str]:
+    """Who hears /chatter, by the rows of its links."""
+    return sorted(link["To"] for link in rows(browser) if link["Name"] == "/chatter")
+
+
+@pytest.mark.usefixtures("operator")
+def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: Browser) -> None:
+    lab.node("roscpp", "c1", "pub", name="talker", topic="/chatter", rate=10)
+    for role, name in (("out", "listener"), ("c2", "hearer")):
+        lab.node("roscpp", role, "sub", name=name, topic="/chatter").wait_for("^got ")
+    for listener in ("/listener", "/hearer"):
+        shown = row(browser, "/chatter", State="ok", From="/talker", To=listener)
+        assert PORTS_OF_FIRST.fullmatch(shown["Port"]), shown
+    wait_until("each link is there once", lambda: hearers(browser) == ["/hearer", "/listener"])
+    for name, where in (
+        ("/talker", "container, inside of one"),
+        ("/hearer", "container, inside of two"),
+        ("/listener", "robot, outside"),
+        ("master (master)", "robot, outside"),
+    ):
+        assert [cells[2] for cells in node_rows(browser, name)] == [where]
+    ok, red = colour(browser, "ok"), colour(browser, "broken")
+    assert box_colour(browser, "two") == ok
+    assert line(browser, "/talker", "/hearer")["colour"] == ok
+
+    second.process.kill()
+    wait_until("it is told", lambda: "BROKEN: two\n" in trouble(browser))
+    (broken,) = node_rows(browser, "two (proxy)")
+    admin = f"{lab.place('px2').address}:{ADMIN_PORT}"
+    assert broken[0] == "BROKEN"
+    assert broken[-1] == f"it can't be asked: {admin} refuses connectionsdocker logs two"
+    assert "docker logs two" in trouble(browser)
+    assert box_colour(browser, "two") == red
+    assert title(browser) == "(1 broken) rosproxy"
+    assert node_rows(browser, "one (proxy)")[0][0] == "ok"
+    assert node_rows(browser, "/talker")[0][2] == "container, inside of one"
+
+    second.start_again()
+    wait_until("nothing is broken", lambda: title(browser) == "rosproxy")
+    assert node_rows(browser, "two (proxy)")[0][0] == "ok"
+    assert box_colour(browser, "two") == ok
+    row(browser, "/chatter", State="ok", From="/talker", To="/hearer")
+    wait_until(
+        "who is behind it is back",
+        lambda: [c[2] for c in node_rows(browser, "/hearer")] == ["container, inside of two"],
+    )
