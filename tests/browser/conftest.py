@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import pytest
 
@@ -11,6 +11,19 @@ from tests.ros.cpp import compiled_node
 from tests.ros.forks import Forks
 from tests.ros.lab import Lab
 from tests.ros.topology import SHARED, Place, Topology, remove_leftovers
+from tests.ros2.lab import Lab as Ros2Lab
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Shows with a failure what the proxy and the nodes of that test have printed."""
+    result = yield
+    lab = getattr(item, "funcargs", {}).get("lab")
+    if result.failed and isinstance(lab, Lab | Ros2Lab):
+        result.sections += lab.transcripts()
+    return result
 
 
 @pytest.fixture(scope="session")

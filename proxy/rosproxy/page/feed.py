@@ -20,13 +20,8 @@ from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
 from rosproxy.net.tasks import Tasks
-from rosproxy.page.graph_document import (
-    JudgedFacts,
-    graph_document,
-    judge,
-    relayed,
-    topics_to_ask_about,
-)
+from rosproxy.page.graph_document import graph_document, relayed
+from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import Json
 
@@ -193,7 +188,7 @@ class PageWatch:
         """One round of questions; the seconds until the next."""
         began, status = time.monotonic(), self._status()
         facts = await collect_running(status, self._admin, partial(topics_to_ask_about, status))
-        judged = await asyncio.to_thread(judge, facts, self._judged)
+        judged = await asyncio.to_thread(judge, facts, self._judged, self._status())
         async with self._counting:
             relayed_links = relayed(status, facts.system)
             self._measures.read_nodes(facts, judged.pairs.keys() | relayed_links.keys())

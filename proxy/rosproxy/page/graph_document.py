@@ -13,10 +13,9 @@ import msgspec
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error
 from rosproxy.admin.status_document import EndpointStatus, ProxyStatus, StandInStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SystemState
-from rosproxy.doctor.rules import diagnose_running
-from rosproxy.doctor.rules.pair import judge_pair
 from rosproxy.net.addresses import is_loopback
 from rosproxy.page import domain_graph
+from rosproxy.page.judgement import JudgedFacts, inside_nodes
 from rosproxy.page.measures import Key, Measures
 from rosproxy.page.page_document import (
     BROKEN,
@@ -42,64 +41,6 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 MASTER, PROXY = "master", "rosproxy"
 """Keys of what is no node: names of those begin with a slash."""
 _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
-
-
-class JudgedFacts(msgspec.Struct, frozen=True):
-    """The ``facts`` with the doctor's findings: on nodes, on pairs, and on the rest.
-
-    ``unconnected_pairs`` are all pairs that are not connected; of them ``pairs`` has those that
-    were so before.
-    """
-
-    facts: DoctorFacts
-    nodes: dict[str, DoctorFinding] = {}
-    pairs: dict[Key, DoctorFinding] = {}
-    rest: tuple[DoctorFinding, ...] = ()
-    unconnected_pairs: frozenset[Key] = frozenset()
-
-
-def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
-    """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
-    inside = inside_nodes(status)
-    topics, remaining = [], MOST_LINKS
-    for topic in sorted(graph.topics - QUIET):
-        if not inside.keys() & {*graph.sides(topic)}:
-            continue
-        remaining -= len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
-        if remaining < 0:
-            break
-        topics.append(topic)
-    return tuple(topics)
-
-
-def judge(facts: DoctorFacts, previous: JudgedFacts | None = None) -> JudgedFacts:
-    """Have the doctor judge what was found out; ``previous`` is its judgement before this one.
-
-    A pair is said to be apart once it is found so twice: nodes that start need a moment to meet.
-    """
-    nodes: dict[str, DoctorFinding] = {}
-    rest, inside = [], inside_nodes(facts.proxy)
-    for finding in diagnose_running(msgspec.structs.replace(facts, names=())):
-        if finding.severity < Severity.WARNING:
-            continue
-        if finding.subject not in facts.nodes and finding.subject not in inside:
-            rest.append(finding)
-        elif finding.subject not in nodes or nodes[finding.subject].severity < finding.severity:
-            nodes[finding.subject] = finding
-    pairs = {
-        pair: judge_pair(facts, *pair)
-        for pair in facts.scope.pairs
-        if inside.keys() & {pair[1], pair[2]}
-    }
-    apart = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
-    for key in apart - (previous.unconnected_pairs if previous else frozenset()):
-        del pairs[key]
-    return JudgedFacts(facts, nodes, pairs, tuple(rest), apart)
-
-
-def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
-    """The nodes inside, by their names."""
-    return {name: endpoint for endpoint in status.nodes for name in endpoint.nodes}
 
 
 def relayed(status: ProxyStatus, graph: SystemState) -> dict[Key, int]:

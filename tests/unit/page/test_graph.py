@@ -8,13 +8,8 @@ from msgspec.structs import replace
 from rosproxy.admin.doctor_finding import error
 from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.doctor.facts import Attempt, DoctorFacts, ReachOutcome, SlaveReport, SystemState
-from rosproxy.page.graph_document import (
-    JudgedFacts,
-    graph_document,
-    judge,
-    relayed,
-    topics_to_ask_about,
-)
+from rosproxy.page.graph_document import graph_document, relayed
+from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import (
     LONGEST,
@@ -24,7 +19,7 @@ from rosproxy.page.page_document import (
     PageNode,
     document,
 )
-from tests.unit.doctor.cases import INSIDE_URI, by_name, listener, make_facts, talker
+from tests.unit.doctor.cases import ANSWERED, INSIDE_URI, by_name, listener, make_facts, talker
 from tests.unit.status_json import make_connection, make_node, make_status
 
 LINK = "topic /chatter /talker /listener"
@@ -98,6 +93,18 @@ def test_nodes_that_have_just_started_are_not_said_to_be_apart() -> None:
     silent = talker(report=SlaveReport(STRING))
     judgement = judge(make_facts(names=("/chatter",), nodes=by_name(silent, listener())))
     assert "state" not in made(judgement)["links"][LINK]
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_a_node_that_comes_or_goes_while_all_are_asked_is_well(is_late: bool) -> None:
+    """The proxy was asked first, the master afterwards, and the node answers."""
+    before, after = make_status(), make_status(make_node())
+    if not is_late:
+        before, after = after, before
+    facts = make_facts(status=before, nodes=by_name(talker(attempt=ANSWERED), listener()))
+    assert not judge(facts, None, read_status(after)).nodes
+    lasting = make_facts(status=make_status(), nodes=facts.nodes)
+    assert [*judge(lasting, None, lasting.proxy).nodes] == ["/talker"]
 
 
 def test_a_node_that_is_wrong_is_the_first_cause_on_its_links() -> None:

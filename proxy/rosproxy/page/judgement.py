@@ -1,0 +1,92 @@
+"""What the doctor finds out about a proxy that runs, for its page: again and again, on everything.
+
+A round of questions takes a while in which nodes start and end. So the proxy is heard before and
+after it, and what holds by both is said.
+"""
+
+import msgspec
+from msgspec.structs import replace
+
+from rosproxy.admin.doctor_finding import DoctorFinding, Severity
+from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
+from rosproxy.doctor.facts import DoctorFacts, SystemState
+from rosproxy.doctor.rules import diagnose_running
+from rosproxy.doctor.rules.pair import judge_pair
+from rosproxy.page.measures import Key
+from rosproxy.page.page_document import MOST_LINKS, QUIET
+
+
+class JudgedFacts(msgspec.Struct, frozen=True):
+    """The ``facts`` with the doctor's findings: on nodes, on pairs, and on the rest.
+
+    ``unconnected_pairs`` are all pairs that are not connected; of them ``pairs`` has those that
+    were so before.
+    """
+
+    facts: DoctorFacts
+    nodes: dict[str, DoctorFinding] = {}
+    pairs: dict[Key, DoctorFinding] = {}
+    rest: tuple[DoctorFinding, ...] = ()
+    unconnected_pairs: frozenset[Key] = frozenset()
+
+
+def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
+    """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
+    inside = inside_nodes(status)
+    topics, remaining = [], MOST_LINKS
+    for topic in sorted(graph.topics - QUIET):
+        if not inside.keys() & {*graph.sides(topic)}:
+            continue
+        remaining -= len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
+        if remaining < 0:
+            break
+        topics.append(topic)
+    return tuple(topics)
+
+
+def judge(
+    facts: DoctorFacts, previous: JudgedFacts | None = None, later: ProxyStatus | None = None
+) -> JudgedFacts:
+    """Have the doctor judge what was found out; ``previous`` is its judgement before this one.
+
+    ``later`` is what the proxy says of itself after all were asked. A pair is said to be apart once
+    it is found so twice: nodes that start need a moment to meet.
+    """
+    nodes: dict[str, DoctorFinding] = {}
+    rest, inside = [], inside_nodes(facts.proxy)
+    for finding in _lasting(facts, later):
+        if finding.subject not in facts.nodes and finding.subject not in inside:
+            rest.append(finding)
+        elif finding.subject not in nodes or nodes[finding.subject].severity < finding.severity:
+            nodes[finding.subject] = finding
+    pairs = {
+        pair: judge_pair(facts, *pair)
+        for pair in facts.scope.pairs
+        if inside.keys() & {pair[1], pair[2]}
+    }
+    apart = frozenset(key for key, f in pairs.items() if f.severity is Severity.ERROR)
+    for key in apart - (previous.unconnected_pairs if previous else frozenset()):
+        del pairs[key]
+    return JudgedFacts(facts, nodes, pairs, tuple(rest), apart)
+
+
+def _lasting(facts: DoctorFacts, later: ProxyStatus | None) -> list[DoctorFinding]:
+    """What is wrong by what the proxy said before and by what it says after.
+
+    Of a node that registers or leaves meanwhile the one knows, and the other does not.
+    """
+    before = _wrong(facts)
+    if later is None:
+        return before
+    after = {(f.check, f.subject) for f in _wrong(replace(facts, status=later))}
+    return [f for f in before if (f.check, f.subject) in after]
+
+
+def _wrong(facts: DoctorFacts) -> list[DoctorFinding]:
+    findings = diagnose_running(replace(facts, names=()))
+    return [finding for finding in findings if finding.severity >= Severity.WARNING]
+
+
+def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
+    """The nodes inside, by their names."""
+    return {name: endpoint for endpoint in status.nodes for name in endpoint.nodes}
