@@ -23,7 +23,7 @@ from rosproxy.access.layers import (
 )
 from rosproxy.access.rules import RuleKind
 from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.refusals import Refusals
+from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, Refusals
 
 OUTWARDS = frozenset({RuleKind.PUBLISH, RuleKind.SERVE})
 """What is enforced on the way of TCPROS connections from outside."""
@@ -109,7 +109,7 @@ class AccessPolicy:
             is_audit = verdict.mode is PolicyMode.AUDIT
             self._metrics.policy_denied.labels(kind.value, verdict.mode.value).inc()
             outcome = "would be denied" if is_audit else "denied"
-            reason = "policy_audit" if is_audit else "policy"
+            reason = WOULD_BE_DENIED if is_audit else DENIED
             text = f"{kind.value} {subject} {outcome} by {verdict.reason}"
             self._refusals.note(reason, source, text)
         return verdict

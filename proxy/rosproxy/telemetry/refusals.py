@@ -13,12 +13,19 @@ from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 
+DENIED, WOULD_BE_DENIED = "policy", "policy_audit"
+"""The reasons of what a policy denies, or only tells of."""
 QUIET = 60.0
 """Seconds in which a source is not logged again for the same reason."""
 LINES = 20
 """Sources that are logged in that time for one reason: sources of datagrams may be forged."""
 MOST = 1000
 """Sources and reasons that are remembered for that."""
+
+
+def problem_subject(reason: str) -> str:
+    """The subject of the problem that tells the last refusal for a reason."""
+    return f"refused: {reason.replace('_', ' ')}"
 
 
 class Refusals:
@@ -45,7 +52,7 @@ class Refusals:
         if len(self._logged_at) >= MOST:
             del self._logged_at[next(iter(self._logged_at))]
         self._logged_at[key] = now
-        subject = f"refused: {reason.replace('_', ' ')}"
+        subject = problem_subject(reason)
         log.warning("%s, from %s: %s", subject, source, text)
         self._problems.solved(subject)
         self._problems.add(subject, f"from {source}: {text}")

@@ -2,7 +2,8 @@
 
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.admin.status_document import ProblemStatus, ProxyStatus
+from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, problem_subject
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_status import (
@@ -14,6 +15,7 @@ from rosproxy_operator.kubernetes.resources.cluster import ProxyReport
 
 RECENT = 300.0
 """Seconds for which a problem counts that the proxy does not take back: it lists the last ones."""
+_BY_POLICY = {problem_subject(reason) for reason in (DENIED, WOULD_BE_DENIED)}
 _LONGEST = 300
 """Characters kept of a problem or an error, which may be of any size in the status."""
 
@@ -44,11 +46,14 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         },
         topics=frozenset(topics),
         refusal=refusal,
-        problems=tuple(
-            short(f"{p.subject}: {p.text}") for p in status.problems if p.holds or p.age <= RECENT
-        ),
+        problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if _counts(p)),
         range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
     )
+
+
+def _counts(problem: ProblemStatus) -> bool:
+    """Whether a problem of a proxy is one now. A policy that denies does what it is there for."""
+    return problem.subject not in _BY_POLICY and (problem.holds or problem.age <= RECENT)
 
 
 def no_answer(error: str) -> ProxyReport:

@@ -276,6 +276,9 @@ STATUS = {
         {"age": 3.0, "subject": "/talker", "text": "does not answer"},
         {"age": RECENT + 1, "subject": "/old", "text": "long ago"},
         {"age": RECENT + 1, "subject": "published range", "text": "dead", "holds": True},
+        {"age": 1.0, "subject": "refused: policy", "text": "publish /camera of /a denied"},
+        {"age": 1.0, "subject": "refused: policy audit", "text": "it would be denied"},
+        {"age": 1.0, "subject": "refused: rate", "text": "too many calls"},
     ],
     "range_probe": {"reached": False, "from_proxy": "refused", "from_master": "missed", "age": 9.0},
 }
@@ -287,7 +290,11 @@ def test_what_a_proxy_answers():
     assert (proxy_report.answered, proxy_report.master_up, proxy_report.error) == (True, True, "")
     assert proxy_report.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
     assert proxy_report.topics == {"/chatter", "/rosout"}
-    assert proxy_report.problems == ("/talker: does not answer", "published range: dead")
+    assert proxy_report.problems == (
+        "/talker: does not answer",
+        "published range: dead",
+        "refused: rate: too many calls",
+    )
     assert proxy_report.range_probe == RangeProbeStatus(False, "refused", "missed")
     assert report(read_status({})).range_probe is None
 
