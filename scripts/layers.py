@@ -174,13 +174,13 @@ DOCKER_ENGINE = Layer(
 _ROS2_PODS = "tests/kubernetes/test_ros2.py"
 CLUSTER = Layer(
     "kubernetes",
-    setup=(ENGINE, KUBERNETES, IMAGES),
+    setup=(ENGINE, KUBERNETES, PROMETHEUS, IMAGES),
     obstacle=debian_root_obstacle,
     tests=("tests/kubernetes", f"--ignore={_ROS2_PODS}"),
 )
 ROS2_CLUSTER = Layer(
     "kubernetes-ros2",
-    setup=CLUSTER.setup,
+    setup=(ENGINE, KUBERNETES, IMAGES),
     obstacle=debian_root_obstacle,
     tests=(_ROS2_PODS,),
 )

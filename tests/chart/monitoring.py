@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
+from rosproxy_operator.common.operator_metrics import ClusterMetrics, CommonMetrics, DockerMetrics
 from tests.chart.chart import CHART, ROOT, Json
 
 ALERTS = CHART / "files/alerts.yaml"
@@ -30,16 +31,49 @@ def panels() -> list[Json]:
 
 
 def expressions() -> Iterator[tuple[str, str]]:
-    """Each panel's title with each of its queries, for all proxies and over half a minute."""
+    """Each panel's title with each of its queries, for all proxies and over half a minute.
+
+    Without the zero that is shown where there is nothing: with it each query would have data.
+    """
     for panel in panels():
         for target in panel["targets"]:
             query = target["expr"].replace("$instance", ".*").replace("$__rate_interval", "30s")
-            yield panel["title"], query
+            yield panel["title"], query.removesuffix(" or vector(0)")
 
 
 def metrics(query: str) -> set[str]:
     """The metrics of the project and of its processes that a query names."""
     return set(re.findall(r"\b(?:rosproxy|process)_\w+", query))
+
+
+def of_kubernetes(query: str) -> bool:
+    """Whether a query is for what the operator on Kubernetes alone counts."""
+    return bool(metrics(query) & (_families(ClusterMetrics()) - _families(DockerMetrics())))
+
+
+def of_docker(query: str) -> bool:
+    """Whether a query is for what the operator on Docker alone counts."""
+    return bool(metrics(query) & (_families(DockerMetrics()) - _families(ClusterMetrics())))
+
+
+def _families(metrics: CommonMetrics) -> set[str]:
+    """The names of its metrics in queries."""
+    described = metrics.registry.collect()
+    return {
+        f"{family.name}_total" if family.type == "counter" else family.name for family in described
+    }
+
+
+def relabel_configs(endpoint: Json) -> list[Json]:
+    """The relabelings of a monitor's endpoint, in the names of Prometheus' own file.
+
+    The Prometheus operator hands them on as they are.
+    """
+    names = {"sourceLabels": "source_labels", "targetLabel": "target_label"}
+    return [
+        {names.get(key, key): value for key, value in rule.items()}
+        for rule in endpoint["relabelings"]
+    ]
 
 
 def scrape_configs() -> list[Any]:

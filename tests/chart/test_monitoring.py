@@ -20,6 +20,7 @@ from tests.chart.monitoring import (
     expressions,
     metrics,
     panels,
+    relabel_configs,
     scrape_configs,
 )
 from tests.docker.engine import wait_until
@@ -94,25 +95,15 @@ def test_the_operator_is_called_as_alerts_have_it(tmp_path: Path) -> None:
 
 
 def targets(directory: Path, labels: Json, endpoint: Json, *addresses: str) -> list[Json]:
-    """What Prometheus makes of addresses that were found with labels, by a monitor's rules.
-
-    The Prometheus operator hands those on as they are, in the names of Prometheus' own file.
-    """
+    """What Prometheus makes of addresses that were found with labels, by a monitor's rules."""
     targets_file = directory / "found.json"
     targets_file.write_text(json.dumps([{"targets": addresses, "labels": labels}]))
-    names = {"sourceLabels": "source_labels", "targetLabel": "target_label"}
-    rules = [{names.get(key, key): value for key, value in rule.items()}
-             for rule in endpoint["relabelings"]]  # fmt: skip
     job = {"job_name": "found", "file_sd_configs": [{"files": [str(targets_file)]}],
-           "relabel_configs": rules, "scrape_interval": "1h", "scrape_timeout": "1s"}  # fmt: skip
+           "relabel_configs": relabel_configs(endpoint), "scrape_interval": "1h",
+           "scrape_timeout": "1s"}  # fmt: skip
     with running_prometheus(directory, {"scrape_configs": [job]}) as prometheus:
-
-        def active() -> list[Json]:
-            given: list[Json] = prometheus.ask("targets", state="active")["activeTargets"]
-            return given
-
-        wait_until(lambda: bool(active()), 30, "the file is read")
-        return active()
+        wait_until(lambda: bool(prometheus.targets()), 30, "the file is read")
+        return prometheus.targets()
 
 
 @pytest.mark.parametrize("alert", alerts(), ids=lambda alert: str(alert["alert"]))

@@ -54,33 +54,37 @@ class Prometheus:
         wait_until(lambda: bool(matching_alerts()), seconds, lambda: f"{wanted} in {self.firing()}")
         return matching_alerts()[0]
 
+    def targets(self) -> list[dict[str, Any]]:
+        """All targets that are scraped, whether they answer or not."""
+        active: list[dict[str, Any]] = self.ask("targets", state="active")["activeTargets"]
+        return active
+
     def answering(self) -> set[tuple[str, str]]:
         """The targets that answer, by job and instance."""
-        labels = [
-            target["labels"]
-            for target in self.ask("targets")["activeTargets"]
-            if target["health"] == "up"
-        ]
+        labels = [target["labels"] for target in self.targets() if target["health"] == "up"]
         return {(target_labels["job"], target_labels["instance"]) for target_labels in labels}
 
 
 def guides_configuration(directory: Path, operator: str) -> Any:
-    """The guide's configuration for Docker; ``operator`` is where the operator's metrics are.
-
-    It looks each second, and alerts fire at once: how long what they name has to last is held in
-    tests/chart.
-    """
-    rules = yaml.safe_load(ALERTS.read_text())
-    for rule in rules["groups"][0]["rules"]:
-        rule.pop("for", None)
-    (directory / "alerts.yaml").write_text(yaml.safe_dump(rules))
+    """The guide's configuration for Docker; ``operator`` is where the operator's metrics are."""
     config = scrape_configs()[0]
-    config["global"] = {"scrape_interval": "1s", "evaluation_interval": "1s"}
+    config |= hurried(directory, yaml.safe_load(ALERTS.read_text()))
     proxies, operators = config["scrape_configs"]
     (discovery,) = proxies["docker_sd_configs"]
     discovery |= {"host": engine_url(), "refresh_interval": "1s"}
     operators["static_configs"][0]["targets"] = [operator]
     return config
+
+
+def hurried(directory: Path, rules: Any) -> Any:
+    """What makes Prometheus look each second; and the rules' file, by which they fire at once.
+
+    How long what they name has to last is tested in tests/chart.
+    """
+    for rule in rules["groups"][0]["rules"]:
+        rule.pop("for", None)
+    (directory / "alerts.yaml").write_text(yaml.safe_dump(rules))
+    return {"global": {"scrape_interval": "1s", "evaluation_interval": "1s"}}
 
 
 @contextmanager

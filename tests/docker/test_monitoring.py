@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy_operator.common.operator_metrics import ClusterMetrics, CommonMetrics, DockerMetrics
-from tests.chart.monitoring import expressions, metrics
+from tests.chart.monitoring import expressions, of_kubernetes
 from tests.docker.controller import Controller, Proxy, proxies
 from tests.docker.engine import docker, wait_until
 from tests.docker.inside import ENABLE, Container, Inside, inside
@@ -56,19 +55,6 @@ def ros1_proxy() -> Proxy:
     return Proxy(name)
 
 
-def of_kubernetes(query: str) -> bool:
-    """Whether a query is for what the operator on Kubernetes alone counts."""
-    return bool(metrics(query) & (families(ClusterMetrics()) - families(DockerMetrics())))
-
-
-def families(metrics: CommonMetrics) -> set[str]:
-    """The names of its metrics in queries."""
-    described = metrics.registry.collect()
-    return {
-        f"{family.name}_total" if family.type == "counter" else family.name for family in described
-    }
-
-
 def test_dashboard_and_alerts(
     operator: Controller, prometheus: Prometheus, cell: Inside, patrol: Robot,
     lan: Outside, inside2: Inside2,
@@ -98,6 +84,10 @@ def test_dashboard_and_alerts(
         box.run("sh", "-c", "kill -KILL $(cat /tmp/victim.pid)")
         alert = prometheus.wait_for_alert("RosproxyNodeDown", instance=proxy.name, node="/victim")
         assert f"The ROS node /victim behind {proxy.name}" in alert["annotations"]["summary"]
+
+        elsewhere = (ENABLE, "rosproxy.advertise-host=192.0.2.1")
+        cell.idle(cell.network(), labels=elsewhere)
+        prometheus.wait_for_alert("RosproxyNotReachable")
 
         # The port of the dead one goes to one of them, and the last gets none.
         for number in range(NODES + 2):
