@@ -210,15 +210,19 @@ class Lab:
         answer: dict[str, Any] = json.loads(text)
         return answer
 
-    def links(self, topic: str) -> list[dict[str, Any]]:
-        """The links of a topic on the live page."""
+    def read(self, path: str) -> str:
+        """What the proxy's admin endpoint has, asked from where the proxy is."""
         with self.place("px").entered():
             connection = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
             try:
-                connection.request("GET", "/graph")
-                links = json.loads(connection.getresponse().read())["links"].values()
+                connection.request("GET", path)
+                return connection.getresponse().read().decode()
             finally:
                 connection.close()
+
+    def links(self, topic: str) -> list[dict[str, Any]]:
+        """The links of a topic on the live page."""
+        links = json.loads(self.read("/graph"))["links"].values()
         return [link for link in links if link["name"] == topic]
 
     def wait_shown(self, topic: str, **wanted: Any) -> dict[str, Any]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from tests.ros.combinations import each_library
 from tests.ros.lab import Lab
@@ -41,6 +43,36 @@ def test_status_shows_a_node_with_its_addresses_and_connections(lab: Lab, librar
     table = lab.rosproxy("status").output
     assert f"/{name} " in table
     assert f"topic {topic} with /{name}_sub" in table
+
+
+def counted(lab: Lab, topic: str, side: str) -> float:
+    """How many messages of a topic the metrics have."""
+    families = text_string_to_metric_families(lab.read("/metrics"))
+    labels = {"name": topic, "side": side}
+    return sum(
+        sample.value
+        for family in families
+        for sample in family.samples
+        if sample.name == "rosproxy_topic_messages_total" and sample.labels == labels
+    )
+
+
+@each_library
+def test_metrics_count_the_messages_of_nodes_inside(lab: Lab, library: str) -> None:
+    """Once each, though two hear them; of what comes in as well."""
+    name = lab.unique("counted")
+    outward, inward = f"/{name}/outward", f"/{name}/inward"
+    publisher = lab.node(library, "c1", "pub", name=name, topic=outward)
+    lab.node("roscpp", "out", "pub", topic=inward)
+    for role, topic in (("out", outward), ("out", outward), ("c2", inward)):
+        lab.node(library, role, "sub", topic=topic).wait_for("^got ")
+    first = counted(lab, outward, "published")
+    wait_until("sent ones are counted", lambda: counted(lab, outward, "published") > first, 60)
+    wait_until("received ones are counted", lambda: counted(lab, inward, "received") > 0, 60)
+    published = counted(lab, outward, "published")
+    sent = re.findall("^sent ", publisher.output(), re.MULTILINE)
+    assert published <= len(sent) + 1, "the last is printed after it was sent"
+    assert not counted(lab, inward, "published")
 
 
 def test_doctor_finds_nothing_wrong_with_healthy_nodes(lab: Lab) -> None:

@@ -16,6 +16,7 @@ import msgspec
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.bus_stats import read_bus_stats
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.graph import read_types
 
@@ -83,7 +84,7 @@ def slave_report(
     """
     rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5]
     rows = [row for row in rows if row[5] not in (0, "0")]
-    counted = _bus_counts(stats)
+    counted = read_bus_stats(stats)
     links = {(str(row[2]), str(row[4]), str(row[1])): row[0] for row in rows}
     counts = {
         link: counted[link[:2]][number]
@@ -93,33 +94,6 @@ def slave_report(
     return SlaveReport(
         read_types(publications), read_types(subscriptions), frozenset(links), counts, at
     )
-
-
-def _bus_counts(stats: Any) -> dict[tuple[str, str], dict[int, tuple[int, int]]]:
-    """Bytes and messages in ``getBusStats``, by direction and topic, then by connection.
-
-    The second list is of subscriptions: ``[id, bytes, messages, drops, ...]`` each. In that of
-    publications rospy has ``[id, bytes, messages, connected]``, roscpp ``[id, bytes, bytes of
-    messages, messages, connected]`` (``Publication::getStats``).
-    """
-    by_topic: dict[tuple[str, str], dict[int, tuple[int, int]]] = {}
-    for direction, rows in zip("oi", _items(stats)[:2], strict=False):
-        for row in _items(rows):
-            match row:
-                case [str(topic), *_, list(connections)]:
-                    counts = by_topic.setdefault((direction, topic), {})
-                    counts.update(filter(None, (_counts(c, direction) for c in connections)))
-    return by_topic
-
-
-def _counts(row: Any, direction: str) -> tuple[int, tuple[int, int]] | None:
-    """The number of a connection, with its bytes and messages."""
-    match row:
-        case [int(number), int(size), _, int(messages), _] if direction == "o":
-            return number, (size, messages)
-        case [int(number), int(size), int(messages), *_]:
-            return number, (size, messages)
-    return None
 
 
 def data_port(answer: Any) -> HostPort | None:

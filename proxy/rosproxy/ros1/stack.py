@@ -48,6 +48,7 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
+from rosproxy.ros1.upkeep.message_counter import COUNT_TICK, MessageCounter
 from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, PolicyEnforcer
 from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
@@ -104,7 +105,8 @@ class Ros1:
         self.master_monitor = monitor = MasterMonitor(
             context, self._recovery, registrar, self._memory
         )
-        self._state = Ros1State(context, monitor, self.tcpros, self.stand_ins, plane)
+        self._messages = messages = MessageCounter(context)
+        self._state = Ros1State(context, monitor, self.tcpros, self.stand_ins, plane, messages)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(
             context, leases, self.stand_ins, self._adopter, self.tcpros, access
@@ -172,6 +174,7 @@ class Ros1:
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
         repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
         repeat(self.stand_ins.tidy, TIDY_INTERVAL, "looking after nodes outside")
+        repeat(self._messages.look, COUNT_TICK, "counting messages")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         repeat(self._enforcer.look, ENFORCE_TICK, "enforcing the policy")
 

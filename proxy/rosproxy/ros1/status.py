@@ -21,6 +21,7 @@ from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
+from rosproxy.ros1.upkeep.message_counter import MessageCounter
 from rosproxy.telemetry.metrics import NamedNodes
 
 
@@ -33,6 +34,7 @@ class Ros1State(Collector):
     _tcpros: TcprosServer
     _stand_ins: StandInPorts
     _plane: KernelPlane
+    _messages: MessageCounter
     _down: NamedNodes = field(default_factory=NamedNodes)
 
     def add_to(self, status: document.ProxyStatus) -> document.ProxyStatus:
@@ -84,6 +86,7 @@ class Ros1State(Collector):
         yield by_state
         yield self._nodes_down()
         yield from self._bytes()
+        yield from self._counted_by_nodes()
 
     def _numbers(self) -> Iterator[tuple[str, str, float]]:
         """Name, meaning and value of each gauge without labels."""
@@ -134,6 +137,17 @@ class Ros1State(Collector):
         for labels, size in self._plane.traffic.totals():
             forwarded.add_metric(labels[1:], size)  # the first one is "node" for all
         return relayed, forwarded
+
+    def _counted_by_nodes(self) -> Iterable[Metric]:
+        labels = ["name", "side"]
+        text = "Messages of topics that inside nodes published or received, as they count."
+        messages = CounterMetricFamily("rosproxy_topic_messages", text, labels=labels)
+        text = "Bytes of topics that inside nodes published or received, as they count."
+        sizes = CounterMetricFamily("rosproxy_topic_bytes", text, labels=labels)
+        for key, (size, count) in self._messages.read().by_topic.items():
+            messages.add_metric(key, count)
+            sizes.add_metric(key, size)
+        return messages, sizes
 
     def _settings(self, common: document.StatusSettings) -> document.StatusSettings:
         settings, selected = self._context.settings, self._context.selected

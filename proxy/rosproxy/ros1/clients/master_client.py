@@ -233,10 +233,12 @@ class MasterClient:
             target, name = self.reach(slave), str(slave)
             return await self._nodes.pass_on(target, "/", name, body, NODE_TIMEOUT)
 
-    async def call_node(self, slave: HostPort, within: float, method: str, *params: Any) -> Any:
+    async def call_node(
+        self, slave: HostPort, within: float, method: str, *params: Any, limits: Limits = REPLY
+    ) -> Any:
         """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
-        return read_value(method, await self.post_to_node(slave, body, within))
+        return read_value(method, await self.post_to_node(slave, body, within), limits)
 
     def close_after_answer(self, sock: socket.socket) -> None:
         """Close a connection to a node on which an answer is due, once that has come."""

@@ -20,6 +20,8 @@ port opens or refuses. Nothing below knows who asked for it.
     policy has changed                         connections                        cut
     TIDY_INTERVAL           stand_in_ports     problems with                      those of ended
                                                nodes outside                      nodes go
+    COUNT_TICK, while the   message_counter    what nodes count   topic_growth    added to the
+    metrics are read                                                              metrics
     RETRY_BLOCKED           leases             ports that others                  they open
                                                had
     POST /containers        containers         the nodes there    liveness        unregistered,
