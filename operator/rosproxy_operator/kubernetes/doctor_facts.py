@@ -61,8 +61,8 @@ class DoctorFacts:
         for place in self._places:
             events += self._ask("events", partial(self._warnings, place)) or []
         recent = recent_events(events, rosproxies, own_pods, time.time())
-        known = {text_at(submap(obj, "metadata"), "uid") for obj in (*rosproxies, *own_pods)}
-        return [e for e in recent[:MOST_LOOKED_FOR] if e.uid in known or self._is_there(e)]
+        ours = {text_at(submap(obj, "metadata"), "uid") for obj in (*rosproxies, *own_pods)}
+        return [e for e in recent[:MOST_LOOKED_FOR] if e.uid in ours or self._is_there(e)]
 
     def _warnings(self, place: str) -> list[Json]:
         return [*self._api.list_fresh("events", place, fields="type=Warning")]

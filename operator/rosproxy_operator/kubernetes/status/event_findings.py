@@ -50,14 +50,14 @@ def recent_events(
     uids = {text_at(submap(obj, "metadata"), "uid") for obj in rosproxies}
     pod_uids = {text_at(submap(obj, "metadata"), "uid") for obj in pods}
     told = [*_messages(rosproxies)]
-    found: dict[tuple[str, str, str], RecentEvent] = {}
+    newest: dict[tuple[str, str, str], RecentEvent] = {}
     for event in sorted((_read(e, now) for e in events), key=lambda e: e.age):
-        known = uids if event.kind == KIND else pod_uids
-        matters = event.uid in known or (event.kind == "Pod" and event.own)
+        ours = uids if event.kind == KIND else pod_uids
+        matters = event.uid in ours or (event.kind == "Pod" and event.own)
         if matters and not (event.own and _is_told(event, told)):
             message = event.message if event.own else ""
-            found.setdefault((event.uid, event.reason, message), event)
-    return [*found.values()]
+            newest.setdefault((event.uid, event.reason, message), event)
+    return [*newest.values()]
 
 
 def event_findings(

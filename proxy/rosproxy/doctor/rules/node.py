@@ -49,8 +49,8 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
         states = [node.state for node in present]
         text = f"{states.count('ok')} of {len(states)} answer"
         if ended:
-            held = f"{plural(len(ended), 'port')} for up to {facts.proxy.settings.linger:g} s"
-            text += f"; those that have ended still hold {held}"
+            ports = f"{plural(len(ended), 'port')} for up to {facts.proxy.settings.linger:g} s"
+            text += f"; those that have ended still hold {ports}"
         yield ok(INSIDE, "inside nodes", text)
     elif facts.status is not None:
         text = "none has registered through the proxy"
