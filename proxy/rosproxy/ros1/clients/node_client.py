@@ -28,6 +28,7 @@ from rosproxy.ros1.clients.master_client import (
 )
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc.limits import PID_REPLY
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo, read_types
 from rosproxy.ros1.registry.node_health import ProbeResult
 
@@ -81,7 +82,7 @@ class NodeClient:
 
         Raises Unreachable if it is no XML-RPC.
         """
-        match parse_value(body):
+        match parse_value(body, PID_REPLY):
             case [_, _, int(pid)]:
                 return pid
         return None

@@ -33,6 +33,10 @@ def master_call(mebibytes: int) -> Limits:
 
 REPLY = Limits(4 * 1024 * 1024, 20_000)
 """A reply in which addresses are replaced: the publishers of a topic, a node's connections."""
+BUS_STATS = Limits(4 * 1024 * 1024, 10_000)
+"""What a node has counted: twelve elements for each topic with two connections."""
+PID_REPLY = Limits(4 * 1024 * 1024, 100)
+"""A node's pid, which it is asked for over and over, or its refusal: five elements."""
 OWN_REPLY = Limits(64 * 1024 * 1024, 500_000)
 """The master's reply to a call of the proxy's own: the graph of all nodes, of ten elements for each
 topic and as many for each service."""
