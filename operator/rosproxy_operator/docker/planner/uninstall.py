@@ -15,7 +15,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import RemoveNetwork
 from rosproxy_operator.docker.planner.container_steps import removal_steps
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.model import STARTED, HostState
+from rosproxy_operator.docker.planner.model import SERVING, HostState
 from rosproxy_operator.docker.planner.plan import DockerPlan, Group
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -96,9 +96,9 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
 
 
 def _guests(observed: HostState, network: str) -> list[str]:
-    """Other containers that are on a network, so that the engine does not remove it."""
+    """Other containers that are on a network; without it one that restarts could not start."""
     return sorted(
         container.name
         for container in observed.containers
-        if container.state in STARTED and network in container.networks
+        if container.state in SERVING and network in container.networks
     )

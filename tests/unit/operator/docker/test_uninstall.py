@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
-from hypothesis import given
+import pytest
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy_operator.docker.engine_json import read_network
 from rosproxy_operator.docker.planner.actions import RemoveNetwork
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.model import HostState
+from rosproxy_operator.docker.planner.model import STARTED, HostState
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import ROLE_REDIRECT, proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -33,12 +34,14 @@ def look(uninstall: Uninstall, state: HostState) -> DockerPlan:
 
 
 @given(st.integers(1, 3), st.lists(EVENTS, max_size=30))
+@example(1, [(Hosts.share, 0, 0), (Hosts.come_to_rest, 0, 0), (Hosts.change, 0, 1)])
 def test_after_whatever_happened_nothing_is_left(containers: int, events: list) -> None:
     host = Hosts()
     for number in range(containers):
         host.run(number, number)
     for happen, n, m in events:
         happen(host, n, m)
+        host.check()  # which also notes who has which ports
     host.engine.redirects_fail, host.engine.uninstalls = False, True
     before = [(box.id, box.name, box.state, dict(box.networks)) for box in host.strangers()]
     networks = {n.id for n in host.engine.networks.values() if not n.made_by_operator}
@@ -52,7 +55,8 @@ def test_after_whatever_happened_nothing_is_left(containers: int, events: list) 
     assert not stays or (not host.engine.image and any("proxy image" in p for p in problems))
     for network in host.engine.networks.values():
         assert not network.made_by_operator or f"network {network.name}" in problems
-    namespaces = {box.namespace for box in host.strangers()}
+    # Of a container that has ended the rules have gone with the namespace.
+    namespaces = {box.namespace for box in host.strangers() if box.state in STARTED}
     for place in host.engine.rules:
         assert not host.engine.image or place in host.forgotten or place[0] not in namespaces
 
@@ -86,8 +90,9 @@ def test_a_network_that_somebody_else_made_stays() -> None:
     assert (planned.actions, planned.problems) == ((), ())
 
 
-def test_who_is_still_on_the_uplink_is_named() -> None:
-    guest = container("prometheus", {}, networks=(UPLINK.name,))
+@pytest.mark.parametrize("state", ["running", "paused", "restarting"])
+def test_who_is_still_on_the_uplink_is_named(state: str) -> None:
+    guest = container("prometheus", {}, networks=(UPLINK.name,), state=state)
     planned = look(Uninstall(), observed(guest, networks=(OURS, APP)))
     assert planned.actions == ()
     (problem,) = planned.problems
