@@ -40,6 +40,14 @@ class Prometheus:
         )
         return [series["metric"] for series in answer["result"]]
 
+    def wait_for_data(self, panels: list[tuple[str, str]]) -> None:
+        """Wait until each query, given with its title, has had something since the beginning."""
+
+        def empty() -> list[tuple[str, str]]:
+            return [panel for panel in panels if not self.series(panel[1])]
+
+        wait_until(lambda: not empty(), 30, lambda: f"without data: {empty()}")
+
     def firing(self) -> list[dict[str, Any]]:
         """The alerts that fire now."""
         return [alert for alert in self.ask("alerts")["alerts"] if alert["state"] == "firing"]

@@ -105,7 +105,7 @@ def test_dashboard_and_alerts(
         prometheus.wait_for_alert("RosproxyDown", instance=proxy.name)
 
     asked = [(title, query) for title, query in expressions() if not of_kubernetes(query)]
-    assert not [panel for panel in asked if not prometheus.series(panel[1])]
+    prometheus.wait_for_data(asked)
 
 
 def start_node(box: Container, name: str) -> None:

@@ -74,7 +74,7 @@ def test_what_is_scraped_the_dashboard_and_alerts(
     # For ROS 2 and for a range that is full see tests/docker/test_monitoring.py.
     asked = [panel for panel in expressions()
              if not of_docker(panel[1]) and "rosproxy_ros2_" not in panel[1]]  # fmt: skip
-    assert not [panel for panel in asked if not prometheus.series(panel[1])]
+    prometheus.wait_for_data(asked)
 
 
 def check_targets(prometheus: Prometheus, proxies: list[Proxy]) -> None:
