@@ -157,8 +157,8 @@ def test_namespaces_are_folded_until_asked_for(lab: Lab, browser: Browser) -> No
 
 def test_names_are_text_whatever_they_are(lab: Lab, browser: Browser) -> None:
     """The master refuses odd names; who connects to a node may call himself anything."""
-    lab.node("roscpp", "c1", "pub", name="talker", topic="/chatter", rate=10)
-    lab.wait_registered("talker")
+    talker = lab.node("roscpp", "c1", "pub", name="talker", topic="/chatter", rate=10)
+    talker.wait_for("^sent ")  # registered it is before, for /rosout
     header = {"callerid": HOSTILE, "topic": "/chatter", "md5sum": "*", "type": "*"}
     with lab.place("out").entered():
         stranger = socket.create_connection((OUT_HOST, port_of(lab, "talker")))
