@@ -69,7 +69,7 @@ def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> 
 
 @click.command()
 @_json_option
-@_wait_option("Time in which there may come to be nothing to do, before it is shown.")
+@_wait_option("Time in which all may come to be done and well, before it is shown.")
 @click.pass_obj
 def plan(context: CommandContext, as_json: bool, wait: float) -> None:
     """Show what the operator would do now, and change nothing.

@@ -87,9 +87,10 @@ def _ask(endpoint: HostPort) -> Json | None:
 def show_plan(host: HostStatus, as_json: bool, wait: float) -> int:
     """Print what would be done now, and what is wrong; the exit code. Raises EngineError.
 
-    ``wait`` are the seconds in which there may come to be nothing to do.
+    ``wait`` are the seconds in which there may come to be nothing to do and nothing wrong: a proxy
+    that has just been started does not answer yet.
     """
-    status = _await(host, wait, lambda status: not status["actions"])
+    status = _await(host, wait, lambda status: not status["actions"] and not _is_wrong(status))
     shown = {key: status[key] for key in ("actions", "problems")}
     if as_json:
         write(json.dumps(shown, indent=2))

@@ -151,6 +151,26 @@ def test_a_plan_is_its_lines_and_its_exit_code(
     assert json.loads(capsys.readouterr().out) == {"actions": actions, "problems": problems}
 
 
+def test_a_plan_waits_for_a_proxy_that_has_just_been_started(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent = {"subject": "proxy a", "text": "does not answer", "fatal": True}
+    looks: list[dict[str, Any]] = [
+        {"actions": ["start container a"], "problems": []},
+        {"actions": [], "problems": [silent]},
+        {"actions": [], "problems": []},
+    ]
+
+    async def survey(settings: PlanSettings) -> dict[str, Any]:
+        return looks.pop(0)
+
+    monkeypatch.setattr(host_status, "survey", survey)
+    monkeypatch.setattr(host_status, "WAIT_INTERVAL", 0.0)
+    host = HostStatus(PlanSettings(), operator=None)
+    assert host_status.show_plan(host, as_json=False, wait=60) == 0
+    assert capsys.readouterr().out.splitlines() == ["Nothing to do."]
+
+
 @pytest.mark.parametrize(
     ("proxy", "code"),
     [
