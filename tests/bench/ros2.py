@@ -26,8 +26,8 @@ from tests.bench.world import (
     OUTSIDE,
     SYSTEM_PATH,
     World,
+    anonymous,
     cpu_seconds,
-    resident,
     world,
 )
 from tests.ros.processes import Process
@@ -189,11 +189,11 @@ def measure_crowd(book: Book, size: int, idle: float) -> None:
     """The same through the proxy, and what they cost it."""
     with world() as place, proxy(place, "auto") as pid:
         time.sleep(REMEMBERED)  # it waits no more for who had ports before it started
-        before = resident(pid)
+        before = anonymous(pid)
         book.add("discovery, s", PATH, crowded(place, size), size)
         book.add("CPU when idle, ms/s", PATH, busy(pid, idle) * 1000, size)
         if size == max(SIZES):
-            book.add("memory per participant, KiB", PATH, (resident(pid) - before) / size, size)
+            book.add("memory per participant, KiB", PATH, (anonymous(pid) - before) / size, size)
 
 
 def crowded(place: World, size: int, peer: str = "") -> float:

@@ -248,12 +248,20 @@ def resident(pid: int) -> int:
 
     What the kernel holds for sockets and pipes is not in it.
     """
-    return sum(map(_proportional, family(pid)))
+    return sum(_rolled_up(member, "Pss:") for member in family(pid))
 
 
-def _proportional(pid: int) -> int:
+def anonymous(pid: int) -> int:
+    """KiB of memory of a process and all below it that no file stands behind.
+
+    Other than the share of what is shared it does not get less where others start.
+    """
+    return sum(_rolled_up(member, "Anonymous:") for member in family(pid))
+
+
+def _rolled_up(pid: int, kind: str) -> int:
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
         return 0
-    return next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    return next(int(line.split()[1]) for line in lines if line.startswith(kind))
