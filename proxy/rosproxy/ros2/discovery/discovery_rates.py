@@ -1,23 +1,29 @@
-"""How much discovery one source may make: datagrams that are read, and those they lead to.
+"""How much discovery one source may make: the datagrams that are read and those they lead to.
 
-Reading discovery costs a hundred times what passing on a user's datagram does, and one announcement
-goes on to everybody on the other side. So each source has an allowance of datagrams, in and out,
-that fills up again with the time; a long one counts as several, since it takes as long to read.
-What users send is not charged, also where it comes to a port for both, as that of Cyclone DDS: but
-for what has to be read to tell, as it is encrypted, unknown, or of more submessages than is usual.
-What is over it is dropped, as datagrams may be anywhere: discovery is repeated, and its readers
-ask for what they lack.
+Reading discovery costs a hundred times what passing on a user's datagram does, and an announcement
+goes on to all participants of the other side. So each source has an allowance that fills up again
+with time. Datagrams are charged by their length, those of the source and those that they lead to.
+User data is not charged, also where it comes to a port for both, as that of Cyclone DDS. The proxy
+has to read some of it to tell: encrypted or unknown submessages, or more of them than is usual.
+A datagram over the allowance is lost. Participants repeat discovery, and readers ask for what they
+lack.
 """
 
 from dataclasses import dataclass, field
 
-PER_SECOND, BURST = 5_000.0, 25_000.0
-"""Datagrams of a source in a second, and at once. A host with fifty participants that all start at
-once, beside a hundred others, makes some ten thousand."""
+PER_SECOND = 10_000.0
+BURST = 50_000.0
+"""What a source may be charged in a second, and at once. Fifty participants at one address that
+start at once are charged 10,000 with two peers, and some 1,200 a second from then on."""
 STEP = 256
-"""Bytes that are read for one datagram's charge; most announcements are two or three."""
+"""Bytes of a datagram for each unit of its charge. An announcement takes two or three."""
 MOST_SOURCES = 4096
 """Sources that are remembered; of more, the one that has been heard first goes."""
+
+
+def cost(size: int) -> int:
+    """What a datagram of so many bytes is charged."""
+    return 1 + size // STEP
 
 
 @dataclass(slots=True)
@@ -35,11 +41,11 @@ class DiscoveryRates:
         allowed = remaining >= 1.0
         if source not in self._remaining and len(self._remaining) >= MOST_SOURCES:
             del self._remaining[next(iter(self._remaining))]
-        self._remaining[source] = (remaining - 1 - size // STEP if allowed else remaining), now
+        self._remaining[source] = (remaining - cost(size) if allowed else remaining), now
         return allowed
 
-    def charge(self, source: str, count: int) -> None:
-        """Charge a source with so many datagrams that its own have led to; it may go into debt."""
-        if count and source in self._remaining:
+    def charge(self, source: str, total: int) -> None:
+        """Charge a source with what its datagrams have led to, as `cost`; it may go into debt."""
+        if total and source in self._remaining:
             remaining, since = self._remaining[source]
-            self._remaining[source] = remaining - count, since
+            self._remaining[source] = remaining - total, since

@@ -22,9 +22,10 @@ Every datagram may be forged. So
 - each source may make only so much discovery in a second, what it leads to included.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
+from rosproxy.ros2.discovery.discovery_rates import cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import Outgoing, sent_to
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
@@ -63,7 +64,7 @@ class Domain(DomainParticipants):
                 sent += self._heard_inside(message, source, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
-        self.rates.charge(source, len(sent))
+        self._charge(source, sent)
         return sent
 
     def heard_outside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
@@ -83,13 +84,13 @@ class Domain(DomainParticipants):
                 return []
             if self._is_too_much(datagram, source, now):
                 return []
-            for message in map(read_discovery, by_source(datagram)):
+            for message, received in _credited(datagram):
                 if is_wrapped and message.of_participant is None:
                     raise RtpsError("the ear carries announcements of participants alone")
-                sent += self._heard_outside(message, source, heard_by_ear, now)
+                sent += self._heard_outside(message, source, heard_by_ear, received, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
-        self.rates.charge(source, len(sent))
+        self._charge(source, sent)
         return sent
 
     def at_lease(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
@@ -178,13 +179,18 @@ class Domain(DomainParticipants):
         return self._announced_inside(message, source, now)
 
     def _heard_outside(
-        self, message: DiscoveryMessage, source: str, heard_by_ear: bool, now: float
+        self,
+        message: DiscoveryMessage,
+        source: str,
+        heard_by_ear: bool,
+        received: int,
+        now: float,
     ) -> list[Outgoing]:
         prefix, spdp = message.prefix, message.of_participant
         if prefix in self.inside.by_prefix or prefix == self.own.observer.prefix:
             return []  # the ear hears what it has sent to the LAN itself
         if spdp is None:
-            return self.own.told_outside(message, source)
+            return self.own.told_outside(message, source, received)
         if not heard_by_ear and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
@@ -192,7 +198,7 @@ class Domain(DomainParticipants):
         outsider = self.outside.meet(message, source, now)
         if outsider is None:
             return []
-        outsider.credit += len(message.datagram)
+        outsider.credit += received
         sent = self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
         if spdp.ended:  # those inside are told of that, too
             self._forget_outside(outsider)
@@ -230,8 +236,13 @@ class Domain(DomainParticipants):
         """
         if announcement == insider.announcement and now - insider.announced_at < ANNOUNCED_AGAIN:
             return []
-        insider.announcement, insider.announced_at = announcement, now
-        return [] if insider.apart_until else self.settings.to_outside(announcement)
+        is_first = not insider.announcement
+        insider.announcement = announcement
+        insider.announced_at = now
+        if insider.apart_until:
+            return []
+        targets = self.settings.announcement_targets() if is_first else self.outside.met_targets()
+        return [Outgoing(target, announcement) for target in targets]
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         self.returning.end(message.prefix, source)
@@ -276,6 +287,7 @@ class Domain(DomainParticipants):
         insider: InsideParticipant,
         now: float,
         message: DiscoveryMessage,
+        received: int,
     ) -> _Passing:
         """Metatraffic from outside as a participant inside gets it. Raises RtpsError."""
         prefix, spdp = message.prefix, message.of_participant
@@ -292,7 +304,7 @@ class Domain(DomainParticipants):
             outsider = self.outside.meet(message, source, now)
         if outsider is None:
             return [], []
-        outsider.note_sent(message.datagram, insider.prefix)
+        outsider.note_received(message.datagram, received, insider.prefix)
         imported = partial(self.outside.imported, outsider, insider)
         passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
         back = self.outside.allowed_questions(outsider, questions)
@@ -325,6 +337,10 @@ class Domain(DomainParticipants):
             return
         self.ports.note_use(port, datagram, self.settings.is_peer(source), now)
 
+    def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
+        """Charge a source with the datagrams that its own have led to."""
+        self.rates.charge(source, sum(cost(len(out.datagram)) for out in sent))
+
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether a source makes more discovery than it may; what is not is charged to it."""
         if self.rates.take(source, len(datagram), now):
@@ -342,11 +358,27 @@ def _meant(users: _StandInUsers, datagram: bytes) -> _StandInUsers:
     return [user for user in users if user[0].prefix in named] if named else users
 
 
-def _pass_on_each(datagram: bytes, pass_on: Callable[[DiscoveryMessage], _Passing]) -> _Passing:
+def _pass_on_each(
+    datagram: bytes, pass_on: Callable[[DiscoveryMessage, int], _Passing]
+) -> _Passing:
     """What is passed on of a datagram, and what goes back, of all who send in it. RtpsError."""
-    passed, back = list[bytes](), list[Outgoing]()
-    for message in map(read_discovery, by_source(datagram)):
-        forwarded, replies = pass_on(message)
+    passed = list[bytes]()
+    back = list[Outgoing]()
+    for message, received in _credited(datagram):
+        forwarded, replies = pass_on(message, received)
         passed += forwarded
         back += replies
     return passed, back
+
+
+def _credited(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]:
+    """Each participant's message in a datagram, and how many of the received bytes are its own.
+
+    The messages together may be longer than the datagram (`by_source`); the numbers together are
+    not, so no participant is sent more than came in its name. Raises RtpsError.
+    """
+    remaining = len(datagram)
+    for message in map(read_discovery, by_source(datagram)):
+        received = min(len(message.datagram), remaining)
+        remaining -= received
+        yield message, received

@@ -13,6 +13,8 @@ PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST = 250, 7400, 7410
 """DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
 PARTICIPANTS_TRIED = 32
 """How many well-known ports of a peer are told of participants inside: each program has one."""
+NEXT_PORTS = 2
+"""How many more well-known ports are used than participants are known at an address."""
 
 MOST_INSIDE, MOST_OUTSIDE = 512, 1024
 """Participants of a domain on either side."""

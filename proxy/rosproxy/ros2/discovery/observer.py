@@ -55,10 +55,12 @@ class Observer:
                 received = self._received.setdefault((prefix, sample.writer), set())
                 if len(received) < MOST_SAMPLES:
                     received.add(sample.sequence)
+        # One answer to each writer: a datagram has room for 256 heartbeats, all of one writer.
+        by_writer = {heartbeat.writer: heartbeat for heartbeat in heartbeats(datagram)}
         answers = []
-        for heartbeat in heartbeats(datagram):
-            if heartbeat.writer in OBSERVED:
-                self._received.setdefault((prefix, heartbeat.writer), set())
+        for writer, heartbeat in by_writer.items():
+            if writer in OBSERVED:
+                self._received.setdefault((prefix, writer), set())
                 if heartbeat.last > 0:  # an empty writer would take an answer for a question
                     answers.append(self._answer(prefix, heartbeat))
         return answers

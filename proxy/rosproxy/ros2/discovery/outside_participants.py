@@ -24,6 +24,8 @@ from rosproxy.ros2.discovery.domain_settings import (
     MOST_LEASES,
     MOST_OUTSIDE,
     MOST_PER_HOST,
+    NEXT_PORTS,
+    PARTICIPANTS_TRIED,
     DomainSettings,
     Outgoing,
     Refused,
@@ -139,6 +141,30 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         insider.farewell_times[outsider.prefix] = now
         datagram = farewell(outsider.prefix, outsider.vendor, next_number(outsider.announcement))
         return sent_to(insider.metatraffic, [datagram])
+
+    def met_targets(self) -> list[HostPort]:
+        """Where a participant inside is announced again, after its first announcement.
+
+        Of a peer without a port: where its participants receive discovery, and the next well-known
+        ports, which its participants take one after the other (DDSI-RTPS 2.5, 9.6.2.3). The
+        observer announces itself to all ports of peers, so participants at other ports are met
+        nevertheless. As long as nothing is known of a peer, all its well-known ports are used.
+        """
+        targets = [self.settings.ear] if self.settings.ear else []
+        for peer in self.settings.peers:
+            count = self.count_by_address[peer.host]
+            if peer.port:
+                targets.append(peer)
+            elif not count:
+                targets += self.settings.well_known(peer.host)
+            else:
+                targets += self._met_at(peer.host, count)
+        return targets
+
+    def _met_at(self, host: str, count: int) -> list[HostPort]:
+        met = (p.metatraffic for p in self.by_prefix.values() if p.address == host)
+        next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, PARTICIPANTS_TRIED))
+        return list(dict.fromkeys([*next_ports, *filter(None, met)]))
 
     def is_strange(self, source: str) -> bool:
         """Whether nobody is known at an address, so that nothing from there is read."""

@@ -72,12 +72,15 @@ class OwnParticipants:
         )
         return sent_to(insider.metatraffic, self._ask(self.settings.unicast_port, message, rewrite))
 
-    def told_outside(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
-        """Take in what a participant outside tells the observer. Raises RtpsError."""
+    def told_outside(self, message: DiscoveryMessage, source: str, received: int) -> list[Outgoing]:
+        """Take in what a participant outside tells the observer. Raises RtpsError.
+
+        ``received`` is how many bytes came from the participant.
+        """
         outsider = self.outside.find(message.prefix, source)
         if outsider is None:
             return []
-        outsider.note_sent(message.datagram, self.observer.prefix)
+        outsider.note_received(message.datagram, received, self.observer.prefix)
         rewrite = partial(self.outside.observed, outsider)
         questions = self._ask(self.settings.discovery_port, message, rewrite)
         return self.outside.allowed_questions(outsider, questions)

@@ -44,6 +44,8 @@ SENTINEL = 1
 """The id that ends a parameter list; its length means nothing."""
 MOST_PARAMETERS = 512
 """Parameters of a list that are read, its end among them; real ones have less than a hundred."""
+MOST_INLINE_BYTES = 16 * 1024
+"""Bytes of all inline QoS in a datagram. A sample of discovery has 24 to 36."""
 _LITTLE_HEADER, _BIG_HEADER = struct.Struct("<HH"), struct.Struct(">HH")
 
 _LITTLE, _QOS, _DATA, _KEY, _FRAGMENT_KEY = 0x01, 0x02, 0x04, 0x08, 0x04
@@ -162,25 +164,40 @@ def has_checksum(datagram: bytes) -> bool:
 
 
 def samples(datagram: bytes) -> list[Sample]:
-    """All samples in a message, in their order. Raises RtpsError if a length leads outside."""
-    all_samples, prefix = list[Sample](), source_prefix(datagram)
+    """All samples in a message, in their order.
+
+    Raises RtpsError if a length leads outside, or the inline QoS is longer than MOST_INLINE_BYTES.
+    """
+    all_samples = list[Sample]()
+    prefix = source_prefix(datagram)
+    inline_bytes = 0
     for kind, flags, body in submessages(datagram):
         if kind == _INFO_SRC:
             require_size(body, 20)
             prefix = datagram[body.start + 8 : body.start + 20]
         elif kind in _WITH_SAMPLE:
-            all_samples.append(_sample(datagram, prefix, flags, body, kind == _DATA_FRAG))
+            sample = _sample(datagram, prefix, flags, body, kind == _DATA_FRAG)
+            if sample.inline_qos is not None:
+                inline_bytes += sample.inline_qos.end - sample.inline_qos.start
+            # Reading a parameter takes a microsecond, and the shortest has four bytes.
+            if inline_bytes > MOST_INLINE_BYTES:
+                raise RtpsError(f"inline QoS of more than {MOST_INLINE_BYTES} bytes in a datagram")
+            all_samples.append(sample)
     return all_samples
 
 
 def by_source(datagram: bytes) -> list[bytes]:
-    """The message split into one for each participant that sends in it, in their order.
+    """Split a message into one for each participant that sends in it, in their order.
 
     Cyclone DDS has the participants of a program share a message (INFO_SRC, 8.3.8.9). A destination
-    holds until another one is named. Raises RtpsError if a length leads outside.
+    holds until the message names another one, so each part repeats the destination: 16 bytes, where
+    the INFO_SRC had 24 with its header. All parts together are at most half as long again as the
+    message. Raises RtpsError if a length leads outside.
     """
     source_prefix(datagram)
-    header, start, info_dst = datagram[:HEADER], HEADER, b""
+    header = datagram[:HEADER]
+    start = HEADER
+    info_dst = b""
     messages = list[bytes]()
     for kind, _, body in submessages(datagram):
         if kind == _INFO_SRC:
@@ -191,10 +208,16 @@ def by_source(datagram: bytes) -> list[bytes]:
             header = MAGIC + datagram[source_offset : source_offset + VERSION_TO_PREFIX] + info_dst
             start = body.end
         elif kind == INFO_DST:
-            info_dst = datagram[body.start - 4 : body.end]
+            # The prefix alone: an INFO_DST may be longer, and each part repeats it.
+            info_dst = _info_dst(datagram[body.start : body.start + PREFIX])
     if not messages and start == HEADER:
         return [datagram]
     return [*messages, header + datagram[start:]] if start < len(datagram) else messages
+
+
+def _info_dst(prefix: bytes) -> bytes:
+    """A submessage that says for which participant the next ones are."""
+    return struct.pack("<BBH", INFO_DST, _LITTLE, PREFIX) + prefix
 
 
 def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:

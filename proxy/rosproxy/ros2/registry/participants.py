@@ -248,9 +248,12 @@ class OutsideParticipant(Participant):
     has_come_in: bool = False
     credit: int = 0
 
-    def note_sent(self, datagram: bytes, addressee: bytes) -> None:
-        """Note what it has sent; a message to ``addressee`` proves that it gets ours. RtpsError."""
-        self.credit += len(datagram)
+    def note_received(self, datagram: bytes, size: int, addressee: bytes) -> None:
+        """Note a message of the participant's, for which ``size`` bytes have come.
+
+        A message to ``addressee`` proves that the participant receives ours. Raises RtpsError.
+        """
+        self.credit += size
         if not self.proven and destination(datagram) == addressee:
             self.proven = True
 

@@ -10,7 +10,7 @@ An announcement that is to be hidden goes on as a GAP, so that its reader does n
 and again.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from enum import IntEnum
 
 import msgspec
@@ -64,6 +64,11 @@ LONGEST_OF_PARTICIPANT = 8192
 _OF_ANOTHER = "it announces another participant than the one that sends it"
 LONGEST_TOPIC = 1024
 """Bytes of a topic's name; those of ROS 2 have 255."""
+MOST_PARAMETERS_OF_ALL = 4096
+"""Parameters of all announcements in a datagram. A reader or writer has 25 in 600 bytes, so a
+datagram of 64 KiB has 2,700."""
+MOST_LOCATORS_OF_ALL = 1024
+"""Locators of all announcements in a datagram. Fast DDS writes five for a reader or writer."""
 
 
 class BuiltinWriter(IntEnum):
@@ -118,6 +123,11 @@ class Announcement(msgspec.Struct, frozen=True):
                     return datagram[parameter.value.start + 12 : parameter.value.start + 16]
         return None
 
+    @property
+    def locator_count(self) -> int:
+        """How many locators it names, of all kinds."""
+        return len(self.parameters.all(*UNICAST, *MULTICAST))
+
     def reached_at(self, datagram: bytes) -> Iterator[tuple[int, HostPort]]:
         """The unicast locators of UDP, each with its parameter's id."""
         for parameter in self.parameters.all(*UNICAST):
@@ -162,7 +172,7 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
     message = DiscoveryMessage(
         datagram,
         prefix,
-        tuple(_announcement(datagram, s) for s in builtin_samples if s.fragments is None),
+        _announcements(datagram, [s for s in builtin_samples if s.fragments is None]),
         tuple((s, s.fragments) for s in builtin_samples if s.fragments is not None),
     )
     if len(datagram) > LONGEST_OF_PARTICIPANT and message.of_participant is not None:
@@ -195,6 +205,23 @@ def require_rewritable(message: DiscoveryMessage) -> None:
     if message.fragments:
         raise RtpsError("fragments in a message by which a participant announces itself")
     rewritten(message, lambda *_: None, lambda told: bool(told.topic(message.datagram)))
+
+
+def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[Announcement, ...]:
+    """The announcements in samples. Raises RtpsError if one is malformed, or they take too long."""
+    announcements = list[Announcement]()
+    parameter_count = 0
+    locator_count = 0
+    for sample in builtin_samples:
+        announcement = _announcement(datagram, sample)
+        parameter_count += len(announcement.parameters.parameters)
+        locator_count += announcement.locator_count
+        if parameter_count > MOST_PARAMETERS_OF_ALL:
+            raise RtpsError(f"more than {MOST_PARAMETERS_OF_ALL} parameters in a datagram")
+        if locator_count > MOST_LOCATORS_OF_ALL:
+            raise RtpsError(f"more than {MOST_LOCATORS_OF_ALL} locators in a datagram")
+        announcements.append(announcement)
+    return tuple(announcements)
 
 
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:

@@ -23,6 +23,7 @@ from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import (
+    NEXT_PORTS,
     PARTICIPANTS_TRIED,
     DomainSettings,
     Outgoing,
@@ -193,7 +194,9 @@ class DomainServer:
             count = counts.get(address, 0)
             # Participants of a machine take these ports one after the other (9.6.2.3): those that
             # have not been heard yet are at the next ones.
-            targets = settings.well_known(address, count + 2 if count else PARTICIPANTS_TRIED)
+            targets = settings.well_known(
+                address, count + NEXT_PORTS if count else PARTICIPANTS_TRIED
+            )
             self._send(Outgoing(target, announcement) for target in targets)
 
     def _observe(self, near: str) -> None:

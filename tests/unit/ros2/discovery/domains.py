@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, Outgoing
 from rosproxy.ros2.protocol.locators import pack_locator
@@ -47,12 +48,15 @@ def make_domain(
     return Domain.starting(settings, PortPool(ports.listen), b"the observer", 0.0)
 
 
-def spdp(prefix: bytes, address: str, port: int = 7410, lease: float = 20) -> bytes:
+def spdp(
+    prefix: bytes, address: str, port: int = 7410, lease: float = 20, padding: int = 0
+) -> bytes:
     parameters = [
         (Pid.PARTICIPANT_GUID, prefix + bytes([0, 0, 1, 0xC1])),
         (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(address, port), "<")),
         (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(address, port + 1), "<")),
         (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
+        *([(Pid.ENTITY_NAME, bytes(padding))] if padding else []),
     ]
     return message(data(payload(parameters)), prefix=prefix)
 
@@ -76,6 +80,11 @@ def sedp(prefix: bytes, address: str, port: int, to: bytes = b"") -> bytes:
 def reached_at(datagram: bytes) -> list[HostPort]:
     (announcement,) = read_discovery(datagram).announcements
     return [locator for _, locator in announcement.reached_at(datagram)]
+
+
+def allowance_left(domain: Domain, source: str) -> float:
+    remaining, _ = domain.rates._remaining.get(source, (BURST, 0.0))
+    return remaining
 
 
 def meet(domain: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgoing]:

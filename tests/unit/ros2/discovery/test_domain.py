@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.discovery_rates import BURST
-from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN
+from rosproxy.ros2.discovery.discovery_rates import BURST, STEP, cost
+from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
@@ -34,6 +34,7 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
+    allowance_left,
     farewell,
     make_domain,
     meet,
@@ -372,9 +373,38 @@ def test_an_announcement_is_charged_with_what_it_leads_to() -> None:
     domain = make_domain()
     for number in range(40):
         domain.heard_outside(spdp(bytes([9, number]) + B[2:], ROBOT), ROBOT, NOW)
-    meet(domain)
-    left = sum(1 for _ in range(int(BURST)) if domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW))
-    assert left < BURST / 2
+    before = allowance_left(domain, INSIDE)
+    announcement = spdp(A, INSIDE)
+    sent = domain.heard_inside(announcement, INSIDE, NOW)
+    led_to = sum(cost(len(out.datagram)) for out in sent)
+    assert led_to > 40
+    assert allowance_left(domain, INSIDE) == before - cost(len(announcement)) - led_to
+
+
+def test_a_long_announcement_is_charged_for_each_copy() -> None:
+    """Copies counted as one each, whatever their length."""
+    domain = make_domain(peers=[f"10.0.1.{number}" for number in range(32)])
+    before = allowance_left(domain, INSIDE)
+    domain.heard_inside(spdp(A, INSIDE, padding=7000), INSIDE, NOW)
+    assert before - allowance_left(domain, INSIDE) > 33 * 7000 / STEP
+
+
+def targets_of(domain: Domain, announcement: bytes, now: float) -> set[HostPort]:
+    sent = domain.heard_inside(announcement, INSIDE, now)
+    return {out.target for out in sent if out.target.host == ROBOT}
+
+
+def test_an_announcement_is_repeated_where_a_peers_participants_are() -> None:
+    """Each announcement went to 32 ports of each peer, however often it came."""
+    domain = make_domain(peers=[])
+    domain.settings.peers = (HostPort(ROBOT, 0),)
+    everywhere = {HostPort(ROBOT, port) for port in range(7410, 7474, 2)}
+    assert targets_of(domain, spdp(A, INSIDE), NOW) == everywhere
+    assert targets_of(domain, spdp(A, INSIDE), NOW + 3) == everywhere  # nothing is known of it
+    domain.heard_outside(spdp(B, ROBOT, 7440), ROBOT, NOW + 3)
+    known = {HostPort(ROBOT, port) for port in (7410, 7412, 7414, 7440)}
+    assert targets_of(domain, spdp(A, INSIDE), NOW + 6) == known
+    assert targets_of(domain, spdp(bytes([7]) * 12, INSIDE, 7420), NOW + 6) == everywhere
 
 
 @pytest.mark.parametrize("outside", [False, True])

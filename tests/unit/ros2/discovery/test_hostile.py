@@ -134,6 +134,47 @@ def test_fragments_are_judged_anew_by_another_policy() -> None:
     assert b"chatter" not in sent.datagram
 
 
+def shared_message(prefixes: list[bytes], *in_front: bytes, to_each: bytes) -> bytes:
+    """A message in which many participants speak."""
+    parts = [
+        submessage(0x0C, 0, bytes(4) + b"\x02\x03\x01\x0f" + prefix) + to_each
+        for prefix in prefixes
+    ]
+    return message(*in_front, *parts, prefix=prefixes[0])
+
+
+def test_what_is_split_is_not_multiplied() -> None:
+    """A long INFO_DST went into each part: 65 kB became seven megabytes."""
+    domain = make_domain()
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = domain.outside.stand_ins
+    info_dst = submessage(0x0E, 0, B + bytes(55_000))
+    datagram = shared_message([A] * 120, info_dst, to_each=heartbeat(1, 2))
+    sent = domain.at_stand_in(stand_in, datagram, INSIDE, NOW)
+    assert len(sent) == 121
+    assert sum(len(out.datagram) for out in sent) <= 1.5 * len(datagram)
+
+
+@pytest.mark.parametrize("is_at_lease", [False, True])
+@pytest.mark.parametrize("size", [12, 9000])
+def test_an_unproven_participant_has_no_credit_for_copies(is_at_lease: bool, size: int) -> None:
+    """What a message became when it was split counted as received: a victim was sent 30 times what
+    came in its name."""
+    domain = make_domain(peers=[])
+    domain.heard_outside(wrapped(STRANGER, spdp(B, STRANGER)), EAR.host, NOW)
+    meet(domain)
+    (port, *_) = domain.inside.leases
+    info_dst = submessage(0x0E, 0, bytes([7]) * size)
+    datagram = shared_message([B] * 100, info_dst, to_each=heartbeat(1, 0))
+    if is_at_lease:
+        domain.at_lease(port, datagram, STRANGER, NOW)
+    else:
+        domain.heard_outside(datagram, STRANGER, NOW)
+    assert len(datagram) < domain.outside.by_prefix[B].credit
+    assert domain.outside.by_prefix[B].credit <= len(datagram) + len(spdp(B, STRANGER))
+
+
 def test_an_exhausted_range_is_not_searched_for_each_locator(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -61,3 +61,11 @@ def test_a_participant_that_has_gone_is_forgotten() -> None:
     observer.forget(PEER)
     (answer,) = observer.take(PEER, message(heartbeat(1, 1), prefix=PEER))
     assert asked(answer)[1] == [1]
+
+
+def test_a_writer_gets_one_answer_to_a_datagram() -> None:
+    """A datagram of 8 kB with 256 heartbeats led to 256 answers of 17 kB."""
+    observer = Observer(OWN)
+    many = message(*(heartbeat(1, number) for number in range(1, 200)), prefix=PEER)
+    (answer,) = observer.take(PEER, many)
+    assert asked(answer)[1] == list(range(1, 200))

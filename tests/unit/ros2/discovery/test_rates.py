@@ -10,6 +10,7 @@ from rosproxy.ros2.discovery.discovery_rates import (
     PER_SECOND,
     STEP,
     DiscoveryRates,
+    cost,
 )
 
 
@@ -40,6 +41,11 @@ def test_so_many_sources_are_remembered_and_no_more() -> None:
     for number in range(MOST_SOURCES):
         rates.take(str(number), 100, 0.0)
     assert rates.take("first", 100, 0.0)
+
+
+@given(st.lists(st.integers(0, 65_536), min_size=1, max_size=50))
+def test_what_is_charged_follows_from_the_bytes(sizes: list[int]) -> None:
+    assert sum(sizes) / STEP <= sum(map(cost, sizes)) <= sum(sizes) / STEP + len(sizes)
 
 
 def test_a_long_datagram_is_charged_as_several() -> None:

@@ -21,6 +21,7 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
+    allowance_left,
     make_domain,
     sedp,
     spdp,
@@ -57,10 +58,6 @@ def shared() -> tuple[Domain, int, int]:
     (port,), (stand_in,) = domain.inside.leases, domain.outside.stand_ins
     assert domain.inside.leases[port][1].kind is LeaseKind.METATRAFFIC
     return domain, port, stand_in
-
-
-def allowance_left(domain: Domain, source: str) -> float:
-    return domain.rates._remaining[source][0]
 
 
 def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:

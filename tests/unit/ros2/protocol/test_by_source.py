@@ -62,3 +62,16 @@ def test_all_samples_stay_with_who_has_written_them(submessages: list[bytes]) ->
         for sample in samples(datagram)
     ]
     assert after == before
+
+
+@given(
+    st.lists(
+        st.sampled_from(
+            [data(b"some"), info_src(), info_dst(), info_dst(FOR + bytes(5000)), info_src(PREFIX)]
+        )
+    )
+)
+def test_the_parts_are_at_most_half_as_long_again(submessages: list[bytes]) -> None:
+    """Each part repeated a long INFO_DST: 195 kB became 209 MB."""
+    whole = message(*submessages)
+    assert sum(map(len, by_source(whole))) <= 1.5 * len(whole)

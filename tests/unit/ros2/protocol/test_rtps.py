@@ -174,6 +174,15 @@ def test_an_edit_leaves_all_other_bytes(datagram: bytes, more: st.DataObject) ->
     assert changed[:at] + changed[at + len(after) :] == datagram[:at] + datagram[at + len(after) :]
 
 
+def test_the_inline_qos_of_a_datagram_has_a_length() -> None:
+    """A datagram of 64 kB with parameters of four bytes took 20 ms."""
+    qos = parameter_list([(0x1234, b"")] * 500)
+    whole = message(*[data(b"some", qos=qos)] * 31)
+    with pytest.raises(RtpsError, match="inline QoS of more than"):
+        samples(whole)
+    assert len(samples(message(*[data(b"some", qos=qos)] * 8))) == 8
+
+
 def test_an_edit_outside_is_an_error() -> None:
     for edit in (Overwrite(3, b"ab"), Overwrite(-1, b"a")):
         with pytest.raises(ValueError, match="an edit of bytes"):

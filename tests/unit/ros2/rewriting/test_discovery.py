@@ -111,6 +111,27 @@ def test_old_locators_are_gone() -> None:
     assert {p.pid for p in announcement.parameters.parameters} == {Pid.PAD}
 
 
+def endpoint(*parameters: tuple[int, bytes]) -> bytes:
+    topic = (Pid.TOPIC_NAME, b"\4\0\0\0rt/\0")
+    return data(payload([topic, *parameters]), writer=BuiltinWriter.PUBLICATIONS)
+
+
+def test_a_datagram_has_so_many_parameters() -> None:
+    """One with 16,000 took 14 ms, in which the proxy did nothing else."""
+    parameters = [(0x1234, b"")] * 400
+    assert len(read_discovery(message(*[endpoint(*parameters)] * 10)).announcements) == 10
+    with pytest.raises(RtpsError, match="more than 4096 parameters"):
+        read_discovery(message(*[endpoint(*parameters)] * 11))
+
+
+@pytest.mark.parametrize("pid", [*UNICAST, *MULTICAST])
+def test_a_datagram_has_so_many_locators(pid: int) -> None:
+    locators = [(pid, pack_locator(HostPort(INSIDE, 7412), "<"))] * 100
+    assert len(read_discovery(message(*[endpoint(*locators)] * 10)).announcements) == 10
+    with pytest.raises(RtpsError, match="more than 1024 locators"):
+        read_discovery(message(*[endpoint(*locators)] * 11))
+
+
 def test_discovery_with_a_checksum_is_refused() -> None:
     """It would not fit any more, and the receiver would drop the message without a word."""
     told = data(payload([(Pid.PARTICIPANT_GUID, bytes(range(16)))]))
