@@ -17,7 +17,8 @@ SOURCES = sorted(
 REFERENCE = ROOT / "docs/reference"
 MADE = {".venv", "build", "node_modules"}
 PAGES = sorted(page for page in ROOT.rglob("*.md") if not MADE & set(page.relative_to(ROOT).parts))
-MAX_FILE_LINES = 400
+MAX_FILE_LINES = 600
+"""A file is as long as its subject: at this length it may have two."""
 MAX_FUNCTION_LINES = 45
 MAX_MEDIAN_LINES = 10
 

@@ -93,6 +93,29 @@ class Domain(DomainParticipants):
         self._charge(source, sent)
         return sent
 
+    def is_known(self, source: str) -> bool:
+        """Whether participants are known at an address, or it is a peer's."""
+        return source in self.inside.count_by_address or self.outside.is_met(source)
+
+    def is_heard_outside(self, source: str) -> bool:
+        """Whether `heard_outside` reads what comes from an address."""
+        is_ear = self.settings.ear is not None and source == self.settings.ear.host
+        return is_ear or self.outside.is_met(source)
+
+    def is_read_at(self, port: int, datagram: bytes, source: str) -> bool:
+        """Whether `at_lease` reads a datagram, which takes long, and does not just pass it on."""
+        leased = self.inside.leases.get(port)
+        if leased is not None:
+            is_metatraffic = leased[1].kind is LeaseKind.METATRAFFIC
+            return is_metatraffic and self.outside.is_met(source) and may_be_discovery(datagram)
+        return False
+
+    def is_read_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
+        """Whether `at_stand_in` reads a datagram, which takes long, and does not just pass it."""
+        users = self.outside.stand_ins.get(port, ())
+        is_metatraffic = any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users)
+        return is_metatraffic and may_be_discovery(datagram)
+
     def at_lease(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What outside sends to a port of the range."""
         leased = self.inside.leases.get(port)
@@ -118,8 +141,7 @@ class Domain(DomainParticipants):
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What inside sends to a port that stands for locators outside."""
         users, sent = list(self.outside.stand_ins.get(port, ())), list[Outgoing]()
-        is_metatraffic = any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users)
-        if not (is_metatraffic and may_be_discovery(datagram)):
+        if not self.is_read_at_stand_in(port, datagram, source):
             is_of_participant = source in self.inside.count_by_address
             return self._to_outside(users, datagram) if is_of_participant else []
         if self._is_too_much(datagram, source, now):

@@ -166,9 +166,13 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, PARTICIPANTS_TRIED))
         return list(dict.fromkeys([*next_ports, *filter(None, met)]))
 
+    def is_met(self, source: str) -> bool:
+        """Whether a participant is known at an address, or it is a peer's."""
+        return source in self.count_by_address or self.settings.is_peer(source)
+
     def is_strange(self, source: str) -> bool:
-        """Whether nobody is known at an address, so that nothing from there is read."""
-        if source in self.count_by_address or self.settings.is_peer(source):
+        """Whether nothing from an address is read, since no participant is known there."""
+        if self.is_met(source):
             return False
         self.refused("not_a_peer", source, "the address is no peer's, and nobody was heard there")
         return True

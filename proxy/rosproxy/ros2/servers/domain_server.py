@@ -1,5 +1,8 @@
 """The sockets of one domain: what they receive goes to `Domain`, what that returns is sent.
 
+User data passes at once. Discovery, which takes long to read, waits for its turn
+(`DiscoveryReader`).
+
     the groups       at the domain's multicast port, on every inside network
     well-known port  where those inside announce themselves that know the proxy as a peer
     the range        all its ports, from the start: what comes to one not lent tells who had it
@@ -16,6 +19,7 @@ import os
 import socket
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import LARGEST_DATAGRAM
@@ -32,6 +36,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, by_source
 from rosproxy.ros2.registry.selected import SelectedAddresses
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
 from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
 
 log = logging.getLogger(__name__)
@@ -42,6 +47,8 @@ PER_TURN = 16
 
 Take = Callable[[bytes, str, float], list[Outgoing]]
 """Takes a datagram, the address it came from and the time; gives what is to be sent."""
+MustRead = Callable[[bytes, str], bool]
+"""Whether a datagram from an address is discovery, which has to be read."""
 
 
 class DomainServer:
@@ -73,6 +80,7 @@ class DomainServer:
         self._synced_changes = 0
         self._groups = GroupEars(settings.multicast_port, self._read_group, self._stop_reading)
         self._secret, self._heard = b"", asyncio.Event()
+        self._reader = DiscoveryReader()
         self._out = {f: _sending_socket(f) for f in (socket.AF_INET, socket.AF_INET6)}
         self.lost = 0
         """Datagrams that the kernel did not take."""
@@ -85,7 +93,7 @@ class DomainServer:
         settings, domain = self.domain.settings, self.domain
         self._groups.open(_families(self._bind))
         well_known = datagrams.bind(self._bind, settings.unicast_port)
-        self._read(well_known, self._from_inside(domain.heard_inside))
+        self._read(well_known, self._from_inside(domain.heard_inside), self._comes_from_inside)
         taken_ports = []
         for port in settings.ports.listen.ports():
             try:
@@ -95,8 +103,10 @@ class DomainServer:
                 self.domain.ports.pool.block(port)
                 taken_ports.append(port)
                 continue
-            is_discovery = port == settings.discovery_port
-            self._read(sock, self._at_discovery if is_discovery else self._at_lease(port))
+            if port == settings.discovery_port:
+                self._read(sock, self._at_discovery, self._is_heard_outside)
+            else:
+                self._read(sock, partial(domain.at_lease, port), partial(domain.is_read_at, port))
         return taken_ports
 
     async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
@@ -166,6 +176,7 @@ class DomainServer:
 
     def close(self) -> None:
         """Close all sockets."""
+        self._reader.close()
         # The observer's alone: participants are not to forget the keeper, by which they keep ports.
         farewell = self.domain.own.observer.farewell()
         for address in self._groups.joined:
@@ -215,15 +226,21 @@ class DomainServer:
 
     def _read_group(self, sock: socket.socket) -> None:
         take = self._from_inside(self._heard_in_group)
-        self._loop.add_reader(sock, self._take_in, sock, take)
+        self._loop.add_reader(sock, self._take_in, sock, take, self._comes_from_inside)
 
     def _stop_reading(self, sock: socket.socket) -> None:
         self._loop.remove_reader(sock)
         sock.close()
 
-    def _read(self, sock: socket.socket, take: Take) -> None:
+    def _read(self, sock: socket.socket, take: Take, must_read: MustRead) -> None:
         self._sockets.append(sock)
-        self._loop.add_reader(sock, self._take_in, sock, take)
+        self._loop.add_reader(sock, self._take_in, sock, take, must_read)
+
+    def _comes_from_inside(self, _: bytes, source: str) -> bool:
+        return self._is_inside(source)
+
+    def _is_heard_outside(self, datagram: bytes, source: str) -> bool:
+        return datagram != self._secret and self.domain.is_heard_outside(source)
 
     def _from_inside(self, take: Take) -> Take:
         def take_selected(datagram: bytes, source: str, now: float) -> list[Outgoing]:
@@ -253,14 +270,8 @@ class DomainServer:
             return []
         return self.domain.heard_outside(datagram, source, now)
 
-    def _at_lease(self, port: int) -> Take:
-        return lambda datagram, source, now: self.domain.at_lease(port, datagram, source, now)
-
-    def _at_stand_in(self, port: int) -> Take:
-        return lambda datagram, source, now: self.domain.at_stand_in(port, datagram, source, now)
-
-    def _take_in(self, sock: socket.socket, take: Take) -> None:
-        """Take in what waits at a socket, and send what follows from it.
+    def _take_in(self, sock: socket.socket, take: Take, must_read: MustRead) -> None:
+        """Receive what waits at a socket: discovery is read later, all else passes at once.
 
         At most `PER_TURN` datagrams, or one of the longest, before others have their turn.
         """
@@ -273,9 +284,25 @@ class DomainServer:
                 except ConnectionRefusedError:
                     continue
                 byte_count += len(datagram)
-                outgoing = take(datagram, plain_address(sender[0]), self._now())
-                self._tell_changes()
-                self._open_and_send(outgoing)
+                source = plain_address(sender[0])
+                if must_read(datagram, source):
+                    self._queue(take, datagram, source)
+                else:
+                    self._carry_out(take, datagram, source)
+
+    def _queue(self, take: Take, datagram: bytes, source: str) -> None:
+        """Have discovery read when the turn of its source comes."""
+        is_known = self.domain.is_known(source)
+        if not self._reader.put(source, is_known, datagram, partial(self._carry_out, take)):
+            text = "more discovery waits to be read than has room"
+            self.domain.refused("rate", source, text)
+
+    def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:
+        """Send what follows from a datagram, and return that."""
+        outgoing = take(datagram, source, self._now())
+        self._tell_changes()
+        self._open_and_send(outgoing)
+        return outgoing
 
     def _open_and_send(self, outgoing: Iterable[Outgoing]) -> None:
         """Send what may name new stand-ins.
@@ -326,7 +353,9 @@ class DomainServer:
                 closed.append(port)
                 continue
             self._stand_ins[port] = sock
-            self._loop.add_reader(sock, self._take_in, sock, self._at_stand_in(port))
+            take = partial(self.domain.at_stand_in, port)
+            must_read = partial(self.domain.is_read_at_stand_in, port)
+            self._loop.add_reader(sock, self._take_in, sock, take, must_read)
         return closed
 
 

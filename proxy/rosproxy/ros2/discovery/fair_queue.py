@@ -1,0 +1,161 @@
+"""Discovery that waits to be read, in an order that is fair to its sources.
+
+Reading discovery takes long, and any neighbour may send it. So datagrams wait, and the source goes
+first that has had least of the reading (start-time fair queueing; Goyal, Vin, Cheng: SIGCOMM 1996).
+A forged source costs its sender nothing. So sources where participants are known share one half of
+the reading, and all other sources share the other half.
+"""
+
+import heapq
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Generic, NamedTuple, TypeVar
+
+MOST_OF_SOURCE = 1024 * 1024
+MOST_OF_ALL = 4 * 1024 * 1024
+"""Bytes of one source that wait, and bytes that wait in a half."""
+MOST_KNOWN = 2048
+MOST_UNKNOWN = 256
+"""Sources in each half of which datagrams wait. A few thousand datagrams are read in a second."""
+OVERHEAD = 256
+"""Bytes that a datagram counts for beside its own."""
+
+Item = TypeVar("Item")
+
+
+class Waiting(NamedTuple, Generic[Item]):
+    """An item with its source, and the bytes that it counts for."""
+
+    source: str
+    item: Item
+    size: int
+
+
+@dataclass(slots=True)
+class FairQueue(Generic[Item]):
+    """Items by source; the source whose share is used least goes first.
+
+    A share is counted in bytes, as a point on a line: `_now` is where the item began that was taken
+    last, and `_next` is where the next item of a source begins. A source that was silent begins
+    at `_now`: silence saves nothing.
+    """
+
+    most_sources: int
+    most_of_source: int = MOST_OF_SOURCE
+    most_of_all: int = MOST_OF_ALL
+    _waiting: dict[str, deque[Waiting[Item]]] = field(default_factory=dict)
+    _sizes: dict[str, int] = field(default_factory=dict)
+    _order: list[tuple[int, str]] = field(default_factory=list)
+    _next: dict[str, int] = field(default_factory=dict)
+    _now: int = 0
+    _size: int = 0
+
+    def __bool__(self) -> bool:
+        """Whether an item waits."""
+        return bool(self._waiting)
+
+    def put(self, source: str, item: Item, size: int) -> bool:
+        """Add an item of so many bytes. Return False if there is no room for the item."""
+        waiting = Waiting(source, item, size + OVERHEAD)
+        if not self._has_room(waiting):
+            return False
+        if source not in self._waiting:
+            self._waiting[source] = deque()
+            self._next[source] = max(self._now, self._next.get(source, 0))
+            heapq.heappush(self._order, (self._next[source], source))
+        self._waiting[source].append(waiting)
+        self._count(source, waiting.size)
+        return True
+
+    def pop(self) -> Waiting[Item] | None:
+        """Take the next item; None if no item waits."""
+        while self._order:
+            start, source = heapq.heappop(self._order)
+            if start < self._next[source]:  # `charge` has moved the source back
+                heapq.heappush(self._order, (self._next[source], source))
+                continue
+            self._now = start
+            return self._take(source)
+        return None
+
+    def charge(self, source: str, size: int) -> None:
+        """Count bytes that the last item of a source has led to as its own."""
+        if source in self._next:
+            self._next[source] += size
+
+    def _take(self, source: str) -> Waiting[Item]:
+        waiting = self._waiting[source].popleft()
+        self._count(source, -waiting.size)
+        self._next[source] += waiting.size
+        if self._waiting[source]:
+            heapq.heappush(self._order, (self._next[source], source))
+        else:
+            del self._waiting[source]
+            self._forget_silent()
+        return waiting
+
+    def _has_room(self, waiting: Waiting[Item]) -> bool:
+        """Whether an item fits; the source with most loses its last items to one with less."""
+        source = waiting.source
+        if source not in self._waiting and len(self._waiting) >= self.most_sources:
+            return False
+        size = self._sizes.get(source, 0) + waiting.size
+        if size > self.most_of_source:
+            return False
+        while self._size + waiting.size > self.most_of_all:
+            largest = max(self._sizes, key=self._sizes.__getitem__)
+            # A source is never emptied here: its place in `_order` would be left.
+            if self._sizes[largest] <= size or len(self._waiting[largest]) == 1:
+                return False
+            self._count(largest, -self._waiting[largest].pop().size)
+        return True
+
+    def _count(self, source: str, size: int) -> None:
+        self._size += size
+        self._sizes[source] = self._sizes.get(source, 0) + size
+        if not self._sizes[source]:
+            del self._sizes[source]
+
+    def _forget_silent(self) -> None:
+        """Forget how much silent sources have had, where that no longer holds them back."""
+        if not self._waiting:
+            self._next.clear()
+        elif len(self._next) > 2 * self.most_sources:
+            kept = self._waiting.keys() | {
+                s for s, start in self._next.items() if start > self._now
+            }
+            self._next = {source: self._next[source] for source in kept}
+
+
+class DiscoveryQueue(Generic[Item]):
+    """Datagrams that wait in two halves: those of known sources, and those of all others."""
+
+    def __init__(self) -> None:
+        self._known = FairQueue[Item](MOST_KNOWN)
+        self._unknown = FairQueue[Item](MOST_UNKNOWN)
+        self._lead = 0
+        """Bytes by which the reading of unknown sources is ahead of that of known ones."""
+
+    def __bool__(self) -> bool:
+        """Whether a datagram waits."""
+        return bool(self._known or self._unknown)
+
+    def put(self, source: str, is_known: bool, item: Item, size: int) -> bool:
+        """Add a datagram of so many bytes. Return False if there is no room for the datagram."""
+        return (self._known if is_known else self._unknown).put(source, item, size)
+
+    def pop(self) -> Waiting[Item] | None:
+        """Take the next datagram; None if no datagram waits."""
+        if not (self._known and self._unknown):
+            self._lead = 0
+            return self._known.pop() or self._unknown.pop()
+        is_known = self._lead >= 0
+        waiting = (self._known if is_known else self._unknown).pop()
+        if waiting:
+            self._lead += -waiting.size if is_known else waiting.size
+        return waiting
+
+    def charge(self, source: str, size: int) -> None:
+        """Count bytes that the last datagram of a source has led to as its own."""
+        self._known.charge(source, size)
+        self._unknown.charge(source, size)

@@ -1,0 +1,89 @@
+"""Discovery is read a little in each round of the event loop, and everything else comes first."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.servers.discovery_reader import ROUND, DiscoveryReader
+
+LONG = bytes(ROUND)
+
+
+def reading(names: list[str], sent: Sequence[Outgoing] = ()) -> Callable[..., Sequence[Outgoing]]:
+    def read(_: bytes, source: str) -> Sequence[Outgoing]:
+        names.append(source)
+        return sent
+
+    return read
+
+
+async def until_read(names: list[str], count: int) -> None:
+    while len(names) < count:
+        await asyncio.sleep(0)
+
+
+async def test_something_else_runs_between_two_long_datagrams() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    for _ in range(3):
+        reader.put("robot", True, LONG, reading(names))
+    for count in (1, 2, 3):
+        asyncio.get_running_loop().call_soon(names.append, f"else {count}")
+        await until_read(names, 2 * count)
+    assert names == ["robot", "else 1", "robot", "else 2", "robot", "else 3"]
+
+
+async def test_what_a_datagram_leads_to_counts_as_well() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 32
+    for _ in range(3):
+        reader.put("announces", True, b"", reading(names, copies))
+        reader.put("other", True, b"", reading(names))
+    await until_read(names, 6)
+    assert names == ["announces", "other", "other", "other", "announces", "announces"]
+
+
+async def test_short_datagrams_share_a_round() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    for _ in range(20):
+        reader.put("robot", True, b"", reading(names))
+    await asyncio.sleep(0)
+    assert len(names) == 20
+
+
+async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    failures = list[str]()
+    asyncio.get_running_loop().set_exception_handler(
+        lambda _, context: failures.append(str(context["exception"]))
+    )
+
+    def fail(_: bytes, source: str) -> Sequence[Outgoing]:
+        raise RuntimeError(f"{source} broke it")
+
+    reader.put("evil", True, b"", fail)
+    reader.put("robot", True, b"", reading(names))
+    await until_read(names, 1)
+    assert failures == ["evil broke it"]
+
+
+async def test_nothing_is_read_after_the_end() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    reader.put("robot", True, b"", reading(names))
+    reader.close()
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert names == []
+
+
+async def test_what_has_no_room_is_told() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    has_room = [reader.put("many", True, LONG, reading(names)) for _ in range(80)]
+    assert has_room == [True] * 63 + [False] * 17
+    await until_read(names, 63)

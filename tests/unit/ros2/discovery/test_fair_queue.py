@@ -1,0 +1,122 @@
+"""Discovery that waits: whose is read next, and whose is lost."""
+
+from collections import Counter
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue, FairQueue
+
+SIZES = st.integers(0, 60_000)
+
+
+def taken(queue: FairQueue[int] | DiscoveryQueue[int], count: int) -> list[str]:
+    waiting = (queue.pop() for _ in range(count))
+    return [item.source for item in waiting if item]
+
+
+def test_a_source_with_one_datagram_does_not_wait_for_one_with_many() -> None:
+    queue = FairQueue[int](most_sources=10)
+    for number in range(100):
+        queue.put("many", number, 500)
+    queue.put("few", 1, 500)
+    assert "few" in taken(queue, 2)
+
+
+def test_long_datagrams_count_for_more() -> None:
+    queue = FairQueue[int](most_sources=10)
+    for number in range(50):
+        queue.put("long", number, 10 * OVERHEAD - OVERHEAD)
+        queue.put("short", number, 0)
+    assert Counter(taken(queue, 22)) == {"long": 2, "short": 20}
+
+
+def test_a_source_pays_for_what_its_datagrams_lead_to() -> None:
+    queue = FairQueue[int](most_sources=10)
+    for number in range(50):
+        queue.put("announces", number, 0)
+        queue.put("other", number, 0)
+    sources = []
+    for _ in range(22):
+        (source,) = taken(queue, 1)
+        sources.append(source)
+        if source == "announces":
+            queue.charge(source, 9 * OVERHEAD)
+    assert Counter(sources) == {"announces": 2, "other": 20}
+
+
+def test_a_source_that_always_has_one_datagram_is_not_always_next() -> None:
+    """It began where the queue was each time, and no other source was read meanwhile."""
+    queue = FairQueue[int](most_sources=10)
+    for number in range(50):
+        queue.put("waits", number, 0)
+    sources = []
+    for number in range(50):
+        queue.put("quick", number, 0)
+        sources += taken(queue, 1)
+    assert Counter(sources)["waits"] >= 24
+
+
+def test_silence_saves_nothing() -> None:
+    queue = FairQueue[int](most_sources=10)
+    queue.put("silent", 0, 0)
+    for number in range(100):
+        queue.put("speaks", number, 0)
+    taken(queue, 60)
+    for number in range(50):
+        queue.put("silent", number, 0)
+    assert Counter(taken(queue, 20))["speaks"] >= 9
+
+
+def test_a_source_has_so_much_room() -> None:
+    queue = FairQueue[int](most_sources=2, most_of_source=10 * OVERHEAD)
+    assert [queue.put("one", number, 0) for number in range(11)] == [True] * 10 + [False]
+    assert queue.put("another", 0, 0)
+    assert not queue.put("a third", 0, 0)
+
+
+def test_the_source_with_most_loses_what_does_not_fit() -> None:
+    queue = FairQueue[int](most_sources=10, most_of_all=10 * OVERHEAD)
+    for number in range(9):
+        queue.put("many", number, 0)
+    assert [queue.put("few", number, 0) for number in range(9)] == [True] * 5 + [False] * 4
+    assert Counter(taken(queue, 20)) == {"many": 5, "few": 5}
+
+
+@given(st.lists(st.tuples(st.sampled_from("abcd"), SIZES, st.booleans(), SIZES), max_size=60))
+def test_what_was_put_is_taken_in_its_order(steps: list[tuple[str, int, bool, int]]) -> None:
+    queue = FairQueue[int](most_sources=3, most_of_source=150_000, most_of_all=200_000)
+    last = Counter[str]()
+    for number, (source, size, takes, led_to) in enumerate(steps, 1):
+        queue.put(source, number, size)
+        assert queue._size == sum(queue._sizes.values()) <= 200_000
+        waiting = queue.pop() if takes else None
+        if waiting:
+            assert waiting.item > last[waiting.source]
+            last[waiting.source] = waiting.item
+            queue.charge(waiting.source, led_to)
+    while waiting := queue.pop():
+        assert waiting.item > last[waiting.source]
+        last[waiting.source] = waiting.item
+    assert (queue._size, queue._sizes, queue._next) == (0, {}, {})
+    assert not queue
+
+
+def test_a_thousand_forged_sources_get_half_of_the_reading() -> None:
+    queue = DiscoveryQueue[int]()
+    for number in range(1000):
+        queue.put(f"forged {number}", False, number, 500)
+        queue.put("robot", True, number, 500)
+    assert Counter(taken(queue, 200))["robot"] == 100
+
+
+def test_a_half_that_has_nothing_to_read_leaves_its_time() -> None:
+    queue = DiscoveryQueue[int]()
+    for number in range(100):
+        queue.put("forged", False, number, 500)
+    assert len(taken(queue, 50)) == 50
+    for number in range(100):
+        queue.put("robot", True, number, 500)
+    assert Counter(taken(queue, 40)) == {"robot": 20, "forged": 20}
+    assert len(taken(queue, 200)) == 110
+    assert not queue
