@@ -134,6 +134,14 @@ class Lab:
         """What a program prints on the proxy's machine."""
         return run_command("ip", "netns", "exec", self.place("px").namespace, *argv)
 
+    def unproven(self) -> dict[str, int]:
+        """How many participants have not proved to receive, by side."""
+        lines = self._get("/metrics").decode().splitlines()
+        told = (line for line in lines if line.startswith("rosproxy_ros2_unproven_participants{"))
+        return {
+            line.split('side="')[1].split('"')[0]: int(float(line.split()[-1])) for line in told
+        }
+
     def ports(self) -> dict[str, list[tuple[int, str]]]:
         """The ports of the range with their locators, by participant inside."""
         return {

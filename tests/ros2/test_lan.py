@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab
 
 OPTIONS = ("--ros2-ear", "172.30.1.1:47090")
@@ -51,6 +52,15 @@ def test_messages_in_fragments(
 def test_a_participant_on_the_host_itself_is_met(lab: Lab) -> None:
     lab.node("jazzy", "c1", "pub", topic="/chatter")
     lab.node("jazzy", "host", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+
+
+@pytest.mark.parametrize("vendor", ["jazzy", "kilted", "cyclone"])
+def test_participants_prove_that_they_receive(lab: Lab, vendor: str) -> None:
+    """An address that does not counts as forged, once there are many."""
+    for role in ("c1", "c2", "out"):
+        lab.node(vendor, role, "sub", topic="/chatter")
+    lab.wait_for_participants(inside=2, outside=1)
+    wait_until("all have answered", lambda: lab.unproven() == {"inside": 0, "outside": 0})
 
 
 def test_the_ear_may_be_killed(lab: Lab) -> None:

@@ -99,11 +99,24 @@ class Ros2State(Collector):
         gauge = GaugeMetricFamily(
             "rosproxy_ros2_participants", "Participants by side.", labels=["domain", "side"]
         )
+        unproven = GaugeMetricFamily(
+            "rosproxy_ros2_unproven_participants",
+            "Participants at addresses that have not proved to receive; many mean forged sources.",
+            labels=["domain", "side"],
+        )
         for server in self._servers:
-            number = str(server.domain.settings.number)
-            gauge.add_metric([number, "inside"], len(server.domain.inside.by_prefix))
-            gauge.add_metric([number, "outside"], len(server.domain.outside.by_prefix))
+            domain = server.domain
+            number = str(domain.settings.number)
+            sides = {
+                "inside": domain.inside.count_by_address,
+                "outside": domain.outside.count_by_address,
+            }
+            for side, counts in sides.items():
+                gauge.add_metric([number, side], counts.total())
+                are_unproven = (n for a, n in counts.items() if not domain.proofs.has(a))
+                unproven.add_metric([number, side], sum(are_unproven))
         yield gauge
+        yield unproven
 
     def _domain(self, server: DomainServer) -> document.DomainStatus:
         domain, settings = server.domain, server.domain.settings

@@ -9,6 +9,7 @@ from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Refused
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
@@ -42,7 +43,8 @@ class Bench:
         ports, pool = PortMap(RANGE, RANGE), PortPool(RANGE)
         domain = DomainSettings(0, ("192.0.2.1",), ports, str, lambda *_: None, lambda *_: True)
         refused = Refused(domain.note)
-        self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused)
+        proofs = AddressProofs(b"a secret")
+        self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs)
         self.leases = DataLeases(pool)
         self.leases.domains.append(self.inside)
         table = KernelTable(Table(RANGE.first, RANGE, Transport.UDP), self.tools)

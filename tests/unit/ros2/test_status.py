@@ -19,7 +19,17 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import Lease
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.status import Ros2State
-from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, make_domain, spdp
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    NOW,
+    OTHER,
+    ROBOT,
+    A,
+    B,
+    make_domain,
+    prove,
+    spdp,
+)
 from tests.unit.ros2.protocol.messages import data, message, payload
 
 PUBLICATIONS, SUBSCRIPTIONS = 0x000003C2, 0x000004C2
@@ -147,3 +157,19 @@ def test_metrics_tell_the_ports_that_are_left() -> None:
     assert (used, free) == (len(domain.inside.leases), domain.ports.pool.free)
     assert used > 0
     assert values["rosproxy_ros2_participants_without_port"] == 0
+
+
+def test_metrics_tell_how_many_have_not_proved_to_receive() -> None:
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    domain.heard_inside(spdp(B, OTHER), OTHER, NOW)
+    prove(domain, INSIDE)
+    state = Ros2State([cast(DomainServer, Served(domain))], cast(DomainPlane, Copied()))
+    values = {
+        (sample.name, sample.labels.get("side")): sample.value
+        for family in state.collect()
+        for sample in family.samples
+    }
+    assert values["rosproxy_ros2_participants", "inside"] == 2
+    assert values["rosproxy_ros2_unproven_participants", "inside"] == 1
+    assert values["rosproxy_ros2_unproven_participants", "outside"] == 0

@@ -18,7 +18,7 @@ start at once are charged 10,000 with two peers, and some 1,200 a second from th
 STEP = 256
 """Bytes of a datagram for each unit of its charge. An announcement takes two or three."""
 MOST_SOURCES = 4096
-"""Sources that are remembered; of more, the one that has been heard first goes."""
+"""Sources that are remembered. Of more, the source is forgotten that was remembered first."""
 
 
 def cost(size: int) -> int:
@@ -27,25 +27,58 @@ def cost(size: int) -> int:
 
 
 @dataclass(slots=True)
+class _Allowance:
+    """What is left of an allowance, and the time in seconds at which that was."""
+
+    remaining: float
+    since: float
+
+    def refill(self, per_second: float, burst: float, now: float) -> float:
+        """What is left now."""
+        passed = max(now - self.since, 0.0)
+        self.remaining = min(self.remaining + passed * per_second, burst)
+        self.since = now
+        return self.remaining
+
+
+@dataclass(slots=True)
 class DiscoveryRates:
-    """What is left of each source's allowance, and the time at which that was."""
+    """The allowance of each source, and one for all sources together that are not known.
+
+    A forger has as many sources as it likes; they share one allowance.
+    """
 
     per_second: float = PER_SECOND
     burst: float = BURST
-    _remaining: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _by_source: dict[str, _Allowance] = field(default_factory=dict)
+    _of_unknown: _Allowance = field(init=False)
 
-    def take(self, source: str, size: int, now: float) -> bool:
-        """Whether a datagram of a source, of so many bytes, may be read; it is charged then."""
-        remaining, since = self._remaining.get(source, (self.burst, now))
-        remaining = min(remaining + max(now - since, 0.0) * self.per_second, self.burst)
-        allowed = remaining >= 1.0
-        if source not in self._remaining and len(self._remaining) >= MOST_SOURCES:
-            del self._remaining[next(iter(self._remaining))]
-        self._remaining[source] = (remaining - cost(size) if allowed else remaining), now
-        return allowed
+    def __post_init__(self) -> None:
+        """Nothing has been used yet."""
+        self._of_unknown = _Allowance(self.burst, 0.0)
 
-    def charge(self, source: str, total: int) -> None:
+    def take(self, source: str, size: int, now: float, is_known: bool = True) -> bool:
+        """Charge a source for a datagram of so many bytes. Return False if it may not be read."""
+        allowances = [self._allowance(source, now)]
+        if not is_known:
+            allowances.append(self._of_unknown)
+        if any(a.refill(self.per_second, self.burst, now) < 1.0 for a in allowances):
+            return False
+        for allowance in allowances:
+            allowance.remaining -= cost(size)
+        return True
+
+    def charge(self, source: str, total: int, is_known: bool = True) -> None:
         """Charge a source with what its datagrams have led to, as `cost`; it may go into debt."""
-        if total and source in self._remaining:
-            remaining, since = self._remaining[source]
-            self._remaining[source] = remaining - total, since
+        if allowance := self._by_source.get(source):
+            allowance.remaining -= total
+        if not is_known:
+            self._of_unknown.remaining -= total
+
+    def _allowance(self, source: str, now: float) -> _Allowance:
+        allowance = self._by_source.get(source)
+        if allowance is None:
+            if len(self._by_source) >= MOST_SOURCES:
+                del self._by_source[next(iter(self._by_source))]
+            allowance = self._by_source[source] = _Allowance(self.burst, now)
+        return allowance

@@ -25,12 +25,20 @@ Every datagram may be forged. So
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
+from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.discovery_rates import cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import Outgoing, sent_to
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
-from rosproxy.ros2.protocol.addressing import destinations, for_all, may_be_discovery
+from rosproxy.ros2.protocol.addressing import (
+    destination,
+    destinations,
+    for_all,
+    may_be_discovery,
+)
+from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
 from rosproxy.ros2.protocol.envelope import unwrapped
+from rosproxy.ros2.protocol.reliable import acknack, heartbeats
 from rosproxy.ros2.protocol.rtps import MAGIC, NO_VENDOR, RtpsError, by_source, source_vendor
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
@@ -38,7 +46,12 @@ from rosproxy.ros2.registry.participants import (
     LeaseKind,
     OutsideParticipant,
 )
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, require_rewritable
+from rosproxy.ros2.rewriting.discovery import (
+    BuiltinWriter,
+    DiscoveryMessage,
+    read_discovery,
+    require_rewritable,
+)
 
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
@@ -94,8 +107,8 @@ class Domain(DomainParticipants):
         return sent
 
     def is_known(self, source: str) -> bool:
-        """Whether participants are known at an address, or it is a peer's."""
-        return source in self.inside.count_by_address or self.outside.is_met(source)
+        """Whether an address has proved to receive, or it is a peer's."""
+        return self.proofs.has(source) or self.settings.is_peer(source)
 
     def is_heard_outside(self, source: str) -> bool:
         """Whether `heard_outside` reads what comes from an address."""
@@ -192,13 +205,27 @@ class Domain(DomainParticipants):
         prefix, spdp = message.prefix, message.of_participant
         if prefix in self.outside.by_prefix or source_vendor(message.datagram) == NO_VENDOR:
             return []  # a proxy's own participants are not passed on
+        if self.proofs.note(source, message.datagram, now):
+            return [out for insider in self.inside.prove() for out in self._end_for(insider)]
         if spdp is None:
             return self.own.told_inside(message, source, now)
         if spdp.ended:
             return self._end_inside(message, source, now)
-        if prefix not in self.inside.by_prefix and self.ports.may_have_returning(now):
-            return self.returning.wait(message, source, now)
+        is_new = prefix not in self.inside.by_prefix
+        if is_new and (self.ports.may_have_returning(now) or self.inside.lacks_proof(source)):
+            return self._wait(message, source, now)
         return self._announced_inside(message, source, now)
+
+    def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
+        """Have a participant inside wait until it has answered the proxy."""
+        sent = self.returning.wait(message, source, now)
+        return sent + self._question_to_inside(message, source) if sent else []
+
+    def _question_to_inside(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
+        """What asks a participant inside that announces itself to prove that it receives."""
+        spdp = message.of_participant
+        metatraffic = first_metatraffic(spdp, message.datagram, source) if spdp else None
+        return self.own.question_to_inside(source, message.prefix, metatraffic)
 
     def _heard_outside(
         self,
@@ -208,23 +235,62 @@ class Domain(DomainParticipants):
         received: int,
         now: float,
     ) -> list[Outgoing]:
-        prefix, spdp = message.prefix, message.of_participant
-        if prefix in self.inside.by_prefix or prefix == self.own.observer.prefix:
+        if message.prefix in self.inside.by_prefix or message.prefix == self.own.observer.prefix:
             return []  # the ear hears what it has sent to the LAN itself
-        if spdp is None:
-            return self.own.told_outside(message, source, received)
+        if message.of_participant is None:
+            return self._told_outside(message, source, received, now)
         if not heard_by_ear and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
             return self._drop("not_a_peer", source, "an announcement; the address is no peer's")
-        outsider = self.outside.meet(message, source, now)
+        return self._announced_outside(message, source, received, now)
+
+    def _told_outside(
+        self, message: DiscoveryMessage, source: str, received: int, now: float
+    ) -> list[Outgoing]:
+        """Take in what a participant outside tells the proxy's own. Raises RtpsError."""
+        sent = list[Outgoing]()
+        if self.proofs.note(source, message.datagram, now):
+            told, ended = self.outside.prove(source)
+            sent += [out for outsider in ended for out in self._end_outside(outsider)]
+            sent += self.outside.introduced(told, self.inside.by_prefix.values(), now)
+        return sent + self.own.told_outside(message, source, received)
+
+    def _announced_outside(
+        self, message: DiscoveryMessage, source: str, received: int, now: float
+    ) -> list[Outgoing]:
+        """Note what a participant outside announces, and tell inside. Raises RtpsError."""
+        outsider, sent = self._meet_outside(message, source, now)
         if outsider is None:
-            return []
+            return sent
         outsider.credit += received
-        sent = self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
-        if spdp.ended:  # those inside are told of that, too
-            self._forget_outside(outsider)
+        sent += self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
+        if message.of_participant is None or not message.of_participant.ended:
+            return sent + self.own.question_to_outside(outsider)
+        self._forget_outside(outsider)  # those inside are told of that, too
         return sent
+
+    def _meet_outside(
+        self, message: DiscoveryMessage, source: str, now: float
+    ) -> tuple[OutsideParticipant | None, list[Outgoing]]:
+        """The participant that announces itself, and what ends the one whose place it gets."""
+        made_room = self._make_room(message, source)
+        return self.outside.meet(message, source, now), made_room
+
+    def _make_room(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
+        """End the participant outside whose place a new one gets, if there is one."""
+        spdp = message.of_participant
+        if spdp is None or spdp.ended or message.prefix in self.outside.by_prefix:
+            return []
+        outsider = self.outside.gives_place(source)
+        return self._end_outside(outsider) if outsider else []
+
+    def _end_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
+        """Forget a participant outside, and tell inside that it has ended."""
+        ended = farewell(outsider.prefix, outsider.vendor, LAST_SEQUENCE)
+        insiders = self.inside.by_prefix.values() if outsider.is_introduced else ()
+        self._forget_outside(outsider)
+        return [sent for insider in insiders for sent in sent_to(insider.metatraffic, [ended])]
 
     def _announced_inside(
         self, message: DiscoveryMessage, source: str, now: float
@@ -232,12 +298,18 @@ class Domain(DomainParticipants):
         """Note what a participant inside announces of itself, and tell outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
+        if is_new and self.inside.lacks_proof(source):
+            # It is announced with all of its ports or not at all: outside takes up no new locators
+            # of a participant that it knows. It announces itself again.
+            return self._question_to_inside(message, source)
+        gives_place = self.inside.gives_place(source) if is_new else None
+        sent = self._end_for(gives_place) if gives_place else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
-            return []
+            return sent
         lease_count = len(insider.leases)
         exported = self.inside.exported(insider, message, now, self.returning.former_ports(prefix))
-        sent = self.inside.introduced(insider, message)
+        sent += self.inside.introduced(insider, message)
         # It knew the proxy elsewhere: it forgets the keeper there, and meets all outside anew.
         if is_new and prefix in self.returning.former:
             sent += self.own.keeper_farewell(insider)
@@ -247,6 +319,7 @@ class Domain(DomainParticipants):
         sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
         if is_new:
             sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
+        sent += self.own.question_to_inside(insider.address, prefix, insider.metatraffic)
         return sent + self.own.first_questions(insider)
 
     def _tell_outside(
@@ -312,27 +385,55 @@ class Domain(DomainParticipants):
         received: int,
     ) -> _Passing:
         """Metatraffic from outside as a participant inside gets it. Raises RtpsError."""
-        prefix, spdp = message.prefix, message.of_participant
-        outsider = self.outside.find(prefix, source)
+        outsider = self.outside.find(message.prefix, source)
+        spdp = message.of_participant
         if outsider is not None:
             outsider.has_come_in = True
-        if prefix in self.inside.by_prefix or insider.is_apart:
+        if message.prefix in self.inside.by_prefix or insider.is_apart:
             return [], []
+        back = list[Outgoing]()
         if spdp is not None:
             if outsider is None and not self.settings.is_peer(source):
-                text = "a participant that was not heard before, at an address that is no peer's"
-                self._drop("not_a_peer", source, text)
-                return [], []
-            outsider = self.outside.meet(message, source, now)
+                return [], self._announced_at_lease(insider, message, source)
+            outsider, back = self._meet_outside(message, source, now)
         if outsider is None:
-            return [], []
+            return [], back
         outsider.note_received(message.datagram, received, insider.prefix)
+        if not self.outside.may_introduce(outsider):
+            return [], back
         imported = partial(self.outside.imported, outsider, insider)
         passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
-        back = self.outside.allowed_questions(outsider, questions)
+        back += self.outside.allowed_questions(outsider, questions)
         if spdp is not None and spdp.ended:
             self._forget_outside(outsider)
         return passed, back
+
+    def _announced_at_lease(
+        self, insider: InsideParticipant, message: DiscoveryMessage, source: str
+    ) -> list[Outgoing]:
+        """What answers an announcement of a participant that was not heard before, at no peer's."""
+        if source_vendor(message.datagram) == NO_VENDOR:
+            return self._answer_to_proxy(insider, message, source)
+        text = "a participant that was not heard before, at an address that is no peer's"
+        return self._drop("not_a_peer", source, text)
+
+    def _answer_to_proxy(
+        self, insider: InsideParticipant, message: DiscoveryMessage, source: str
+    ) -> list[Outgoing]:
+        """The answer to another proxy that asks a participant inside to prove that it receives.
+
+        The participant knows nothing of the participants of proxies outside, so it can't answer
+        itself. The answer is shorter than the question. Raises RtpsError.
+        """
+        spdp = message.of_participant
+        target = first_metatraffic(spdp, message.datagram, source) if spdp else None
+        asked = [h for h in heartbeats(message.datagram) if h.writer == BuiltinWriter.PUBLICATIONS]
+        if destination(message.datagram) != insider.prefix or not asked:
+            return []
+        answer = acknack(
+            insider.prefix, message.prefix, asked[0].writer, asked[0].first, (), 1, final=True
+        )
+        return sent_to(target, [answer])
 
     def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
         """A datagram that goes to participants outside, as far as they may be sent any."""
@@ -361,11 +462,12 @@ class Domain(DomainParticipants):
 
     def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
         """Charge a source with the datagrams that its own have led to."""
-        self.rates.charge(source, sum(cost(len(out.datagram)) for out in sent))
+        total = sum(cost(len(out.datagram)) for out in sent)
+        self.rates.charge(source, total, self.is_known(source))
 
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether a source makes more discovery than it may; what is not is charged to it."""
-        if self.rates.take(source, len(datagram), now):
+        if self.rates.take(source, len(datagram), now, self.is_known(source)):
             return False
         self.refused("rate", source, "more discovery than one source may send in a second")
         return True

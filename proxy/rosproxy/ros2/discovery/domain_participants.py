@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from rosproxy.leases.ports import PortPool
+from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused
 from rosproxy.ros2.discovery.fragments import FragmentStores
@@ -41,26 +42,46 @@ class DomainParticipants:
     refused: Refused
     fragments: FragmentStores
     rediscovery: Rediscovery
+    proofs: AddressProofs
     rates: DiscoveryRates = field(default_factory=DiscoveryRates)
     passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
 
     @classmethod
     def starting(
-        cls, settings: DomainSettings, pool: PortPool, own: bytes, now: float, when: float = 0.0
+        cls,
+        settings: DomainSettings,
+        pool: PortPool,
+        own: bytes,
+        secret: bytes,
+        now: float,
+        when: float = 0.0,
     ) -> Self:
-        """A domain without participants; ``own`` is a random prefix, ``when`` Unix time."""
+        """A domain without participants.
+
+        ``own`` is a random prefix, ``secret`` random bytes, ``when`` Unix time.
+        """
         pool.claim(settings.discovery_port)  # where outside announces itself: nobody gets it
         ports, refused = LocatorPorts(pool, now), Refused(settings.note)
+        proofs = AddressProofs(secret)
         keeper = Keeper.of(settings.host, settings.ports.listen, settings.number, when)
-        inside = InsideParticipants(settings, ports, refused)
-        outside = OutsideParticipants(settings, refused)
-        returning, fragments = ReturningParticipants(settings, ports, keeper), FragmentStores()
+        inside = InsideParticipants(settings, ports, refused, proofs)
+        outside = OutsideParticipants(settings, refused, proofs)
+        returning = ReturningParticipants(settings, ports, keeper, proofs)
+        fragments = FragmentStores()
         participants = OwnParticipants(
-            settings, Observer(own), keeper, inside, outside, returning, fragments
+            settings, Observer(own), keeper, inside, outside, returning, fragments, proofs
         )
-        meetings = Rediscovery(settings, outside)
         return cls(
-            settings, ports, participants, inside, outside, returning, refused, fragments, meetings
+            settings,
+            ports,
+            participants,
+            inside,
+            outside,
+            returning,
+            refused,
+            fragments,
+            Rediscovery(settings, outside),
+            proofs,
         )
 
     def is_kept(self, participant: InsideParticipant) -> bool:
@@ -73,6 +94,7 @@ class DomainParticipants:
             self._forget_inside(insider)
         for outsider in [p for p in self.outside.by_prefix.values() if p.until < now]:
             self._forget_outside(outsider)
+        self.proofs.expire(now, self.inside.count_by_address, self.outside.count_by_address)
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:
         """End the participants at addresses inside where nobody is any more; what outside is told.
@@ -82,9 +104,13 @@ class DomainParticipants:
         self.returning.forget(addresses)
         sent = list[Outgoing]()
         for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
-            self._forget_inside(leaver)
-            sent += self.settings.to_outside(farewell(leaver.prefix, leaver.vendor, LAST_SEQUENCE))
+            sent += self._end_for(leaver)
         return sent
+
+    def _end_for(self, insider: InsideParticipant) -> list[Outgoing]:
+        """End a participant inside on its behalf; what outside is told."""
+        self._forget_inside(insider)
+        return self.settings.to_outside(farewell(insider.prefix, insider.vendor, LAST_SEQUENCE))
 
     def _forget_inside(self, insider: InsideParticipant) -> None:
         self.inside.forget(insider)

@@ -16,10 +16,22 @@ PARTICIPANTS_TRIED = 32
 NEXT_PORTS = 2
 """How many more well-known ports are used than participants are known at an address."""
 
-MOST_INSIDE, MOST_OUTSIDE = 512, 1024
-"""Participants of a domain on either side."""
-MOST_PER_ADDRESS, MOST_PER_HOST = 64, 256
+MOST_INSIDE = 384
+MOST_INSIDE_UNPROVEN = 128
+"""Participants inside: at addresses that have proved to receive, and at all others."""
+MOST_AT_PEERS = 1024
+MOST_OUTSIDE = 512
+MOST_OUTSIDE_UNPROVEN = 256
+"""Participants outside: at peers' addresses, at others that have proved to receive, at the rest."""
+MOST_WAITING = 512
+"""Participants inside that wait after a start until it is known which ports they had."""
+MOST_PER_ADDRESS = 64
+MOST_PER_HOST = 256
 """Participants at one address inside, and outside, where another proxy may be."""
+MOST_PER_UNPROVEN = 16
+"""Participants at one address outside that has not proved to receive."""
+MOST_INTRODUCED_UNPROVEN = 64
+"""While so many participants outside are at unproven addresses, inside is told of these, too."""
 MOST_LEASES = 16
 """Ports of the range for one participant; Fast DDS takes three for one address."""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
@@ -14,6 +15,7 @@ from rosproxy.ros2.discovery.announced_participant import (
 )
 from rosproxy.ros2.discovery.domain_settings import (
     MOST_INSIDE,
+    MOST_INSIDE_UNPROVEN,
     MOST_LEASES,
     MOST_PER_ADDRESS,
     DomainSettings,
@@ -33,8 +35,11 @@ from rosproxy.ros2.registry.participants import (
     PortShortage,
     ShortageKind,
 )
+from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, require_rewritable, rewritten
 
+PART_FOR_PROVEN = 4
+"""One of so many parts of the range is for addresses that have proved to receive."""
 PART_FOR_OTHERS = 8
 """One of so many parts of the range is out of reach for a single address: a container that takes
 all that it can get leaves something for others."""
@@ -51,6 +56,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     settings: DomainSettings
     ports: LocatorPorts
     refused: Refused
+    proofs: AddressProofs
     leases: dict[int, tuple[InsideParticipant, Lease]] = field(default_factory=dict)
     port_shortages: dict[bytes, PortShortage] = field(default_factory=dict)
     changes: int = 0
@@ -68,15 +74,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         if participant is None:
             if prefix in self.by_prefix:
                 return None
-            if (
-                self.count_by_address[source] >= MOST_PER_ADDRESS
-                or len(self.by_prefix) >= MOST_INSIDE
-            ):
-                text = (
-                    f"more than {MOST_PER_ADDRESS} participants at one address, "
-                    f"or {MOST_INSIDE} inside"
-                )
-                self.refused("participants", source, text)
+            if reason := self._why_no_place(source):
+                self.refused("participants", source, reason)
                 return None
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
             participant.proxy_address = self.settings.proxy_address_for(source)
@@ -85,6 +84,37 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         participant.metatraffic = first_metatraffic(spdp, datagram, source)
         participant.traits = traits(spdp, datagram, source)
         return participant
+
+    def lacks_proof(self, address: str) -> bool:
+        """Whether an address gets no port before it has proved to receive: ports are scarce."""
+        kept = len(self.settings.ports.listen) // PART_FOR_PROVEN
+        return self.ports.pool.free <= kept and not self.proofs.has(address)
+
+    def gives_place(self, source: str) -> InsideParticipant | None:
+        """The participant that ends for a new one at an address; None if there is none.
+
+        Either there is room without, or the new one gets no place.
+        """
+        if self.proofs.has(source):
+            return fairer_place(self._at_proven(True), MOST_INSIDE, source)
+        return oldest_unproven(self._at_proven(False), MOST_INSIDE_UNPROVEN)
+
+    def prove(self) -> list[InsideParticipant]:
+        """The participants that end, as more than have room are at proven addresses now."""
+        return surplus(self._at_proven(True), MOST_INSIDE)
+
+    def _why_no_place(self, source: str) -> str:
+        """Why a new participant at an address gets no place; empty if it gets one."""
+        if self.count_by_address[source] >= MOST_PER_ADDRESS:
+            return f"the address has {MOST_PER_ADDRESS} participants already"
+        is_proven = self.proofs.has(source)
+        most = MOST_INSIDE if is_proven else MOST_INSIDE_UNPROVEN
+        is_full = len(self._at_proven(is_proven)) >= most
+        return f"there are {most} participants inside already" if is_full else ""
+
+    def _at_proven(self, is_proven: bool) -> list[InsideParticipant]:
+        """The participants at addresses that have proved to receive, or those at the others."""
+        return [p for p in self.by_prefix.values() if self.proofs.has(p.address) is is_proven]
 
     def exported(
         self,
@@ -216,6 +246,11 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         if self._has_its_share(participant.address):
             text = f"{locator} got no port: {participant.address} has as many of {ports} as one "
             text += "address may have"
+            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
+            return None
+        if self.lacks_proof(participant.address):
+            text = f"{locator} got no port: the last ports of {ports} are for addresses that have "
+            text += f"proved to receive, and {participant.address} does not answer the proxy"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)

@@ -13,6 +13,7 @@ from functools import partial
 from math import inf
 
 from rosproxy.net.addresses import HostPort, is_loopback, is_of_link
+from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
@@ -21,9 +22,13 @@ from rosproxy.ros2.discovery.announced_participant import (
     traits,
 )
 from rosproxy.ros2.discovery.domain_settings import (
+    MOST_AT_PEERS,
+    MOST_INTRODUCED_UNPROVEN,
     MOST_LEASES,
     MOST_OUTSIDE,
+    MOST_OUTSIDE_UNPROVEN,
     MOST_PER_HOST,
+    MOST_PER_UNPROVEN,
     NEXT_PORTS,
     PARTICIPANTS_TRIED,
     DomainSettings,
@@ -44,6 +49,7 @@ from rosproxy.ros2.registry.participants import (
     OutsideParticipant,
     ParticipantTable,
 )
+from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     read_discovery,
@@ -64,6 +70,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
     settings: DomainSettings
     refused: Refused
+    proofs: AddressProofs
     stand_ins: dict[int, list[tuple[OutsideParticipant, Lease]]] = field(default_factory=dict)
     blocked: set[int] = field(default_factory=set)
     changes: int = 0
@@ -117,9 +124,9 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         inside: Collection[InsideParticipant],
         now: float,
     ) -> list[Outgoing]:
-        """The announcements of participants outside for some inside."""
+        """The announcements of participants outside for some inside, as far as these may know."""
         sent = list[Outgoing]()
-        for outsider in outside:
+        for outsider in filter(self.may_introduce, outside):
             message = read_discovery(outsider.announcement)
             for insider in inside:
                 if insider.metatraffic and not insider.is_apart:
@@ -128,6 +135,30 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
                         Outgoing(insider.metatraffic, self._imported(outsider, insider, message))
                     )
         return sent
+
+    def prove(self, address: str) -> tuple[list[OutsideParticipant], list[OutsideParticipant]]:
+        """Note that an address has proved to receive.
+
+        Return the participants that inside has to be told of, and those that end for them.
+        """
+        for outsider in self.at(address):
+            outsider.proven = True
+        ended = surplus(self._proven_strangers(), MOST_OUTSIDE)
+        told = [p for p in self.at(address) if not p.is_introduced and p not in ended]
+        return told, ended
+
+    def may_introduce(self, outsider: OutsideParticipant) -> bool:
+        """Whether inside is told of a participant.
+
+        Where many have not proved to receive, inside is told of no more of these: a forger may have
+        made them up, and each participant inside would remember all of them.
+        """
+        if not outsider.is_introduced:
+            is_proven = outsider.trusted or outsider.proven
+            outsider.is_introduced = (
+                is_proven or len(self._unproven_strangers()) <= MOST_INTRODUCED_UNPROVEN
+            )
+        return outsider.is_introduced
 
     def farewell_to(
         self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
@@ -209,17 +240,47 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         for participant, lease in list(self.stand_ins.get(port, ())):
             self._close(participant, lease.target)
 
+    def gives_place(self, source: str) -> OutsideParticipant | None:
+        """The participant that ends for a new one at an address; None if there is none.
+
+        Either there is room without, or the new one gets no place.
+        """
+        if self.settings.is_peer(source):
+            return None
+        if self.proofs.has(source):
+            return fairer_place(self._proven_strangers(), MOST_OUTSIDE, source)
+        return oldest_unproven(self._unproven_strangers(), MOST_OUTSIDE_UNPROVEN)
+
+    def _why_no_place(self, source: str) -> str:
+        """Why a new participant at an address gets no place; empty if it gets one."""
+        is_peer = self.settings.is_peer(source)
+        is_proven = self.proofs.has(source)
+        most_there = MOST_PER_HOST if is_peer or is_proven else MOST_PER_UNPROVEN
+        if self.count_by_address[source] >= most_there:
+            return f"the address has {most_there} participants already"
+        if is_peer:
+            count, most = sum(p.trusted for p in self.by_prefix.values()), MOST_AT_PEERS
+        elif is_proven:
+            count, most = len(self._proven_strangers()), MOST_OUTSIDE
+        else:
+            count, most = len(self._unproven_strangers()), MOST_OUTSIDE_UNPROVEN
+        return f"there are {most} participants outside already" if count >= most else ""
+
+    def _proven_strangers(self) -> list[OutsideParticipant]:
+        return [p for p in self.by_prefix.values() if p.proven and not p.trusted]
+
+    def _unproven_strangers(self) -> list[OutsideParticipant]:
+        return [p for p in self.by_prefix.values() if not p.proven and not p.trusted]
+
     def _add(
         self, prefix: bytes, datagram: bytes, source: str, now: float
     ) -> OutsideParticipant | None:
-        if self.count_by_address[source] >= MOST_PER_HOST or len(self.by_prefix) >= MOST_OUTSIDE:
-            text = (
-                f"more than {MOST_PER_HOST} participants at one address, or {MOST_OUTSIDE} outside"
-            )
-            self.refused("participants", source, text)
+        if reason := self._why_no_place(source):
+            self.refused("participants", source, reason)
             return None
         outsider = OutsideParticipant(prefix, source, source_vendor(datagram), now)
         outsider.trusted = self.settings.is_peer(source)
+        outsider.proven = self.proofs.has(source)
         self.add(outsider)
         return outsider
 

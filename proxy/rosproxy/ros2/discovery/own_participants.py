@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
@@ -17,7 +18,7 @@ from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.port_keeper import Keeper
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import farewell
-from rosproxy.ros2.registry.participants import InsideParticipant
+from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 
 
@@ -32,6 +33,7 @@ class OwnParticipants:
     outside: OutsideParticipants
     returning: ReturningParticipants
     fragments: FragmentStores
+    proofs: AddressProofs
 
     def announced_inside(self, near: str) -> bytes:
         """The observer's announcement for a network inside, where the proxy has an address."""
@@ -39,9 +41,30 @@ class OwnParticipants:
 
     def announced_outside(self) -> list[Outgoing]:
         """The observer's announcement for the ear and the peers."""
+        return self.settings.to_outside(self.observer.announcement(*self._reached_from_outside()))
+
+    def question_to_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
+        """What asks a participant outside to prove that its address receives, if that is to be."""
+        if outsider.proven:
+            return []
+        question = self.proofs.question(
+            outsider.address, outsider.prefix, self._reached_from_outside()
+        )
+        return self.outside.allowed_questions(outsider, [question])
+
+    def question_to_inside(
+        self, address: str, prefix: bytes, metatraffic: HostPort | None
+    ) -> list[Outgoing]:
+        """What asks a participant inside to prove that its address receives, if that is to be."""
+        if self.proofs.has(address):
+            return []
+        near = self.settings.proxy_address_for(address)
+        reached_at = [HostPort(near, self.settings.unicast_port)]
+        return sent_to(metatraffic, [self.proofs.question(address, prefix, reached_at)])
+
+    def _reached_from_outside(self) -> list[HostPort]:
         port = self.settings.ports.advertised(self.settings.discovery_port)
-        reached_at = (HostPort(host, port) for host in self.settings.hosts)
-        return self.settings.to_outside(self.observer.announcement(*reached_at))
+        return [HostPort(host, port) for host in self.settings.hosts]
 
     def first_questions(self, participant: InsideParticipant) -> list[Outgoing]:
         """What asks a participant inside that has announced itself for its readers and writers."""
@@ -81,6 +104,8 @@ class OwnParticipants:
         if outsider is None:
             return []
         outsider.note_received(message.datagram, received, self.observer.prefix)
+        if not self.outside.may_introduce(outsider):
+            return []
         rewrite = partial(self.outside.observed, outsider)
         questions = self._ask(self.settings.discovery_port, message, rewrite)
         return self.outside.allowed_questions(outsider, questions)

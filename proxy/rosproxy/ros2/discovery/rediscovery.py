@@ -46,7 +46,7 @@ class Rediscovery:
             {},  # it was not told to forget anybody yet
         )
         datagram = farewell(insider.prefix, insider.vendor, next_number(insider.announcement))
-        outsiders = self.outside.by_prefix.values()
+        outsiders = [o for o in self.outside.by_prefix.values() if o.is_introduced]
         inwards = [sent for o in outsiders for sent in self.outside.farewell_to(o, insider, now)]
         return inwards + self.settings.to_outside(datagram)
 

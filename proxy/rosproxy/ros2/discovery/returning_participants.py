@@ -10,10 +10,11 @@ from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.domain_settings import (
-    MOST_INSIDE,
     MOST_PER_ADDRESS,
+    MOST_WAITING,
     DomainSettings,
     Outgoing,
 )
@@ -39,6 +40,7 @@ class ReturningParticipants:
     settings: DomainSettings
     ports: LocatorPorts
     keeper: Keeper
+    proofs: AddressProofs
     waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
     former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
@@ -51,11 +53,21 @@ class ReturningParticipants:
         """Keep an announcement until ports are given; meanwhile ask which ports it had."""
         if message.prefix in self.waiting:
             return []
-        if len(self.waiting) >= MOST_INSIDE or self._counts[source] >= MOST_PER_ADDRESS:
+        if self._counts[source] >= MOST_PER_ADDRESS or not self._has_room():
             return []  # it announces itself again, when there may be room
         self.waiting[message.prefix] = source, message, now
         self._counts[source] += 1
         return self._questions(message, source)
+
+    def _has_room(self) -> bool:
+        """Whether one more may wait; the first that has not proved to receive leaves for it."""
+        if len(self.waiting) < MOST_WAITING:
+            return True
+        unproven = (p for p, (source, *_) in self.waiting.items() if not self.proofs.has(source))
+        prefix = next(unproven, None)
+        if prefix is not None:
+            self._forget_waiting(prefix)
+        return prefix is not None
 
     def repeated_questions(self, now: float) -> list[Outgoing]:
         """Questions again to those that have not answered."""
@@ -93,7 +105,7 @@ class ReturningParticipants:
         """
         for prefix, ports in former.items():
             in_range = all(port in self.ports.pool.range for port in ports)
-            if ports and prefix not in present and len(self.former) < MOST_INSIDE:
+            if ports and prefix not in present and len(self.former) < MOST_WAITING:
                 self.former[prefix] = tuple(ports) if in_range else ()
 
     def former_ports(self, prefix: bytes) -> Sequence[int]:

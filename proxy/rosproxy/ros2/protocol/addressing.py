@@ -60,6 +60,15 @@ def destination(datagram: bytes) -> bytes | None:
     return None
 
 
+def is_destination(datagram: bytes, prefix: bytes) -> bool:
+    """Whether some of a message is for the participant with a GUID prefix. Raises RtpsError.
+
+    Cyclone DDS puts into one message what goes to several participants at one locator.
+    """
+    info_dst = (body.start for kind, _, body in submessages(datagram) if kind == INFO_DST)
+    return any(datagram[start : start + PREFIX] == prefix for start in info_dst)
+
+
 def destinations(datagram: bytes) -> set[bytes]:
     """The GUID prefixes of all whom a message is for; none if some of it is for all. RtpsError.
 

@@ -234,28 +234,38 @@ class InsideParticipant(Participant):
         return [lease.port for lease in self.leases.values()]
 
 
+ANSWERED_FACTOR = 3
+"""Bytes for each byte that has come, to a participant that has answered but not proved to receive.
+Where DDS Security authenticates participants, they don't answer the question that proves it."""
+
+
 @dataclass(slots=True)
 class OutsideParticipant(Participant):
     """A participant outside, with a stand-in for each locator that inside does not reach by itself.
 
-    Until it is ``proven`` that it gets what is sent to it, it is sent no more bytes than came from
-    it; ``credit`` is how many are left. One that is ``trusted``, at a peer's address, may be sent
-    anything. ``has_come_in``: discovery from it has arrived at a port that was lent.
+    A participant may be sent anything if it is ``trusted``, at a peer's address, or its address is
+    ``proven`` to receive. All others are sent no more bytes than came from there; ``credit`` is how
+    many are left. ``has_answered``: it has named the proxy's participant, or one inside, and may be
+    sent `ANSWERED_FACTOR` times as much. ``has_come_in``: discovery from it has arrived at a port
+    of the range. ``is_introduced``: participants inside are told of it.
     """
 
     trusted: bool = False
     proven: bool = False
+    has_answered: bool = False
     has_come_in: bool = False
+    is_introduced: bool = False
     credit: int = 0
 
     def note_received(self, datagram: bytes, size: int, addressee: bytes) -> None:
         """Note a message of the participant's, for which ``size`` bytes have come.
 
-        A message to ``addressee`` proves that the participant receives ours. Raises RtpsError.
+        A message to ``addressee`` answers one of the proxy's. A forger on the LAN can send it too,
+        where it hears the same announcements. Raises RtpsError.
         """
-        self.credit += size
-        if not self.proven and destination(datagram) == addressee:
-            self.proven = True
+        if not self.has_answered and destination(datagram) == addressee:
+            self.has_answered = True
+        self.credit += size * (ANSWERED_FACTOR if self.has_answered else 1)
 
     def may_be_sent(self, size: int) -> bool:
         """Whether so many bytes may go to it; if so, they are taken off its credit."""
@@ -285,6 +295,12 @@ class ParticipantTable(Generic[AnyParticipant]):
         """The participant with a prefix, if it is at the address that a datagram came from."""
         participant = self.by_prefix.get(prefix)
         return participant if participant is not None and participant.address == source else None
+
+    def at(self, address: str) -> list[AnyParticipant]:
+        """The participants at an address."""
+        if address not in self.count_by_address:
+            return []
+        return [p for p in self.by_prefix.values() if p.address == address]
 
     def add(self, participant: AnyParticipant) -> None:
         """Add a participant that has come."""

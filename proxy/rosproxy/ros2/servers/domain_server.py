@@ -72,7 +72,9 @@ class DomainServer:
         pool = PortPool(settings.ports.listen)
         # A new prefix for each process: only to an observer that they don't know yet participants
         # announce themselves at once, and send what they had told the former one.
-        self.domain = Domain.starting(settings, pool, os.urandom(PREFIX), now(), time.time())
+        self.domain = Domain.starting(
+            settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time()
+        )
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
         self._sockets: list[socket.socket] = []
@@ -248,7 +250,8 @@ class DomainServer:
                 return []
             if self._selected.admits(source, now):
                 return take(datagram, source, now)
-            if not self.domain.rates.take(source, len(datagram), now):
+            is_known = self.domain.is_known(source)
+            if not self.domain.rates.take(source, len(datagram), now, is_known):
                 return []
             with contextlib.suppress(RtpsError):
                 for message in map(read_discovery, by_source(datagram)):

@@ -10,6 +10,7 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, Outgoing
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
@@ -45,7 +46,7 @@ def make_domain(
         peers=tuple(HostPort(peer, 7410) for peer in peers),
         ear=ear,
     )
-    return Domain.starting(settings, PortPool(ports.listen), b"the observer", 0.0)
+    return Domain.starting(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
 
 
 def spdp(
@@ -83,8 +84,16 @@ def reached_at(datagram: bytes) -> list[HostPort]:
 
 
 def allowance_left(domain: Domain, source: str) -> float:
-    remaining, _ = domain.rates._remaining.get(source, (BURST, 0.0))
-    return remaining
+    allowance = domain.rates._by_source.get(source)
+    return allowance.remaining if allowance else BURST
+
+
+def prove(domain: Domain, *addresses: str) -> None:
+    """Have participants at addresses answer the questions that are for these addresses alone."""
+    for address in addresses:
+        asked = domain.proofs.question(address, A, [HostPort(NEAR, 7410)])
+        answer = message(submessage(0x0E, 0, source_prefix(asked)), prefix=A)
+        assert domain.proofs.note(address, answer, NOW)
 
 
 def meet(domain: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgoing]:

@@ -38,6 +38,7 @@ from tests.unit.ros2.discovery.domains import (
     farewell,
     make_domain,
     meet,
+    prove,
     reached_at,
     sedp,
     spdp,
@@ -245,6 +246,7 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
 
 def test_an_address_has_so_many_participants_and_no_more() -> None:
     domain = make_domain()
+    prove(domain, INSIDE)
     for number in range(MOST_PER_ADDRESS + 10):
         domain.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, NOW)
     assert len(domain.inside.by_prefix) == MOST_PER_ADDRESS
@@ -252,6 +254,7 @@ def test_an_address_has_so_many_participants_and_no_more() -> None:
 
 def test_a_range_that_is_too_short_is_told() -> None:
     domain = make_domain()
+    prove(domain, *(f"172.30.0.{number}" for number in range(1, 10)))
     for number in range(1, 10):
         domain.heard_inside(
             spdp(number.to_bytes(12, "big"), f"172.30.0.{number}"), f"172.30.0.{number}", NOW
@@ -282,8 +285,8 @@ def test_who_has_gone_gives_everything_back() -> None:
 
 def test_ports_are_given_once_it_is_known_who_had_which() -> None:
     domain = make_domain()
-    told, asked = domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    assert {told.target, asked.target} == {HostPort(INSIDE, 7410)}
+    told, *asked = domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
+    assert {told.target, *(out.target for out in asked)} == {HostPort(INSIDE, 7410)}
     assert len(to(domain.settle(0.5), INSIDE)) == 2  # asked again
     assert not domain.inside.leases
     assert to(domain.settle(0.1 + ANSWER_TIME), ROBOT)

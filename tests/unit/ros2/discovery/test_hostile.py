@@ -11,7 +11,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.discovery_rates import BURST
-from rosproxy.ros2.discovery.domain_settings import MOST_INSIDE, MOST_PER_ADDRESS, MOST_PER_HOST
+from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
@@ -43,6 +43,7 @@ from tests.unit.ros2.discovery.domains import (
     farewell,
     make_domain,
     meet,
+    prove,
     sedp,
     spdp,
     to,
@@ -190,6 +191,7 @@ def test_an_exhausted_range_is_not_searched_for_each_locator(
         (Pid.UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 1000 + number), "<"))
         for number in range(400)
     ]
+    prove(domain, INSIDE)
     meet(domain)
     long = message(data(payload([TOPIC, *locators]), writer=SEDP_WRITERS), prefix=A)
     domain.heard_inside(long, INSIDE, NOW)
@@ -200,6 +202,7 @@ def test_one_address_leaves_ports_for_others() -> None:
     """Sixty participants at one address, as many as there may be, took all ports of the range."""
     domain = make_domain()
     prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(30)]
+    prove(domain, INSIDE, OTHER)
     for number, prefix in enumerate(prefixes):
         domain.heard_inside(spdp(prefix, INSIDE, 7410 + 10 * number), INSIDE, NOW)
     assert domain.ports.pool.free == 1  # of 16 the first is the proxy's own, and two are for others
@@ -221,7 +224,7 @@ def test_users_data_of_before_a_restart_is_not_charged() -> None:
     domain, user = make_domain(), message(submessage(0x07, 0, bytes(28)), prefix=B)
     for _ in range(int(BURST) + 5):
         domain.at_lease(45007, user, ROBOT, 0.5)
-    assert domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.6) == []
+    assert domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.6)
     assert B in domain.outside.by_prefix
 
 
@@ -262,7 +265,7 @@ def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.Mon
 
 def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
     domain = make_domain()
-    for number in range(MOST_INSIDE + 1):
+    for number in range(MOST_WAITING + 1):
         domain.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, 0.1)
     assert len(domain.returning.waiting) == MOST_PER_ADDRESS
     assert domain.heard_inside(spdp(A, OTHER), OTHER, 0.2)
@@ -291,9 +294,10 @@ def test_nobody_proves_anything_by_the_ear() -> None:
     domain.heard_outside(wrapped(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
     answer = sedp(B, ROBOT, 7411, to=domain.own.observer.prefix)
     domain.heard_outside(wrapped(ROBOT, answer), EAR.host, NOW)
-    assert not domain.outside.by_prefix[B].proven
+    assert not domain.outside.by_prefix[B].has_answered
     domain.heard_outside(answer, ROBOT, NOW)
-    assert domain.outside.by_prefix[B].proven
+    assert domain.outside.by_prefix[B].has_answered
+    assert not domain.outside.by_prefix[B].proven
 
 
 def test_who_waits_does_not_take_the_prefix_of_somebody_met_meanwhile() -> None:
@@ -430,4 +434,4 @@ def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
     for port in domain.inside.leases:
         domain.at_lease(port, message(prefix=B), STRANGER, NOW)
-    assert STRANGER not in domain.rates._remaining
+    assert STRANGER not in domain.rates._by_source

@@ -52,3 +52,14 @@ def test_a_long_datagram_is_charged_as_several() -> None:
     rates = DiscoveryRates()
     longest = sum(rates.take("a", 64_000, 0.0) for _ in range(1000))
     assert longest == pytest.approx(BURST * STEP / 64_000, abs=1)
+
+
+def test_forged_sources_have_one_allowance_together() -> None:
+    """Each had one of its own, and the debt of a source was forgotten after 4,096 others."""
+    rates = DiscoveryRates()
+    assert rates.take("evil", 100, 0.0, is_known=False)
+    rates.charge("evil", int(BURST), is_known=False)
+    taken = [rates.take(str(n), 100, 0.1, is_known=False) for n in range(2 * MOST_SOURCES)]
+    assert sum(taken) <= 0.1 * PER_SECOND
+    assert not rates.take("evil", 100, 0.1, is_known=False)
+    assert rates.take("robot", 100, 0.1)

@@ -17,8 +17,9 @@ from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.discovery.discovery_rates import BURST, MOST_SOURCES
 from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, Outgoing
 from rosproxy.ros2.protocol.envelope import wrapped
-from rosproxy.ros2.protocol.rtps import LAST_NUMBER
+from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
 from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS
+from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from tests.unit.ros2.discovery.domains import (
     EAR,
     INSIDE,
@@ -107,6 +108,8 @@ class Neighbours(RuleBasedStateMachine):
         self.now = 0.0
         self.came, self.went = Counter[str](), Counter[str]()
         self.proven = {ROBOT}
+        self.answered = set[str]()
+        self.asked = set[str]()
 
     @initialize(started=st.sampled_from([0.0, NOW]))
     def some_are_there(self, started: float) -> None:
@@ -149,6 +152,23 @@ class Neighbours(RuleBasedStateMachine):
         else:
             self.the_ear_tells(spdp(prefix, address), address)
 
+    @rule(prefix=PREFIX, address=ADDRESS, is_true=st.booleans())
+    def somebody_answers_a_question(self, prefix: bytes, address: str, is_true: bool) -> None:
+        asked = self.domain.proofs.question(address if is_true else OTHER, prefix, [])
+        named = submessage(0x0E, 0, source_prefix(asked))
+        answer = message(named, submessage(0x06, 0, bytes(28)), prefix=prefix)
+        if address in NEAR_BY:
+            self.inside_announces(answer, address)
+        else:
+            self.outside_announces(answer, address)
+        assert (
+            is_true
+            or address == OTHER
+            or not self.domain.proofs.has(address)
+            or (address in self.asked)
+        )
+        self.asked |= {address} if is_true else set()
+
     @rule(address=st.sampled_from(NEAR_BY), port=PORT)
     def somebody_speaks_to_all_outside(self, address: str, port: int) -> None:
         speakers = [
@@ -182,12 +202,10 @@ class Neighbours(RuleBasedStateMachine):
         self.domain.outside.block(ports[0] if ports and port % 8 == 0 else port, for_good)
 
     def check(self, sent: list[Outgoing]) -> None:
-        """Hold to whom something may go: no bytes to outside that did not come from there."""
-        self.proven |= {
-            participant.address
-            for participant in self.domain.outside.by_prefix.values()
-            if participant.proven
-        }
+        """Hold to whom something may go: outside is sent no more than came from there."""
+        outsiders = self.domain.outside.by_prefix.values()
+        self.proven |= {outsider.address for outsider in outsiders if outsider.proven}
+        self.answered |= {outsider.address for outsider in outsiders if outsider.has_answered}
         for out in sent:
             assert 0 < out.target.port < 65536
             if out.target == EAR or out.target.host in self.proven:
@@ -199,7 +217,8 @@ class Neighbours(RuleBasedStateMachine):
                 self.went[out.target.host] += len(out.datagram)
         waiting = {source for source, *_ in self.domain.returning.waiting.values()}
         for host, size in self.went.items():
-            assert host in waiting | set(NEAR_BY) or size <= self.came[host]
+            factor = ANSWERED_FACTOR if host in self.answered else 1
+            assert host in waiting | set(NEAR_BY) or size <= factor * self.came[host]
 
     @invariant()
     def leases_are_of_those_inside(self) -> None:
@@ -254,8 +273,8 @@ class Neighbours(RuleBasedStateMachine):
         assert domain.fragments.by_prefix.keys() <= prefixes
         sizes = [store.size for store in domain.fragments.by_prefix.values()]
         assert domain.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL
-        assert len(domain.rates._remaining) <= MOST_SOURCES
-        assert all(left <= BURST for left, _ in domain.rates._remaining.values())
+        assert len(domain.rates._by_source) <= MOST_SOURCES
+        assert all(allowance.remaining <= BURST for allowance in domain.rates._by_source.values())
 
 
 TestNeighbours = Neighbours.TestCase

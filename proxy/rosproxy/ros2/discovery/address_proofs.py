@@ -1,0 +1,67 @@
+"""Which addresses have proved that a participant there receives what the proxy sends.
+
+The source of a datagram is what its sender wrote there. So an address gets a question that no other
+address hears: the announcement of a participant whose GUID prefix follows from the address and from
+a secret of this process. An answer names that prefix (INFO_DST), so its sender has the question.
+The participant in the question has a writer of SEDP, whose heartbeat each reader answers
+(DDSI-RTPS 2.5, 8.4.9). It is forgotten after `LEASE_DURATION`.
+"""
+
+from collections.abc import Container, Iterable
+from dataclasses import dataclass, field
+from hashlib import blake2b
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.addressing import is_destination
+from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
+from rosproxy.ros2.protocol.reliable import heartbeat
+from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+
+LEASE_DURATION = 12.0
+"""Seconds for which a participant remembers the one in a question. Cyclone DDS announces itself
+each 8 s and is asked again then."""
+KEPT = 60.0
+"""Seconds for which an address has proved to receive, after its last participant has gone."""
+
+
+@dataclass(slots=True)
+class AddressProofs:
+    """The addresses that have proved to receive; ``secret`` is random and of this process."""
+
+    secret: bytes
+    _until: dict[str, float] = field(default_factory=dict)
+    _count: int = 0
+
+    def has(self, address: str) -> bool:
+        """Whether an address has proved to receive."""
+        return address in self._until
+
+    def question(self, address: str, prefix: bytes, reached_at: Iterable[HostPort]) -> bytes:
+        """The datagram that asks a participant at an address.
+
+        ``prefix`` is the GUID prefix of the participant, ``reached_at`` where it answers.
+        """
+        own = self._prefix(address)
+        self._count += 1
+        asks = heartbeat(own, prefix, BuiltinWriter.PUBLICATIONS, 1, self._count)
+        return announcement(own, reached_at, LEASE_DURATION, WRITER_ENDPOINTS) + asks[HEADER:]
+
+    def note(self, address: str, datagram: bytes, now: float) -> bool:
+        """Take in a datagram; return whether the address proves by it to receive. RtpsError."""
+        if not is_destination(datagram, self._prefix(address)):
+            return False
+        self._until[address] = now + KEPT
+        return True
+
+    def expire(self, now: float, *present: Container[str]) -> None:
+        """Forget the addresses that have no participant any more."""
+        for address, until in list(self._until.items()):
+            if any(address in addresses for addresses in present):
+                self._until[address] = now + KEPT
+            elif until < now:
+                del self._until[address]
+
+    def _prefix(self, address: str) -> bytes:
+        size = PREFIX - len(NO_VENDOR)
+        return NO_VENDOR + blake2b(address.encode(), key=self.secret, digest_size=size).digest()

@@ -1,0 +1,304 @@
+"""Addresses prove that they receive; whose sources may be forged gets no one else's place."""
+
+from collections import Counter
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.address_proofs import KEPT, AddressProofs
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import (
+    MOST_INSIDE_UNPROVEN,
+    MOST_INTRODUCED_UNPROVEN,
+    MOST_OUTSIDE,
+    MOST_OUTSIDE_UNPROVEN,
+    MOST_PER_HOST,
+    MOST_PER_UNPROVEN,
+    MOST_WAITING,
+    Outgoing,
+)
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
+from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.reliable import acknowledged
+from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
+from tests.unit.ros2.discovery.domains import (
+    EAR,
+    HOST,
+    INSIDE,
+    NOW,
+    OTHER,
+    ROBOT,
+    STRANGER,
+    A,
+    B,
+    make_domain,
+    meet,
+    prove,
+    reached_at,
+    sedp,
+    spdp,
+    to,
+)
+from tests.unit.ros2.protocol.messages import message, submessage
+
+LAPTOP = "10.0.0.77"
+NEIGHBOUR = b"\x01\x0f" + bytes([8] * 10)
+LEASE = 300.0
+PADDING = 200
+"""Bytes by which an announcement is as long as a real one, so that it may be answered."""
+
+
+def named(number: int) -> bytes:
+    return b"\x01\x0f\x77" + number.to_bytes(9, "big")
+
+
+def hear(domain: Domain, prefix: bytes, address: str, now: float = NOW) -> list[Outgoing]:
+    """Have the LAN relay tell of a participant."""
+    announcement = spdp(prefix, address, lease=LEASE, padding=PADDING)
+    return domain.heard_outside(wrapped(address, announcement), EAR.host, now)
+
+
+def forge(domain: Domain, first: int, count: int) -> list[Outgoing]:
+    """Announce participants, each at an address of its own."""
+    sent = list[Outgoing]()
+    for number in range(first, first + count):
+        sent += hear(domain, named(number), f"10.1.{number // 250}.{number % 250 + 1}")
+    return sent
+
+
+def questions(sent: list[Outgoing], address: str) -> list[bytes]:
+    """What asks participants at an address to prove that they receive."""
+    return [datagram for datagram in to(sent, address) if destination(datagram) is not None]
+
+
+def answer(asked: bytes, prefix: bytes) -> bytes:
+    """The acknowledgement with which a participant answers a question."""
+    body = bytes([0, 0, 3, 0xC7, 0, 0, 3, 0xC2]) + bytes(20)
+    return message(
+        submessage(0x0E, 0, source_prefix(asked)), submessage(0x06, 0, body), prefix=prefix
+    )
+
+
+def test_forged_sources_keep_nobody_from_being_met() -> None:
+    """1,200 announcements with leases of 300 s took all places for these 300 s."""
+    domain = make_domain()
+    meet(domain)
+    forge(domain, 0, 1200)
+    assert len(domain.outside.by_prefix) == MOST_OUTSIDE_UNPROVEN
+    (asked,) = questions(hear(domain, NEIGHBOUR, LAPTOP), LAPTOP)
+    told = domain.heard_outside(answer(asked, NEIGHBOUR), LAPTOP, NOW)
+    assert source_prefix(to(told, INSIDE)[-1]) == NEIGHBOUR
+    assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    forge(domain, 1200, 1200)
+    assert {LAPTOP, ROBOT} <= domain.outside.count_by_address.keys()
+
+
+def test_inside_is_told_of_so_many_unproven_participants() -> None:
+    domain = make_domain()
+    meet(domain)
+    told = to(forge(domain, 0, 1200), INSIDE)
+    ended = {source_prefix(d) for d in told if read_discovery(d).announcements[0].ended}
+    assert len(told) == 2 * MOST_INTRODUCED_UNPROVEN
+    assert ended == {named(number) for number in range(MOST_INTRODUCED_UNPROVEN)}
+
+
+def test_a_participant_that_is_not_introduced_reaches_nothing_inside() -> None:
+    domain = make_domain()
+    meet(domain)
+    forge(domain, 0, MOST_INTRODUCED_UNPROVEN)
+    hear(domain, B, LAPTOP)
+    (port, *_) = domain.inside.leases
+    for said in (spdp(B, LAPTOP), sedp(B, LAPTOP, 7411, to=A)):
+        assert to(domain.at_lease(port, said, LAPTOP, NOW), INSIDE) == []
+    assert not domain.outside.by_prefix[B].leases
+    domain.heard_outside(sedp(B, LAPTOP, 7411, to=domain.own.observer.prefix), LAPTOP, NOW)
+    assert not domain.outside.by_prefix[B].leases
+    prove(domain, LAPTOP)
+    assert domain.outside.prove(LAPTOP) == ([domain.outside.by_prefix[B]], [])
+
+
+def test_no_address_takes_the_place_of_another_that_has_fewer() -> None:
+    domain = make_domain()
+    meet(domain)
+    hostile = [f"10.2.0.{number}" for number in range(1, 4)]
+    prove(domain, LAPTOP, *hostile)
+    for index, address in enumerate(hostile):
+        for number in range(MOST_PER_HOST + 5):
+            hear(domain, named(1000 * index + number), address)
+    assert domain.outside.count_by_address.total() == MOST_OUTSIDE
+    assert max(domain.outside.count_by_address.values()) <= MOST_PER_HOST
+    for number in range(20):
+        hear(domain, named(9000 + number), LAPTOP)
+    assert domain.outside.count_by_address[LAPTOP] == 20
+    for number in range(300):
+        hear(domain, named(9900 + number), hostile[0])
+    assert domain.outside.count_by_address[LAPTOP] == 20
+    assert domain.outside.count_by_address.total() == MOST_OUTSIDE
+
+
+def test_a_place_that_is_given_up_is_told_inside() -> None:
+    domain = make_domain()
+    meet(domain)
+    forge(domain, 0, MOST_OUTSIDE_UNPROVEN)
+    assert domain.outside.by_prefix[named(0)].is_introduced
+    (told,) = to(hear(domain, B, LAPTOP), INSIDE)
+    (announcement,) = read_discovery(told).announcements
+    assert (source_prefix(told), announcement.ended) == (named(0), True)
+    assert named(0) not in domain.outside.by_prefix
+
+
+def test_an_address_that_proves_to_receive_may_push_out_the_largest() -> None:
+    domain = make_domain()
+    hostile = [f"10.2.0.{number}" for number in range(1, 3)]
+    prove(domain, *hostile)
+    for index, address in enumerate(hostile):
+        for number in range(MOST_PER_HOST):
+            hear(domain, named(1000 * index + number), address)
+    (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
+    domain.heard_outside(answer(asked, B), LAPTOP, NOW)
+    assert domain.outside.by_prefix[B].proven
+    assert domain.outside.count_by_address.total() == MOST_OUTSIDE
+
+
+def test_an_unproven_address_has_a_few_participants() -> None:
+    domain = make_domain()
+    for number in range(MOST_PER_UNPROVEN + 4):
+        hear(domain, named(number), LAPTOP)
+    assert domain.outside.count_by_address[LAPTOP] == MOST_PER_UNPROVEN
+    prove(domain, LAPTOP)
+    hear(domain, B, LAPTOP)
+    assert B in domain.outside.by_prefix
+
+
+def test_a_question_goes_to_one_address_alone() -> None:
+    """All on a LAN hear the prefix of the observer: a forger could answer for any address."""
+    domain = make_domain(peers=())
+    meet(domain)
+    asked = [
+        questions(hear(domain, named(number), address), address)[0]
+        for number, address in enumerate((LAPTOP, STRANGER))
+    ]
+    assert source_prefix(asked[0]) != source_prefix(asked[1])
+    hearsay = sedp(named(0), LAPTOP, 7411, to=domain.own.observer.prefix)
+    for forged in (hearsay, answer(asked[1], named(0))):
+        domain.heard_outside(forged, LAPTOP, NOW)
+        assert not domain.outside.by_prefix[named(0)].proven
+    domain.heard_outside(answer(asked[0], named(0)), LAPTOP, NOW)
+    assert domain.outside.by_prefix[named(0)].proven
+    assert not domain.outside.by_prefix[named(1)].proven
+
+
+def test_a_participant_that_only_answers_is_sent_three_times_as_much() -> None:
+    """Two proxies on a LAN, and participants with DDS Security, prove nothing by a question."""
+    domain = make_domain(peers=())
+    meet(domain)
+    hear(domain, B, LAPTOP)
+    outsider = domain.outside.by_prefix[B]
+    (port, *_) = domain.inside.leases
+    before = outsider.credit
+    said = sedp(B, LAPTOP, 7411, to=A)
+    domain.at_lease(port, said, LAPTOP, NOW)
+    assert outsider.credit == before + ANSWERED_FACTOR * len(said)
+    assert outsider.may_be_sent(outsider.credit)
+    assert not outsider.may_be_sent(1)
+
+
+def test_a_question_is_no_longer_than_what_came() -> None:
+    domain = make_domain(peers=())
+    short = domain.heard_outside(wrapped(LAPTOP, spdp(B, LAPTOP)), EAR.host, NOW)
+    assert questions(short, LAPTOP) == []  # 140 bytes
+    assert questions(hear(domain, B, LAPTOP, NOW + 1), LAPTOP)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
+    """They know nothing of a proxy outside, and can't answer."""
+    asking, asked = make_domain(peers=()), make_domain(peers=())
+    sent = meet(asked)
+    (announced,) = to(sent, EAR.host)
+    (meta, _) = reached_at(announced)
+    padded = spdp(A, HOST, meta.port, padding=PADDING)
+    (question,) = questions(asking.heard_outside(wrapped(HOST, padded), EAR.host, NOW), HOST)
+    if known:
+        hear(asked, B, HOST)
+    back = asked.at_lease(meta.port - 1000, question, HOST, NOW)
+    assert bool(back) is known
+    for out in back:
+        assert out.target == HostPort(HOST, 46000)
+        assert len(out.datagram) <= len(question)
+        prefix = source_prefix(question)
+        assert acknowledged(out.datagram, prefix, BuiltinWriter.PUBLICATIONS) == [1]
+        asking.heard_outside(out.datagram, HOST, NOW)
+    assert asking.outside.by_prefix[A].proven is known
+
+
+def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
+    """Eight addresses with 64 participants each took all places, and two took all ports."""
+    domain = make_domain(peers=[ROBOT])
+    told = list[Outgoing]()
+    for number in range(600):
+        address = f"172.30.{number // 20 + 1}.9"
+        domain.heard_inside(spdp(named(number), address, 7000 + 2 * number), address, NOW)
+    assert len(domain.inside.by_prefix) <= MOST_INSIDE_UNPROVEN
+    assert domain.ports.pool.free > 0
+    asked = questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE)
+    for question in asked:
+        domain.heard_inside(answer(question, A), INSIDE, NOW)
+    told = domain.settle(NOW + ANSWER_TIME)
+    assert A in {source_prefix(datagram) for datagram in to(told, ROBOT)}
+    assert len(domain.inside.by_prefix[A].leases) == 2
+
+
+def test_who_gives_its_place_up_inside_is_ended_outside() -> None:
+    domain = make_domain()
+    prove(domain, INSIDE)
+    participants = {}
+    for number in range(MOST_INSIDE_UNPROVEN):
+        participant = named(number)
+        address = f"172.30.{number // 200 + 1}.{number % 200 + 1}"
+        participants[participant] = address
+        announcement = spdp(participant, address, 7410)
+        domain.inside.meet(read_discovery(announcement), address, NOW)
+    told = domain.heard_inside(spdp(named(900), OTHER), OTHER, NOW)
+    (ended,) = [d for d in to(told, ROBOT) if read_discovery(d).announcements[0].ended]
+    assert source_prefix(ended) == named(0)
+    assert named(0) not in domain.inside.by_prefix
+
+
+def test_forged_sources_keep_nobody_from_waiting_after_a_start() -> None:
+    domain = make_domain()
+    prove(domain, INSIDE)
+    for number in range(MOST_WAITING):
+        address = f"172.30.{number // 200 + 1}.{number % 200 + 1}"
+        domain.heard_inside(spdp(named(number), address), address, 0.1)
+    assert len(domain.returning.waiting) == MOST_WAITING
+    assert domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.2)
+    assert A in domain.returning.waiting
+    assert len(domain.returning.waiting) == MOST_WAITING
+    for number in range(MOST_WAITING):
+        domain.heard_inside(spdp(named(2000 + number), OTHER), OTHER, 0.3)
+    assert A in domain.returning.waiting
+
+
+def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
+    domain = make_domain()
+    meet(domain)
+    assert domain.is_known(ROBOT)  # a peer
+    assert not domain.is_known(INSIDE)
+    asked = questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE)
+    domain.heard_inside(answer(asked[0], A), INSIDE, NOW)
+    assert domain.is_known(INSIDE)
+    domain.expire(NOW + 10)
+    assert domain.is_known(INSIDE)
+    domain.expire(NOW + 21)
+    domain.expire(NOW + 22 + KEPT)
+    assert not domain.is_known(INSIDE)
+
+
+def test_a_process_has_questions_of_its_own() -> None:
+    first, second = AddressProofs(b"one"), AddressProofs(b"another")
+    asked = [source_prefix(p.question(LAPTOP, A, [])) for p in (first, second)]
+    assert len(Counter(asked)) == 2
