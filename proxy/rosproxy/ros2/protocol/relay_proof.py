@@ -1,0 +1,81 @@
+"""The proof that a datagram comes from the LAN relay, or from the relay's proxy.
+
+Both programs know one secret. An address proves nothing: behind Docker's port proxy, and where
+Kubernetes masquerades, each client has the address of the relay.
+
+    magic 4, time stamp 8 (milliseconds of Unix time, big-endian), proof 16, then the content
+
+The proof is a keyed BLAKE2b (RFC 7693) of the time stamp and the content. The direction is the
+*person* parameter of the hash, so that the proof of one direction is wrong in the other.
+
+A proof is good for `WINDOW_S` seconds before and after the receiver's clock. Neither program keeps
+state, so either may start anew at any time. Within the window a datagram may be repeated. Such a
+datagram only says what its participant has just said to the whole LAN. At worst a participant that
+has ended lives for one lease duration more, or a live one is forgotten until its next announcement,
+seconds later. The relay runs on the proxy's machine, so both have one clock, also where that jumps.
+"""
+
+import hmac
+import struct
+from collections.abc import Callable
+from enum import Enum
+from hashlib import blake2b
+
+from rosproxy.ros2.protocol.rtps import RtpsError
+
+MAGIC = b"RPX1"
+WINDOW_S = 30.0
+"""Seconds by which the time stamp may differ from the receiver's clock."""
+LONGEST_CONTENT = 8192 + 16
+"""Bytes of a content that is read: an announcement of the greatest length, and its address."""
+_PROOF_SIZE = 16
+_STAMP = struct.Struct(">Q")
+_CONTENT_AT = len(MAGIC) + _STAMP.size + _PROOF_SIZE
+
+
+class ProofError(RtpsError):
+    """A datagram without a proof that is good now."""
+
+
+class Direction(Enum):
+    """Which way a datagram goes. A value has 16 bytes at most (RFC 7693, 2.8)."""
+
+    TO_PROXY = b"LAN to proxy"
+    TO_LAN = b"proxy to LAN"
+
+
+class RelayProof:
+    """Proves datagrams, and checks proofs. ``unix_time`` is the wall clock, in seconds."""
+
+    __slots__ = ("_key", "_unix_time")
+
+    def __init__(self, secret: str, unix_time: Callable[[], float]) -> None:
+        self._key = blake2b(secret.encode(), digest_size=32).digest()
+        self._unix_time = unix_time
+
+    def sealed(self, direction: Direction, content: bytes) -> bytes:
+        """Return a content with its proof."""
+        stamp = _STAMP.pack(int(self._unix_time() * 1000))
+        return MAGIC + stamp + self._proof(direction, stamp, content) + content
+
+    def opened(self, direction: Direction, datagram: bytes) -> bytes:
+        """Return the content of a datagram that has a good proof. Raises ProofError."""
+        if not datagram.startswith(MAGIC) or len(datagram) < _CONTENT_AT:
+            raise ProofError("it has no proof: run the proxy and its LAN relay in one version")
+        if len(datagram) > _CONTENT_AT + LONGEST_CONTENT:
+            raise ProofError(f"it has more than {LONGEST_CONTENT} bytes behind its proof")
+        stamp = datagram[len(MAGIC) : len(MAGIC) + _STAMP.size]
+        proof = datagram[len(MAGIC) + _STAMP.size : _CONTENT_AT]
+        content = datagram[_CONTENT_AT:]
+        if not hmac.compare_digest(proof, self._proof(direction, stamp, content)):
+            raise ProofError("its proof is wrong: give the proxy and its LAN relay one secret")
+        age = self._unix_time() - _STAMP.unpack(stamp)[0] / 1000
+        if abs(age) > WINDOW_S:
+            text = "it is a repeated one, or the clocks of the proxy and its LAN relay differ"
+            raise ProofError(f"its proof is {age:.0f} s old: {text}")
+        return content
+
+    def _proof(self, direction: Direction, stamp: bytes, content: bytes) -> bytes:
+        proof = blake2b(stamp, digest_size=_PROOF_SIZE, key=self._key, person=direction.value)
+        proof.update(content)
+        return proof.digest()
