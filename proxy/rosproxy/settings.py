@@ -306,62 +306,62 @@ class Settings:
             default="none",
         ),
     ] = None
+    ros2_ear_secret: Annotated[
+        str | None,
+        Option(
+            "The secret that `rosproxy ear` has as `--secret`: both programs prove by it what they "
+            "send each other. Better given as a variable: a command line can be seen by all.",
+            kinds.TOKEN,
+            default="none",
+        ),
+    ] = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:
             raise SettingError("--admin-token-hash", "give either this or --admin-token, not both")
-        self._check_ranges()
         try:
             check_bounds((*self.policy, *self.policy_layers))
         except ValueError as error:
             raise SettingError("--policy", str(error)) from None
-        self._check_versions()
+        if self.for_ros1 and not self.master_uri:
+            text = "missing; give the real ROS master, e.g. http://robot:11311 (ROS_MASTER_URI)"
+            raise SettingError("--master-uri", text)
         self._check_ports()
-
-    def _check_ranges(self) -> None:
-        advertise = self.advertise_port_range
-        if advertise and len(advertise) != len(self.port_range):
-            text = (
-                f"{advertise} has {len(advertise)} ports and --port-range {self.port_range} has "
-                f"{len(self.port_range)}; both need the same number"
-            )
-            raise SettingError("--advertise-port-range", text)
+        if self.for_ros2:
+            self._check_ros2()
 
     def _check_ports(self) -> None:
-        taken: dict[int, str] = {}
+        ports = self.port_range
+        advertise = self.advertise_port_range
+        if advertise and len(advertise) != len(ports):
+            text = f"{advertise} has {len(advertise)} ports and --port-range {ports} has"
+            text += f" {len(ports)}; both need the same number"
+            raise SettingError("--advertise-port-range", text)
+        uses = dict.fromkeys(ports.ports(), f"lies in --port-range {ports}")
         for option, port in (
             ("--master-port", self.master_port),
             ("--publish-master", self.publish_master),
             ("--admin-bind", self.admin.port),
         ):
-            if port is None:
-                continue
-            if port in self.port_range:
-                text = f"port {port} lies in --port-range {self.port_range}; move one of them"
-                raise SettingError(option, text)
-            if port in taken:
-                text = f"port {port} is taken by {taken[port]}; move one of them"
-                raise SettingError(option, text)
-            taken[port] = option
+            if port in uses:
+                raise SettingError(option, f"port {port} {uses[port]}; move one of them")
+            if port is not None:
+                uses[port] = f"is taken by {option}"
 
-    def _check_versions(self) -> None:
-        if self.for_ros1 and not self.master_uri:
-            text = "missing; give the real ROS master, e.g. http://robot:11311 (ROS_MASTER_URI)"
-            raise SettingError("--master-uri", text)
+    def _check_ros2(self) -> None:
         count = len(self.domains)
-        if self.for_ros2 and len(self.port_range) < LEAST_PER_DOMAIN * count:
+        if len(self.port_range) < LEAST_PER_DOMAIN * count:
             text = f"{self.port_range} is too short: each of {count} domains needs"
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
-        if self.for_ros2 and count > 1:
-            self._check_domains_stay_apart()
-
-    def _check_domains_stay_apart(self) -> None:
-        """An announcement need not tell its domain: what has one port has one domain."""
+        # An announcement need not tell its domain: what has one port has one domain.
         cure = "start a proxy for each domain"
-        if self.ros2_ear:
+        if self.ros2_ear and count > 1:
             raise SettingError("--ros2-ear", f"an ear is for one domain: {cure}")
+        if self.ros2_ear and not self.ros2_ear_secret:
+            text = "missing; give this and rosproxy ear --secret one output of openssl rand -hex 16"
+            raise SettingError("--ros2-ear-secret", f"{text} (ROSPROXY_ROS2_EAR_SECRET)")
         for peer in self.ros2_peer:
-            if peer.port:
+            if peer.port and count > 1:
                 text = f"{peer} has a port, which is for one domain: {cure}"
                 raise SettingError("--ros2-peer", text)
 

@@ -3,6 +3,7 @@
 import itertools
 import struct
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from subprocess import PIPE, Popen
@@ -15,6 +16,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.servers.groups import group_socket, join
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
@@ -32,6 +34,8 @@ from tests.unit.ros2.protocol.messages import (
 
 GOOD, ROBOT = bytes([1, 15, 1]) + bytes(9), bytes([1, 15, 2]) + bytes(9)
 EVIL, EAR, VICTIM = NODES[1], NODES[19], STRANGERS[9]
+SECRET = "0123456789abcdef"
+"""What the proxy and its LAN relay share."""
 PORTS = 64
 MORE = 20_000_000
 """Bytes that a second flood may take more than the first."""
@@ -61,6 +65,7 @@ def abused(start_abused, _apart, first) -> Abused:
         port_range=f"{first}-{first + PORTS - 1}",
         ros2_peer=f"{STRANGERS[0]}:{WELL_KNOWN}",
         ros2_ear=f"{EAR}:{WELL_KNOWN}",
+        ros2_ear_secret=SECRET,
     )
 
 
@@ -88,6 +93,12 @@ def served(good: Participant, robot: Participant, marker: bytes) -> list[Address
     content = message(submessage(0x07, 0, bytes(24) + marker), prefix=ROBOT)
     good.gets(content, lambda: robot.data.sendto(content, user))
     return [meta, user]
+
+
+def carried(source: str, datagram: bytes, secret: str = SECRET) -> bytes:
+    """What the LAN relay sends of a datagram that it has heard from an address."""
+    proof = RelayProof(secret, time.time)
+    return proof.sealed(Direction.TO_PROXY, wrapped(source, datagram))
 
 
 def prefix(number: int) -> bytes:
@@ -220,13 +231,13 @@ def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
 def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
     """A victim is named by a forger, and inside has much to say to all that it hears of."""
     served(good, robot, b"before")
-    heard = [wrapped(VICTIM, spdp(prefix(number), VICTIM, 4000 + number)) for number in range(50)]
+    heard = [spdp(prefix(number), VICTIM, 4000 + number) for number in range(50)]
     with closing(Counted(VICTIM)) as counted, abused.watched():
         came = got = 0
         for datagram in heard:
-            forge(EAR, (APART, first), datagram)
-            came += len(datagram) - 16
-            (stand_in, _) = good.hears(datagram[24:36], lambda sent=datagram: None)
+            forge(EAR, (APART, first), carried(VICTIM, datagram))
+            came += len(datagram)
+            (stand_in, _) = good.hears(datagram[8:20], lambda: None)
             for _ in range(100):
                 good.meta.sendto(sedp(GOOD, good.address, 4000), (stand_in.host, stand_in.port))
             forge(VICTIM, (APART, first), farewell(prefix(999)))
@@ -237,11 +248,35 @@ def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
     assert "unproven" in abused.refused()
 
 
+def test_a_process_at_the_relays_address_is_not_the_relay(abused, good, robot, first):
+    """Behind Docker's port proxy each client has that address: inside hosts became participants
+    outside, and a datagram was led to port 9999 of one."""
+    served(good, robot, b"before")
+    host = NODES[5]
+    claims = [(host, 9999), (APART, first), (APART_HOST, first + 3), ("127.0.0.1", 9999)]
+    said = [spdp(prefix(number), *claim) for number, claim in enumerate(claims)]
+    said.append(spdp(prefix(9), EAR, 9999))
+    unproven = [wrapped(claim[0], told) for claim, told in zip(claims, said, strict=False)]
+    forged = [
+        carried(claim[0], told, "another secret") for claim, told in zip(claims, said, strict=False)
+    ]
+    with closing(Counted(host)) as counted, abused.watched():
+        datagrams = [*said, *unproven, *forged, carried(VICTIM, said[0])[:27]]
+        with Flood([(EAR, (APART, first), d) for d in datagrams], is_forged=False) as flood:
+            flood.wait(AMONG // 2)
+            served(good, robot, b"amid")
+        assert {"not_a_peer", "relay_proof"} <= abused.refused()
+        assert counted.bytes_from([APART, APART_HOST]) == 0
+    (domain,) = abused.status()["domains"]
+    assert {participant["address"] for participant in domain["outside"]} == {robot.address}
+
+
 @pytest.fixture
 def ear(abused, first) -> Iterator[Popen[str]]:
     """The ear, on the LAN of the strangers."""
     command = [sys.executable, "-m", "rosproxy", "ear", "--lan", STRANGERS[1]]
     command += ["--bind", f"{EAR}:{WELL_KNOWN}", "--proxy", f"{APART}:{first}"]
+    command += ["--secret", SECRET]
     with Popen(command, stderr=PIPE, text=True, env=clean_environment()) as made:
         assert made.stderr
         assert "ready: " in made.stderr.readline()

@@ -25,6 +25,7 @@ NODES = Path(__file__).parent / "nodes"
 PROGRAMS = {"jazzy": "node.py", "kilted": "node.py", "cyclone": "participant.py"}
 """The program that stands for a node, by the implementation of DDS that it has."""
 EAR_PORT = 47090
+EAR_SECRET = "0123456789abcdef"
 ADMIN_PORT = 11312
 
 
@@ -193,6 +194,7 @@ class Lab:
 
     def _own_environment(self) -> dict[str, str]:
         env = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONUNBUFFERED": "1"}
+        env |= {"ROSPROXY_ROS2_EAR_SECRET": EAR_SECRET, "ROSPROXY_EAR_SECRET": EAR_SECRET}
         return env | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
     def _spawn(self, title: str, role: str, argv: list[str], env: Mapping[str, str]) -> Process:

@@ -157,11 +157,23 @@ def test_a_token_and_a_hash_do_not_go_together() -> None:
     ],
 )
 def test_what_has_one_port_is_for_one_domain(name: str, value: object, complaint: str) -> None:
-    given = {**GIVEN, "ros": ("2",), name: value}
+    given = {**GIVEN, "ros": ("2",), "ros2_ear_secret": "0123456789abcdef", name: value}
     parse_settings({**given, "ros2_domain": (1,)})
     with pytest.raises(SettingError, match=complaint) as caught:
         parse_settings({**given, "ros2_domain": (0, 1)})
     assert caught.value.option == "--" + name.replace("_", "-")
+
+
+def test_a_lan_relay_needs_a_secret() -> None:
+    """Its address is also that of other programs; the error says what to give."""
+    given = {**GIVEN, "ros": ("2",), "ros2_ear": "172.17.0.1:7500"}
+    expected = "--ros2-ear-secret: missing; give this and rosproxy ear --secret one output of"
+    with pytest.raises(SettingError, match=expected):
+        parse_settings(given)
+    secret = "0123456789abcdef"
+    settings = parse_settings({**given, "ros2_ear_secret": secret})
+    assert settings.ros2_ear_secret == secret
+    assert secret not in repr(settings)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """What both engines know of ROS 2: versions, domains, peers, well-known ports and the ear."""
 
+import hashlib
+import hmac
+
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
 from rosproxy.setting_kinds import read_peer
@@ -42,11 +45,23 @@ def is_dds(rmw: str) -> bool:
     return "zenoh" not in rmw
 
 
-def ear_variables(domain: int, lan: str, bind: HostPort, proxy: HostPort) -> dict[str, str]:
+def relay_secret(key: bytes, proxy: str) -> str:
+    """The secret of a proxy and its LAN relay, 64 hex digits: HMAC-SHA256 (RFC 2104) of the proxy.
+
+    ``key`` is what the operator makes the tokens of proxies of, so that an operator that starts
+    again tells both the same secret. No token is one: the proxy's name never begins like this.
+    """
+    return hmac.new(key, f"LAN relay of {proxy}".encode(), hashlib.sha256).hexdigest()
+
+
+def ear_variables(
+    domain: int, lan: str, bind: HostPort, proxy: HostPort, secret: str
+) -> dict[str, str]:
     """What an ear is told; see `rosproxy.ros2.servers.multicast_ear.EarSettings`."""
     return {
         "ROSPROXY_EAR_DOMAIN": str(domain),
         "ROSPROXY_EAR_LAN": lan,
         "ROSPROXY_EAR_BIND": str(bind),
         "ROSPROXY_EAR_PROXY": str(proxy),
+        "ROSPROXY_EAR_SECRET": secret,
     }

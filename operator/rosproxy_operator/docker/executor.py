@@ -321,7 +321,7 @@ class DockerApplier:
         if isinstance(action, CreateSandbox):
             return sandbox_config(action, self._settings)
         if isinstance(action, CreateEar):
-            return ear_config(action, self._settings)
+            return ear_config(action, self._settings, snapshot.state.secret)
         if isinstance(action, CreateRedirect):
             return redirect_config(action, self._settings)
         secret, masters, key = snapshot.state.secret, snapshot.state.masters, action.key

@@ -92,6 +92,12 @@ def _check(settings: Any, deep: bool) -> None:
     required=True,
     help="The proxy's address, as this host reaches it, and the first port of its range.",
 )
+@click.option(
+    "--secret",
+    type=options.click_type(kinds.TOKEN),
+    required=True,
+    help="The secret that the proxy has as --ros2-ear-secret. Better given as a variable.",
+)
 @options.log_options
 @options.config_option
 def ear(log_format: str, log_level: str, **given: Any) -> None:

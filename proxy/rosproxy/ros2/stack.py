@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import secrets
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,10 +31,11 @@ from rosproxy.net.addresses import HostPort, Network
 from rosproxy.net.interfaces import address_into, address_towards, interface_networks
 from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
-from rosproxy.ros2.discovery.domain_settings import DomainSettings
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import DomainWatch
+from rosproxy.ros2.protocol.relay_proof import RelayProof
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.registry.selected import NEWS_TIMEOUT
 from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
@@ -41,6 +43,7 @@ from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
+from rosproxy.settings import Settings
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +112,7 @@ class Ros2:
                 note=self._runtime.refusals.note,
                 judge=self._is_allowed,
                 both_ways=settings.direction == "both",
-                ear=settings.ros2_ear,
+                relay=_relay(settings),
             )
             server = DomainServer(
                 domain_settings,
@@ -325,3 +328,10 @@ class Ros2:
             )
             self._runtime.problems.add(subject, text)
         return [HostPort(address, peer.port) for address in resolved]
+
+
+def _relay(settings: Settings) -> LanRelay | None:
+    """The LAN relay of the settings, which have a secret where they have a relay."""
+    if settings.ros2_ear is None or settings.ros2_ear_secret is None:
+        return None
+    return LanRelay(settings.ros2_ear, RelayProof(settings.ros2_ear_secret, time.time))

@@ -101,7 +101,8 @@ def _ear_steps(context: PlanContext) -> Iterator[Action]:
 def _ensure_ear(context: PlanContext, ear: CreateEar) -> Iterator[Action]:
     """The steps to have this ear and no other."""
     ears = context.observed.ears_of(ear.key)
-    expected = ear_fingerprint(ear, context.settings, context.observed.image_id)
+    observed = context.observed
+    expected = ear_fingerprint(ear, context.settings, observed.image_id, observed.secret)
     selection = context.select(ears, ear.name, expected, lambda _: True)
     if selection.stuck or selection.waiting:
         return

@@ -20,6 +20,7 @@ from rosproxy_operator.common.ros2 import (
     EAR_COMMAND,
     LAST_DOMAIN,
     ear_variables,
+    relay_secret,
     well_known_ports,
 )
 from rosproxy_operator.docker.planner.actions import (
@@ -236,7 +237,8 @@ def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, sec
     """What a proxy's own container is made of, in 16 hex digits.
 
     Neither its name, its sandbox nor the master's address are in it. The hash of its token is: a
-    proxy that knows another one would not listen to the operator.
+    proxy that knows another one would not listen to the operator. So is what it shares with its
+    LAN relay.
     """
     # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
     # is started again while the operator is away begins with the policy of its creation.
@@ -324,25 +326,32 @@ def _variables(
         "ROSPROXY_MASTER_ADDRESS": master_address,
         **({} if key.is_ros2 else bound_variables(settings.proxy_bounds)),
         **policy_variables((*settings.policy, *action.policy)),
-        **(_ros2_variables(action) if key.is_ros2 else {}),
+        **(_ros2_variables(action, secret) if key.is_ros2 else {}),
     }
 
 
-def _ros2_variables(action: Create) -> dict[str, str]:
+def _ros2_variables(action: Create, secret: str) -> dict[str, str]:
     return {
         "ROSPROXY_ROS": "2",
         "ROSPROXY_ROS2_DOMAINS": str(action.key.domain),
         "ROSPROXY_ROS2_PEERS": " ".join(action.peers),
         "ROSPROXY_ROS2_EAR": str(action.ear or ""),
+        "ROSPROXY_ROS2_EAR_SECRET": _relay_secret(action.key, secret) if action.ear else "",
     }
 
 
-def ear_config(action: CreateEar, settings: PlanSettings) -> dict[str, Any]:
+def _relay_secret(key: Key, secret: str) -> str:
+    """What a key's proxy and its LAN relay prove to each other that they know."""
+    return relay_secret(secret.encode(), _identity(key))
+
+
+def ear_config(action: CreateEar, settings: PlanSettings, secret: str) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for an ear.
 
-    It has the host's network and nothing else of the host's.
+    It has the host's network and nothing else of the host's. ``secret`` is what its own is made of.
     """
-    variables = ear_variables(action.key.domain or 0, action.lan, action.bind, action.proxy)
+    own = _relay_secret(action.key, secret)
+    variables = ear_variables(action.key.domain or 0, action.lan, action.bind, action.proxy, own)
     return {
         "Image": settings.proxy_image,
         "User": USER,
@@ -361,9 +370,9 @@ def ear_config(action: CreateEar, settings: PlanSettings) -> dict[str, Any]:
     }
 
 
-def ear_fingerprint(action: CreateEar, settings: PlanSettings, image_id: str) -> str:
+def ear_fingerprint(action: CreateEar, settings: PlanSettings, image_id: str, secret: str) -> str:
     """What an ear is made of, in 16 hex digits; its name is not in it."""
-    body = ear_config(replace(action, fingerprint=""), settings)
+    body = ear_config(replace(action, fingerprint=""), settings, secret)
     return digest({**body, "Image": image_id})
 
 

@@ -85,6 +85,7 @@ class ProxySite(msgspec.Struct, frozen=True):
     ``master`` is the real master as the proxy is told it: with a ``uri`` even if it is a Service,
     ``address`` empty if its name is to be resolved, ``publish`` 0 where that port can't be had.
     ``peers`` are all of ROS 2: those of the RosProxy, and its proxies on other nodes.
+    ``relay_secret`` is what the proxy and its LAN relay share.
     """
 
     rosproxy: RosProxy
@@ -94,6 +95,7 @@ class ProxySite(msgspec.Struct, frozen=True):
     master: MasterSpec
     token_hash: str = ""
     peers: tuple[str, ...] = ()
+    relay_secret: str = ""
 
     @property
     def own_ports(self) -> PortRange:
@@ -163,7 +165,7 @@ def proxy_fingerprint(site: ProxySite, settings: ClusterSettings) -> str:
     """
     rosproxy = site.rosproxy
     inputs = (rosproxy.uid, rosproxy.spec, site.node, site.advertise_host, site.ports, site.master)
-    key = (*inputs, site.token_hash, settings)
+    key = (*inputs, site.token_hash, site.relay_secret, settings)
     name = proxy_id(rosproxy.id, site.node.name)
     cached = _FINGERPRINTS.get(name)
     if cached is None or cached[0] != key:
@@ -380,6 +382,7 @@ def _ros2_variables(site: ProxySite) -> Mapping[str, str]:
         "ROSPROXY_ROS2_DOMAINS": str(spec.ros2.number),
         PEERS_VARIABLE: " ".join(site.peers),
         "ROSPROXY_ROS2_EAR": str(site.ear or ""),
+        "ROSPROXY_ROS2_EAR_SECRET": site.relay_secret if site.ear else "",
     }
 
 

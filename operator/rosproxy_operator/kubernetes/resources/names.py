@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from functools import lru_cache
 
+from rosproxy_operator.common.ros2 import relay_secret
 from rosproxy_operator.kubernetes.resources.model import Name
 
 GROUP = "rosproxy.io"
@@ -118,6 +119,11 @@ def token_of(key: bytes, proxy: Name, node: str) -> str:
     """
     message = f"{proxy} {node}".encode()
     return hmac.new(key, message, hashlib.sha256).hexdigest() if key else ""
+
+
+def relay_secret_of(key: bytes, proxy: Name, node: str) -> str:
+    """What a proxy and its LAN relay prove to each other that they know. Empty without a key."""
+    return relay_secret(key, f"{proxy} {node}") if key else ""
 
 
 def master_uri(cluster_ip: str) -> str:

@@ -15,8 +15,9 @@ Every datagram may be forged. So
 - a participant inside is one whose address is inside, and only locators at that very address get a
   lease: no announcement makes the proxy a way to another host;
 - the prefix of a participant that is there can't be taken at another address or on the other side;
-- a participant outside is one whose address is a peer's, or that the ear has heard from there, and
-  the proxy itself sends to its locators at that very address alone;
+- a participant outside is one whose address is a peer's, or that the LAN relay has heard from
+  there, and the proxy itself sends to its locators at that very address alone;
+- the LAN relay is known by the proof of a shared secret;
 - until one outside has shown that it gets what it is sent (it names the prefix that it answers), it
   is sent no more bytes than came from it: nobody can make the proxy flood somebody else;
 - each source may make only so much discovery in a second, what it leads to included.
@@ -28,7 +29,7 @@ from functools import partial
 from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.discovery_rates import cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
-from rosproxy.ros2.discovery.domain_settings import Outgoing, sent_to
+from rosproxy.ros2.discovery.domain_settings import LanRelay, Outgoing, sent_to
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
 from rosproxy.ros2.protocol.addressing import (
     destination,
@@ -38,6 +39,7 @@ from rosproxy.ros2.protocol.addressing import (
 )
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
 from rosproxy.ros2.protocol.envelope import unwrapped
+from rosproxy.ros2.protocol.relay_proof import Direction
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
 from rosproxy.ros2.protocol.rtps import MAGIC, NO_VENDOR, RtpsError, by_source, source_vendor
 from rosproxy.ros2.registry.participants import (
@@ -83,24 +85,38 @@ class Domain(DomainParticipants):
     def heard_outside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What came to the discovery port.
 
-        Participants announce themselves there, if the ear has heard them or they are a peer's; and
-        those that are known answer the observer.
+        Participants announce themselves there, if the LAN relay has heard them or they are a
+        peer's; and those that are known answer the observer.
         """
-        heard_by_ear = self.settings.ear is not None and source == self.settings.ear.host
+        relay = self.settings.relay
+        # Other programs have the relay's address, too. What they send has no proof.
+        if relay and source == relay.address.host and not datagram.startswith(MAGIC):
+            return self._heard_by_relay(relay, datagram, now)
+        if self.outside.is_strange(source):
+            return []
+        return self._heard_at_discovery(datagram, source, False, now)
+
+    def _heard_by_relay(self, relay: LanRelay, datagram: bytes, now: float) -> list[Outgoing]:
+        """What the LAN relay has heard, if the proof is good and the claimed address can be."""
+        try:
+            content = relay.proof.opened(Direction.TO_PROXY, datagram)
+            source, announcement = unwrapped(content)
+        except RtpsError as error:
+            return self._drop("relay_proof", relay.address.host, str(error))
+        self.rediscovery.ear_heard = True
+        return self._heard_at_discovery(announcement, source, True, now)
+
+    def _heard_at_discovery(
+        self, datagram: bytes, source: str, by_relay: bool, now: float
+    ) -> list[Outgoing]:
+        if self._is_too_much(datagram, source, now):
+            return []
         sent = list[Outgoing]()
         try:
-            # Participants on the ear's host have its address, too; what they send has no envelope.
-            if is_wrapped := heard_by_ear and not datagram.startswith(MAGIC):
-                source, datagram = unwrapped(datagram)
-                self.rediscovery.ear_heard = True
-            if not heard_by_ear and self.outside.is_strange(source):
-                return []
-            if self._is_too_much(datagram, source, now):
-                return []
             for message, received in _credited(datagram):
-                if is_wrapped and message.of_participant is None:
-                    raise RtpsError("the ear carries announcements of participants alone")
-                sent += self._heard_outside(message, source, heard_by_ear, received, now)
+                if by_relay and message.of_participant is None:
+                    raise RtpsError("the LAN relay carries announcements of participants alone")
+                sent += self._heard_outside(message, source, by_relay, received, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
         self._charge(source, sent)
@@ -112,8 +128,9 @@ class Domain(DomainParticipants):
 
     def is_heard_outside(self, source: str) -> bool:
         """Whether `heard_outside` reads what comes from an address."""
-        is_ear = self.settings.ear is not None and source == self.settings.ear.host
-        return is_ear or self.outside.is_met(source)
+        relay = self.settings.relay
+        is_relay = relay is not None and source == relay.address.host
+        return is_relay or self.outside.is_met(source)
 
     def is_read_at(self, port: int, datagram: bytes, source: str) -> bool:
         """Whether `at_lease` reads a datagram, which takes long, and does not just pass it on."""
@@ -231,15 +248,15 @@ class Domain(DomainParticipants):
         self,
         message: DiscoveryMessage,
         source: str,
-        heard_by_ear: bool,
+        by_relay: bool,
         received: int,
         now: float,
     ) -> list[Outgoing]:
         if message.prefix in self.inside.by_prefix or message.prefix == self.own.observer.prefix:
-            return []  # the ear hears what it has sent to the LAN itself
+            return []  # the LAN relay hears what it has sent to the LAN itself
         if message.of_participant is None:
             return self._told_outside(message, source, received, now)
-        if not heard_by_ear and not self.outside.may_announce(
+        if not by_relay and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
             return self._drop("not_a_peer", source, "an announcement; the address is no peer's")
@@ -336,8 +353,9 @@ class Domain(DomainParticipants):
         insider.announced_at = now
         if insider.apart_until:
             return []
-        targets = self.settings.announcement_targets() if is_first else self.outside.met_targets()
-        return [Outgoing(target, announcement) for target in targets]
+        if is_first:
+            return self.settings.to_outside(announcement)
+        return self.outside.to_met(announcement)
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         self.returning.end(message.prefix, source)

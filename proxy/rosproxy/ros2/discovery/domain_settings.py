@@ -8,6 +8,7 @@ import msgspec
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 
 PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST = 250, 7400, 7410
 """DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
@@ -66,6 +67,14 @@ def sent_to(target: HostPort | None, datagrams: Iterable[bytes]) -> list[Outgoin
     return [Outgoing(target, datagram) for datagram in datagrams] if target else []
 
 
+@dataclass(frozen=True, slots=True)
+class LanRelay:
+    """The LAN relay of a domain: where it listens, and the proof that it shares with the proxy."""
+
+    address: HostPort
+    proof: RelayProof
+
+
 @dataclass(slots=True)
 class DomainSettings:
     """The settings of a domain; ``peers`` may change.
@@ -73,7 +82,7 @@ class DomainSettings:
     ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
     each family; a participant is led to that of its own family, if there is one. ``peers`` are
     those outside that are told of participants inside, with port 0 at their well-known ports;
-    ``ear`` is where the program listens that passes announcements on to the LAN.
+    ``relay`` is the program that passes announcements on to the LAN.
     ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
     """
@@ -86,7 +95,7 @@ class DomainSettings:
     judge: Judge
     both_ways: bool = False
     peers: tuple[HostPort, ...] = ()
-    ear: HostPort | None = None
+    relay: LanRelay | None = None
 
     @property
     def host(self) -> str:
@@ -113,16 +122,19 @@ class DomainSettings:
         """The port of the range, its first, at which outside announces itself to the proxy."""
         return self.ports.listen.first
 
-    def announcement_targets(self) -> list[HostPort]:
-        """Where participants inside are announced."""
-        targets = [self.ear] if self.ear else []
-        for peer in self.peers:
-            targets += [peer] if peer.port else self.well_known(peer.host)
-        return targets
-
     def to_outside(self, datagram: bytes) -> list[Outgoing]:
-        """A datagram for everybody to whom participants inside are announced."""
-        return [Outgoing(target, datagram) for target in self.announcement_targets()]
+        """A datagram for all to whom participants inside are announced: the LAN and all peers."""
+        sent = self.to_lan(datagram)
+        for peer in self.peers:
+            targets = [peer] if peer.port else self.well_known(peer.host)
+            sent += [Outgoing(target, datagram) for target in targets]
+        return sent
+
+    def to_lan(self, datagram: bytes) -> list[Outgoing]:
+        """A datagram for the LAN; nothing without a LAN relay."""
+        if self.relay is None:
+            return []
+        return [Outgoing(self.relay.address, self.relay.proof.sealed(Direction.TO_LAN, datagram))]
 
     def well_known(self, host: str, count: int = PARTICIPANTS_TRIED) -> list[HostPort]:
         """Where the first participants of a host are told of others (9.6.2.3)."""

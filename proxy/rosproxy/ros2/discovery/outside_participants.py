@@ -173,24 +173,26 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         datagram = farewell(outsider.prefix, outsider.vendor, next_number(outsider.announcement))
         return sent_to(insider.metatraffic, [datagram])
 
-    def met_targets(self) -> list[HostPort]:
-        """Where a participant inside is announced again, after its first announcement.
+    def to_met(self, datagram: bytes) -> list[Outgoing]:
+        """An announcement of a participant inside, after the first, for all outside.
 
-        Of a peer without a port: where its participants receive discovery, and the next well-known
-        ports, which its participants take one after the other (DDSI-RTPS 2.5, 9.6.2.3). The
-        observer announces itself to all ports of peers, so participants at other ports are met
-        nevertheless. As long as nothing is known of a peer, all its well-known ports are used.
+        Of a peer without a port it goes where participants of the peer receive discovery, and to
+        the next well-known ports, which participants take one after the other (DDSI-RTPS 2.5,
+        9.6.2.3). The observer announces itself to all ports of peers, so participants at other
+        ports are met nevertheless. As long as no participant of a peer is known, all its well-known
+        ports are used.
         """
-        targets = [self.settings.ear] if self.settings.ear else []
+        sent = self.settings.to_lan(datagram)
         for peer in self.settings.peers:
             count = self.count_by_address[peer.host]
             if peer.port:
-                targets.append(peer)
+                targets = [peer]
             elif not count:
-                targets += self.settings.well_known(peer.host)
+                targets = self.settings.well_known(peer.host)
             else:
-                targets += self._met_at(peer.host, count)
-        return targets
+                targets = self._met_at(peer.host, count)
+            sent += [Outgoing(target, datagram) for target in targets]
+        return sent
 
     def _met_at(self, host: str, count: int) -> list[HostPort]:
         met = (p.metatraffic for p in self.by_prefix.values() if p.address == host)

@@ -72,5 +72,5 @@ class Rediscovery:
                 insider.farewell_times.pop(prefix, None)
 
     def _may_part(self, waits_from: float, now: float) -> bool:
-        no_ear = self.settings.ear is None
+        no_ear = self.settings.relay is None
         return no_ear or self.ear_heard or now - waits_from >= EAR_TIME

@@ -4,7 +4,9 @@ Multicast ends at the bridge of a container network. This program runs in the ho
 there what participants announce to the group (SPDP), and tells the proxy, with the address that it
 came from; what the proxy announces it tells the LAN. It carries nothing else: no discovery of
 readers and writers, no user's data. It needs no right but to be in that network, and keeps no
-state, so that it may be killed and started at any time.
+state, so that it may be killed and started at any time. What it tells the proxy has a proof
+(`rosproxy.ros2.protocol.relay_proof`), and so has what the proxy tells it: other programs have the
+address of either.
 """
 
 import asyncio
@@ -12,7 +14,8 @@ import contextlib
 import errno
 import logging
 import socket
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
@@ -23,6 +26,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     SPDP_MULTICAST,
 )
 from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
@@ -32,6 +36,8 @@ log = logging.getLogger(__name__)
 PER_SECOND, BURST = 500.0, 2000.0
 """Datagrams of one source that are read in a second, and at once, each of 256 bytes; a participant
 makes one in three seconds, the proxy those of all inside."""
+QUIET_S = 60.0
+"""Seconds after which a refused proof is logged again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +45,14 @@ class EarSettings:
     """The settings of an ear.
 
     ``lan`` is this host's address on the LAN, ``bind`` where the proxy's announcements come in,
-    ``proxy`` the address and port of the proxy that hears the LAN's.
+    ``proxy`` the address and port of the proxy that hears the LAN's, ``secret`` what both know.
     """
 
     domain: int
     lan: str
     bind: HostPort
     proxy: HostPort
+    secret: str = field(repr=False)
 
 
 class Ear:
@@ -53,10 +60,12 @@ class Ear:
 
     def __init__(self, settings: EarSettings) -> None:
         self._settings, self._loop = settings, asyncio.get_running_loop()
+        self._proof = RelayProof(settings.secret, time.time)
         self._sockets: list[socket.socket] = []
         self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
         self._groups = GroupEars(self._port, self._begin, self._end)
         self._rates = DiscoveryRates(PER_SECOND, BURST)
+        self._warned_at = -QUIET_S
         self.from_lan = self.to_lan = self.dropped = 0
 
     def start(self) -> None:
@@ -95,8 +104,10 @@ class Ear:
                 # What `_tell` has sent comes back here, by loop: the proxy leaves that out.
                 for announcement in self._announcements(datagram, source):
                     self.from_lan += 1
-                    # By the address of this socket the proxy knows that it is the ear.
-                    self._send(self._own, wrapped(source, announcement), self._settings.proxy)
+                    carried = wrapped(source, announcement)
+                    sealed = self._proof.sealed(Direction.TO_PROXY, carried)
+                    # The proxy takes a proof from the address of this socket alone.
+                    self._send(self._own, sealed, self._settings.proxy)
 
     def _tell(self) -> None:
         """Tell the LAN what the proxy announces."""
@@ -107,14 +118,27 @@ class Ear:
                 except ConnectionRefusedError:  # the proxy is away
                     continue
                 source = plain_address(sender[0])
-                # Nobody else is to have participants of his own announced to the LAN.
-                if source != self._settings.proxy.host:
+                content = self._proven(datagram, source)
+                if content is None:
                     self.dropped += 1
                     continue
-                for announcement in self._announcements(datagram, source):
+                for announcement in self._announcements(content, source):
                     self.to_lan += 1
                     for group in groups_of(self._settings.lan):
                         self._send(self._lan, announcement, HostPort(group, self._port))
+
+    def _proven(self, datagram: bytes, source: str) -> bytes | None:
+        """The content of a datagram of the proxy; None if the datagram is another program's."""
+        if source != self._settings.proxy.host:
+            return None
+        try:
+            return self._proof.opened(Direction.TO_LAN, datagram)
+        except ProofError as error:
+            now = self._loop.time()
+            if now - self._warned_at >= QUIET_S:
+                self._warned_at = now
+                log.warning("refused: a datagram from %s, the proxy's address: %s", source, error)
+            return None
 
     def _announcements(self, datagram: bytes, source: str) -> list[bytes]:
         """The announcements of participants in a datagram; none if its source sends too many.

@@ -217,7 +217,7 @@ class Invariants:
         if self.engine.image:
             proxy = HostPort(sandbox.address, hears.range.first)
             made = CreateEar("", hears.key, hears.range, HERE, near, proxy)
-            assert hears.fingerprint == ear_fingerprint(made, SETTINGS, self.engine.image)
+            assert hears.fingerprint == ear_fingerprint(made, SETTINGS, self.engine.image, "")
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""

@@ -38,6 +38,7 @@ from rosproxy_operator.docker.planner.specs import (
     own_labels,
     proxy_fingerprint,
     proxy_name,
+    proxy_token,
     read_own,
     sandbox_config,
     sandbox_fingerprint,
@@ -45,6 +46,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     APP,
     HERE,
@@ -81,7 +83,7 @@ def running_proxy(near: str = NEAR, ear: CreateEar | None = MADE) -> dict[str, A
     places = (Attachment(SETTINGS.uplink, near), Attachment("app", "172.18.0.9"))
     ears = []
     if ear is not None:
-        ear = structs.replace(ear, fingerprint=ear_fingerprint(ear, SETTINGS, IMAGE))
+        ear = structs.replace(ear, fingerprint=ear_fingerprint(ear, SETTINGS, IMAGE, SECRET))
         ears = [EarContainer(KEY, own(ear), RANGE, ear.fingerprint)]
     return {
         "sandboxes": [Sandbox(KEY, own(box, places, "app"), RANGE, box.fingerprint)],
@@ -115,7 +117,7 @@ def test_the_ear_is_made_once_its_proxy_has_an_address() -> None:
 
     create, start = actions(observed(TALKER, **running_proxy(ear=None)))
 
-    fingerprint = ear_fingerprint(MADE, SETTINGS, IMAGE)
+    fingerprint = ear_fingerprint(MADE, SETTINGS, IMAGE, SECRET)
     assert create == structs.replace(MADE, fingerprint=fingerprint)
     assert start == Start(MADE.name)
     assert actions(observed(TALKER, **running_proxy())) == []
@@ -212,8 +214,10 @@ def test_peers_of_all_containers_are_told() -> None:
 
 def test_what_a_proxy_for_ros_2_is_made_of() -> None:
     made = structs.replace(PROXY, peers=("arm:11400", "robot"))
-    env = dict(text.split("=", 1) for text in container_config(made, SETTINGS, SECRET, "")["Env"])
+    env = environment(container_config(made, SETTINGS, SECRET, ""))
+    settings_of(env)  # it starts
     env.pop("ROSPROXY_ADMIN_TOKEN_HASH")
+    env.pop("ROSPROXY_ROS2_EAR_SECRET")
     assert env == {
         "ROSPROXY_ROS": "2",
         "ROSPROXY_ADVERTISE_HOST": HERE,
@@ -231,8 +235,40 @@ def test_what_a_proxy_for_ros_2_is_made_of() -> None:
     )  # fmt: skip
 
 
+def environment(config: dict[str, Any]) -> dict[str, str]:
+    return dict(text.split("=", 1) for text in config["Env"])
+
+
+def secrets_of(secret: str, key: Key = KEY) -> tuple[str, str]:
+    """What the proxy of a key holds, and what its LAN relay does."""
+    proxy = container_config(structs.replace(PROXY, key=key), SETTINGS, secret, "")
+    relay = ear_config(structs.replace(MADE, key=key), SETTINGS, secret)
+    proxy_env = environment(proxy)
+    relay_env = environment(relay)
+    return proxy_env["ROSPROXY_ROS2_EAR_SECRET"], relay_env["ROSPROXY_EAR_SECRET"]
+
+
+def test_a_proxy_and_its_lan_relay_share_a_secret() -> None:
+    """It is computed from the operator's own: the same after each start, another for each proxy."""
+    of_proxy, of_relay = secrets_of(SECRET)
+    assert of_proxy == of_relay == secrets_of(SECRET)[0]
+    others = [secrets_of("another"), secrets_of(SECRET, Key("", HERE, 1))]
+    assert len({of_proxy, *(secret for pair in others for secret in pair)}) == 3
+    # Who reads it by an inspection of the LAN relay can't call the admin endpoint.
+    assert proxy_token(KEY, SECRET) != of_proxy
+    without = container_config(structs.replace(PROXY, ear=None), SETTINGS, SECRET, "")
+    assert "ROSPROXY_ROS2_EAR_SECRET" not in environment(without)
+
+
+def test_both_are_made_anew_for_another_secret() -> None:
+    state = replace(observed(TALKER, **running_proxy()), secret="another")
+    created = [type(a) for a in actions(state) if isinstance(a, Create | CreateEar)]
+    assert created == [Create, CreateEar]
+    assert actions(replace(state, secret=SECRET)) == []
+
+
 def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
-    config = ear_config(MADE, SETTINGS)
+    config = ear_config(MADE, SETTINGS, SECRET)
     assert config["User"] == "10001:10001"
     assert config["HostConfig"] == {
         "ReadonlyRootfs": True,
@@ -260,7 +296,7 @@ def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
     ],
 )
 def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
-    making = inspection(ear_config(MADE, SETTINGS))
+    making = inspection(ear_config(MADE, SETTINGS, SECRET))
     making["HostConfig"][field] = value
     own = OwnLabels("ear", KEY, RANGE, "")
     reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)

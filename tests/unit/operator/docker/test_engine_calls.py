@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.docker.engine_client import DockerClient
@@ -16,6 +17,7 @@ from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
+    CreateEar,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -29,7 +31,9 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.labels.members import LabelReading
+from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
+    ear_config,
     own_labels,
     proxy_token,
     sandbox_config,
@@ -135,6 +139,15 @@ async def test_a_proxy_gets_its_tokens_hash_and_its_masters_address(engine: Fake
     expected = hash_token(proxy_token(KEY, SECRET))
     assert f"ROSPROXY_ADMIN_TOKEN_HASH={expected}" in variables
     assert "ROSPROXY_MASTER_ADDRESS=192.0.2.7" in variables
+
+
+async def test_a_lan_relay_gets_what_it_shares_with_its_proxy(engine: FakeEngine) -> None:
+    key = Key("", "192.0.2.1", 0)
+    near = HostPort("172.30.0.1", RANGE.last)
+    relay = CreateEar("e", key, RANGE, "192.0.2.1", near, HostPort("172.30.0.2", RANGE.first))
+    await carry_out(relay)
+    variables = engine.calls["POST /containers/create"]["Env"]
+    assert variables == ear_config(relay, SETTINGS, SECRET)["Env"]
 
 
 async def test_the_uplink_holds_the_secret(engine: FakeEngine) -> None:

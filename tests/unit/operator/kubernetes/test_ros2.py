@@ -55,6 +55,8 @@ from tests.unit.operator.kubernetes.objects import (
 
 ADDRESS = "10.96.1.1"
 HEARING = Ros2Spec(multicast=True)
+KEY = bytes(range(32))
+SECRET = "0123456789abcdef"
 GOOD = {"master": {"uri": "http://robot:11311"}}
 
 
@@ -119,7 +121,8 @@ def test_what_is_refused(spec: Any, text: str):
 def test_a_proxy_understands_its_variables_and_takes_ports_of_udp():
     of = of2(Ros2Spec(3, ("robot",), True), ports=8)
     ports = PortRange(11400, 11407)
-    place = replace(site(of, node(), ports), peers=("192.0.2.2:11400", "robot"))
+    peers = ("192.0.2.2:11400", "robot")
+    place = replace(site(of, node(), ports), peers=peers, relay_secret=SECRET)
 
     body = manifests.proxy_pod(place, SETTINGS)
 
@@ -127,6 +130,7 @@ def test_a_proxy_understands_its_variables_and_takes_ports_of_udp():
     assert (settings.ros, settings.domains, settings.master_uri) == (("2",), (3,), "")
     assert settings.ros2_peer == (HostPort("192.0.2.2", 11400), HostPort("robot", 0))
     assert settings.ros2_ear == HostPort("192.0.2.1", 11407)
+    assert settings.ros2_ear_secret == SECRET
     assert settings.ports.listen == PortRange(11400, 11406)
     taken = body["spec"]["containers"][0]["ports"]
     assert {port["protocol"] for port in taken} == {"UDP"}
@@ -216,6 +220,42 @@ def test_an_ear_is_made_once_its_proxy_has_an_address():
     assert done(look(replace(seen, ears=(ear(of),)))) == []
     starting = replace(proxy_pod, pod=replace(proxy_pod.pod, ip=""), ready=False)
     assert done(look(observed(of, service(of), pod(), starting))) == []
+
+
+def test_a_proxy_and_its_lan_relay_share_a_secret():
+    """It is computed from the operator's key: the same after each start, another on each node."""
+    of = of2(HEARING, ports=5)
+    far = node("two", addresses={"InternalIP": "192.0.2.2"})
+
+    def secrets(key: bytes) -> list[str]:
+        seen = observed(of, service(of), node(), far, pod(), pod(name="b", on="two"), key=key)
+        made = [action for action in done(look(seen)) if isinstance(action, CreateProxy)]
+        return [env_of(action.body)["ROSPROXY_ROS2_EAR_SECRET"] for action in made]
+
+    of_proxies = secrets(KEY)
+    assert len({*of_proxies, *secrets(bytes(32))}) == 4
+    assert of_proxies == secrets(KEY)
+    proxy_id = names.proxy_id(of.id, "one")
+    assert names.relay_secret_of(KEY, proxy_id, "one") in of_proxies
+    # Who may read pods can't call the admin endpoint by what stands there.
+    assert names.token_of(KEY, proxy_id, "one") not in of_proxies
+    place = replace(site(of, node(), PortRange(11400, 11404)), relay_secret=SECRET)
+    assert place.ear is not None
+    relay = ear_pod(place, place.ear, "10.244.1.200", SETTINGS)
+    assert env_of(relay)["ROSPROXY_EAR_SECRET"] == SECRET
+
+
+def test_a_proxy_without_a_lan_relay_has_no_secret():
+    place = replace(site(of2(), node()), relay_secret=SECRET)
+    assert "ROSPROXY_ROS2_EAR_SECRET" not in env_of(manifests.proxy_pod(place, SETTINGS))
+
+
+def test_both_are_made_anew_for_another_key():
+    of, proxy_pod = hearing()
+    seen = observed(of, service(of), pod(), proxy_pod, ears=(ear(of),))
+    assert done(look(seen)) == []
+    actions = done(look(replace(seen, key=KEY)))
+    assert [type(action) for action in actions] == [DeleteProxy]
 
 
 @pytest.mark.parametrize("why", ["address", "not asked for"])

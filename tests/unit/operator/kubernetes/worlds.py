@@ -270,6 +270,8 @@ class World:
                 for variable in container_of(ears[place][0])["env"]
             }
             assert env["ROSPROXY_EAR_PROXY"] == f"{proxy.pod.ip}:{proxy.range.first}"
+            secret = names.relay_secret_of(self.cluster.key, proxy.pod.id, place.node)
+            assert env["ROSPROXY_EAR_SECRET"] == secret
             assert env["ROSPROXY_EAR_BIND"] == f"{self.names[place.node]}:{proxy.range.last}"
             assert proxy.range.last not in proxy.pod.udp_ports
 
@@ -301,6 +303,9 @@ class World:
         spec = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[place.of]).spec
         assert bool(proxy.pod.host_ports) == spec.ros1
         assert bool(proxy.pod.udp_ports) == (spec.ros2 is not None)
+        secret = names.relay_secret_of(self.cluster.key, proxy.pod.id, place.node)
+        expected = secret if "ROSPROXY_ROS2_EAR" in env else None
+        assert env.get("ROSPROXY_ROS2_EAR_SECRET") == expected
         domain = str(spec.ros2.number) if spec.ros2 else None
         assert env.get("ROSPROXY_ROS2_DOMAINS") == domain
 

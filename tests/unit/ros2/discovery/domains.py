@@ -7,9 +7,11 @@ from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, Outgoing
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, LanRelay, Outgoing
+from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -19,6 +21,9 @@ INSIDE, OTHER, NEAR = "172.30.0.5", "172.30.0.6", "172.30.0.2"
 HOST, ROBOT, STRANGER = "10.0.0.1", "10.0.0.9", "10.0.0.66"
 EAR = HostPort("172.30.0.1", 7500)
 A, B = b"\x01\x0f" + bytes(10), b"\x01\x0f" + bytes(range(10))
+SECRET = "a secret of both"
+UNIX_TIME = 1.7e9
+PROOF = RelayProof(SECRET, lambda: UNIX_TIME)
 RANGE = PortMap(PortRange(45000, 45015), PortRange(46000, 46015))
 NOW = REMEMBERED + 1
 SEDP_WRITERS = 0x000003C2
@@ -44,7 +49,7 @@ def make_domain(
         judge=judge,
         both_ways=both_ways,
         peers=tuple(HostPort(peer, 7410) for peer in peers),
-        ear=ear,
+        relay=LanRelay(ear, PROOF) if ear else None,
     )
     return Domain.starting(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
 
@@ -60,6 +65,11 @@ def spdp(
         *([(Pid.ENTITY_NAME, bytes(padding))] if padding else []),
     ]
     return message(data(payload(parameters)), prefix=prefix)
+
+
+def carried(source: str, datagram: bytes) -> bytes:
+    """What the LAN relay sends the proxy of a datagram that it has heard from an address."""
+    return PROOF.sealed(Direction.TO_PROXY, wrapped(source, datagram))
 
 
 def farewell(prefix: bytes) -> bytes:
@@ -101,4 +111,9 @@ def meet(domain: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgo
 
 
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
-    return [sent.datagram for sent in outgoing if sent.target.host == host]
+    """What is sent to a host; what is for the LAN relay has its proof."""
+    return [
+        PROOF.opened(Direction.TO_LAN, sent.datagram) if sent.target == EAR else sent.datagram
+        for sent in outgoing
+        if sent.target.host == host
+    ]

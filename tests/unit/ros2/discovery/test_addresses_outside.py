@@ -6,7 +6,6 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from tests.unit.ros2.discovery.domains import (
@@ -17,6 +16,7 @@ from tests.unit.ros2.discovery.domains import (
     ROBOT,
     SEDP_WRITERS,
     B,
+    carried,
     make_domain,
     meet,
     reached_at,
@@ -46,8 +46,8 @@ def writer(*hosts: str) -> bytes:
 
 def told_of_participant(domain: Domain, *hosts: str) -> list[str]:
     """Where inside finds one outside, which the ear has heard."""
-    carried = wrapped(ROBOT, participant(ROBOT, *hosts))
-    (datagram,) = to(domain.heard_outside(carried, EAR.host, NOW), INSIDE)
+    told = carried(ROBOT, participant(ROBOT, *hosts))
+    (datagram,) = to(domain.heard_outside(told, EAR.host, NOW), INSIDE)
     metatraffic, *users = [locator.host for locator in reached_at(datagram)]
     assert metatraffic == NEAR
     return users

@@ -14,7 +14,6 @@ from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
@@ -35,6 +34,7 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     allowance_left,
+    carried,
     farewell,
     make_domain,
     meet,
@@ -108,8 +108,8 @@ def test_an_address_of_a_link_outside_is_not_told_inside() -> None:
 def test_the_observer_is_reached_by_either_family() -> None:
     domain = make_domain()
     domain.settings.hosts = (HOST, "fd77::1")
-    (told, *_) = domain.own.announced_outside()
-    assert {locator.host for locator in reached_at(told.datagram)} == {HOST, "fd77::1"}
+    (told,) = to(domain.own.announced_outside(), EAR.host)
+    assert {locator.host for locator in reached_at(told)} == {HOST, "fd77::1"}
 
 
 def test_a_participant_at_two_networks_is_served_at_the_first() -> None:
@@ -208,7 +208,7 @@ def test_a_stranger_is_not_answered() -> None:
 def test_an_announcement_for_another_address_is_refused() -> None:
     domain = make_domain()
     meet(domain)
-    assert domain.heard_outside(wrapped(ROBOT, spdp(B, STRANGER)), EAR.host, NOW) == []
+    assert domain.heard_outside(carried(ROBOT, spdp(B, STRANGER)), EAR.host, NOW) == []
     assert not domain.outside.by_prefix
 
 
@@ -221,7 +221,7 @@ def test_nobody_takes_the_prefix_of_another() -> None:
     assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
     assert domain.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
     assert domain.heard_inside(farewell(A), OTHER, NOW) == []
-    assert domain.heard_outside(wrapped(STRANGER, farewell(B)), EAR.host, NOW) == []
+    assert domain.heard_outside(carried(STRANGER, farewell(B)), EAR.host, NOW) == []
     assert domain.inside.leases == before
     assert domain.outside.by_prefix.keys() == {B}
 
@@ -230,7 +230,7 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
     domain = make_domain(peers=())
     meet(domain)
     heard = spdp(B, ROBOT)
-    domain.heard_outside(wrapped(ROBOT, heard), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, heard), EAR.host, NOW)
     (stand_in,) = domain.outside.stand_ins
     sent = 0
     for _ in range(20):
@@ -430,7 +430,7 @@ def test_who_has_heard_the_observer_may_announce_itself() -> None:
     domain = make_domain(peers=())
     meet(domain)
     neighbour = b"\x01\x10" + bytes(10)
-    domain.heard_outside(wrapped(ROBOT, spdp(neighbour, ROBOT)), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, spdp(neighbour, ROBOT)), EAR.host, NOW)
     answer = spdp(B, ROBOT)
     named = answer[:20] + submessage(0x0E, 0, domain.own.observer.prefix) + answer[20:]
     assert domain.heard_outside(answer, ROBOT, NOW) == []
@@ -446,14 +446,15 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
 
     sent = domain.gone({INSIDE})
 
-    assert [outgoing.target for outgoing in sent] == domain.settings.announcement_targets()
-    (announcement,) = read_discovery(sent[0].datagram).announcements
+    assert [out.target for out in sent] == [out.target for out in domain.settings.to_outside(b"")]
+    (ended,) = to(sent, EAR.host)
+    (announcement,) = read_discovery(ended).announcements
     assert (announcement.ended, announcement.sample.prefix, announcement.sample.sequence) == (
         True,
         A,
         LAST_SEQUENCE,
     )
-    assert source_vendor(sent[0].datagram) == A[:2]
+    assert source_vendor(ended) == A[:2]
     assert [*domain.inside.by_prefix] == [B]
     assert domain.ports.pool.free == taken + 2
     assert domain.gone({INSIDE}) == []

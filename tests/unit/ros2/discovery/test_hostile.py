@@ -15,7 +15,6 @@ from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, MOST_PER_H
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, RtpsError
@@ -40,6 +39,7 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
+    carried,
     farewell,
     make_domain,
     meet,
@@ -107,7 +107,7 @@ def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> N
     sent = domain.heard_inside(spdp(A, INSIDE) + behind, INSIDE, NOW)
     sent += domain.heard_inside(farewell(A) + behind, INSIDE, NOW)
     sent += domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW)
-    sent += domain.heard_outside(wrapped(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
+    sent += domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
     sent += domain.at_lease(lease.port, spdp(B, ROBOT) + behind, ROBOT, NOW)
     assert domain.refused.count == 5
     sent += domain.heard_outside(farewell(B) + behind, ROBOT, NOW)
@@ -163,7 +163,7 @@ def test_an_unproven_participant_has_no_credit_for_copies(is_at_lease: bool, siz
     """What a message became when it was split counted as received: a victim was sent 30 times what
     came in its name."""
     domain = make_domain(peers=[])
-    domain.heard_outside(wrapped(STRANGER, spdp(B, STRANGER)), EAR.host, NOW)
+    domain.heard_outside(carried(STRANGER, spdp(B, STRANGER)), EAR.host, NOW)
     meet(domain)
     (port, *_) = domain.inside.leases
     info_dst = submessage(0x0E, 0, bytes([7]) * size)
@@ -291,9 +291,9 @@ def test_nobody_proves_anything_by_the_ear() -> None:
     domain = make_domain(peers=())
     domain.own.observer.prefix = bytes([7]) * 12
     meet(domain)
-    domain.heard_outside(wrapped(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
     answer = sedp(B, ROBOT, 7411, to=domain.own.observer.prefix)
-    domain.heard_outside(wrapped(ROBOT, answer), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, answer), EAR.host, NOW)
     assert not domain.outside.by_prefix[B].has_answered
     domain.heard_outside(answer, ROBOT, NOW)
     assert domain.outside.by_prefix[B].has_answered
@@ -324,7 +324,7 @@ def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> No
     )
     for size in (0, 4, 11):
         half = message(submessage(0x0E, 0, bytes(size)), data(told), prefix=evil)
-        domain.heard_outside(wrapped(STRANGER, half), EAR.host, NOW)
+        domain.heard_outside(carried(STRANGER, half), EAR.host, NOW)
         domain.heard_inside(half, OTHER, NOW)
     assert evil not in {*domain.outside.by_prefix, *domain.inside.by_prefix}
     denied.append("/chatter")
@@ -347,7 +347,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
     domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
-    domain.heard_outside(wrapped(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
+    domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
     assert (domain.refused.count, domain.inside.leases) == (3, {})
     assert EVIL not in {*domain.inside.by_prefix, *domain.outside.by_prefix}
     meet(domain, A, OTHER)

@@ -6,7 +6,6 @@ import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 from tests.unit.ros2.discovery.domains import (
@@ -17,6 +16,7 @@ from tests.unit.ros2.discovery.domains import (
     ROBOT,
     A,
     B,
+    carried,
     make_domain,
     meet,
     spdp,
@@ -48,7 +48,7 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     yield domain.heard_inside(inside, INSIDE, NOW)
     yield domain.at_lease(lease.port, outside, ROBOT, NOW)
     yield domain.heard_outside(outside, ROBOT, NOW)
-    yield domain.heard_outside(wrapped(ROBOT, outside), EAR.host, NOW)
+    yield domain.heard_outside(carried(ROBOT, outside), EAR.host, NOW)
 
 
 def said_of(prefix: bytes, pid: int, writer: int) -> dict[str, bytes]:

@@ -10,7 +10,6 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.discovery.outside_participants import FAREWELL_INTERVAL
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, EAR_TIME
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
@@ -23,6 +22,7 @@ from tests.unit.ros2.discovery.domains import (
     ROBOT,
     A,
     B,
+    carried,
     farewell,
     make_domain,
     meet,
@@ -155,8 +155,8 @@ def test_they_meet_anew_once_the_ear_is_heard() -> None:
     meet(domain)
     assert domain.settle(NOW) == domain.settle(NOW + 1) == []
 
-    carried = wrapped(ROBOT, spdp(C, ROBOT))
-    assert by(C, to(domain.heard_outside(carried, EAR.host, NOW + 1), INSIDE)) == []
+    told = carried(ROBOT, spdp(C, ROBOT))
+    assert by(C, to(domain.heard_outside(told, EAR.host, NOW + 1), INSIDE)) == []
 
     parting = domain.settle(NOW + 1)
     assert [is_farewell(datagram) for datagram in by(A, to(parting, EAR.host))] == [True]

@@ -19,7 +19,6 @@ from rosproxy.ros2.discovery.domain_settings import (
 )
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.reliable import acknowledged
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
@@ -34,6 +33,7 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
+    carried,
     make_domain,
     meet,
     prove,
@@ -58,7 +58,7 @@ def named(number: int) -> bytes:
 def hear(domain: Domain, prefix: bytes, address: str, now: float = NOW) -> list[Outgoing]:
     """Have the LAN relay tell of a participant."""
     announcement = spdp(prefix, address, lease=LEASE, padding=PADDING)
-    return domain.heard_outside(wrapped(address, announcement), EAR.host, now)
+    return domain.heard_outside(carried(address, announcement), EAR.host, now)
 
 
 def forge(domain: Domain, first: int, count: int) -> list[Outgoing]:
@@ -208,7 +208,7 @@ def test_a_participant_that_only_answers_is_sent_three_times_as_much() -> None:
 
 def test_a_question_is_no_longer_than_what_came() -> None:
     domain = make_domain(peers=())
-    short = domain.heard_outside(wrapped(LAPTOP, spdp(B, LAPTOP)), EAR.host, NOW)
+    short = domain.heard_outside(carried(LAPTOP, spdp(B, LAPTOP)), EAR.host, NOW)
     assert questions(short, LAPTOP) == []  # 140 bytes
     assert questions(hear(domain, B, LAPTOP, NOW + 1), LAPTOP)
 
@@ -221,7 +221,7 @@ def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
     (announced,) = to(sent, EAR.host)
     (meta, _) = reached_at(announced)
     padded = spdp(A, HOST, meta.port, padding=PADDING)
-    (question,) = questions(asking.heard_outside(wrapped(HOST, padded), EAR.host, NOW), HOST)
+    (question,) = questions(asking.heard_outside(carried(HOST, padded), EAR.host, NOW), HOST)
     if known:
         hear(asked, B, HOST)
     back = asked.at_lease(meta.port - 1000, question, HOST, NOW)

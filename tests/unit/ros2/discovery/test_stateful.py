@@ -16,7 +16,6 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.discovery.discovery_rates import BURST, MOST_SOURCES
 from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, Outgoing
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
 from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
@@ -30,6 +29,7 @@ from tests.unit.ros2.discovery.domains import (
     STRANGER,
     A,
     B,
+    carried,
     farewell,
     make_domain,
     sedp,
@@ -127,7 +127,7 @@ class Neighbours(RuleBasedStateMachine):
     @rule(datagram=datagrams(), source=ADDRESS)
     def the_ear_tells(self, datagram: bytes, source: str) -> None:
         self.came[source] += len(datagram)
-        self.check(self.domain.heard_outside(wrapped(source, datagram), EAR.host, self.now))
+        self.check(self.domain.heard_outside(carried(source, datagram), EAR.host, self.now))
 
     @rule(datagram=datagrams(), source=ADDRESS, port=st.integers(45001, 45015))
     def a_port_gets_something(self, datagram: bytes, source: str, port: int) -> None:

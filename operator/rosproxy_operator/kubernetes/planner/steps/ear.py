@@ -40,7 +40,8 @@ def ear_pod(site: ProxySite, ear: HostPort, proxy_address: str, settings: Cluste
     annotations = {NODE: site.node.name}
     meta = metadata(rosproxy, ear_id(rosproxy.id, site.node.name), annotations, EAR)
     target = HostPort(proxy_address, site.ports.first)
-    variables = ear_variables(ros2.number if ros2 else 0, ear.host, ear, target)
+    number = ros2.number if ros2 else 0
+    variables = ear_variables(number, ear.host, ear, target, site.relay_secret)
     policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
     container: dict[str, Any] = {
         "name": EAR,

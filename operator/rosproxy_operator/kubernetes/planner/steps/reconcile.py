@@ -43,7 +43,12 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id, token_of
+from rosproxy_operator.kubernetes.resources.names import (
+    proxy_id,
+    relay_secret_of,
+    service_id,
+    token_of,
+)
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 LOST_FOR = 10.0
@@ -145,7 +150,16 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
     token = token_of(context.observed.key, name, node.name)
     ports, published = context.ranges.given[place], replace(master, publish=publish)
     token_hash = hash_token(token) if token else ""
-    return ProxySite(rosproxy, node, host, ports, published, token_hash, peers_of(context, place))
+    return ProxySite(
+        rosproxy,
+        node,
+        host,
+        ports,
+        published,
+        token_hash,
+        peers_of(context, place),
+        relay_secret_of(context.observed.key, name, node.name),
+    )
 
 
 def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:

@@ -1,0 +1,224 @@
+"""The LAN relay and the proxy, on loopback: each takes from the other what has a good proof.
+
+The proxy hears the laptop by the relay alone.
+"""
+
+import asyncio
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import closing, contextmanager
+from itertools import chain, count
+
+import pytest
+
+from examples.demo.fake_http import free_ports
+from rosproxy.forwarding.datagrams import bind
+from rosproxy.leases.ports import PortMap, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
+from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
+from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.registry.locator_ports import REMEMBERED
+from rosproxy.ros2.servers.domain_server import DomainServer
+from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
+from rosproxy.ros2.servers.multicast_ear import Ear, EarSettings
+from tests.integration.net import PATIENCE, until
+from tests.unit.ros2.discovery.domains import A, B, spdp
+
+PROXY = "127.0.0.1"
+"""The address from which it sends to others on loopback."""
+INSIDE = "127.0.7.32"
+RELAY = "127.0.7.33"
+LAN = "127.0.7.34"
+LAPTOP = "127.0.7.35"
+DOMAIN = 31
+"""Its ports are below those that tests draw."""
+ON_LAN = GROUP, 7400 + 250 * DOMAIN
+SECRET = "0123456789abcdef"
+
+
+class Boundary:
+    """A proxy and a LAN relay, each of which may be started again, with any secret."""
+
+    def __init__(self) -> None:
+        first = free_ports(16)
+        self.ports = PortRange(first, first + 15)
+        self.bind = HostPort(RELAY, free_ports(1))
+        self.reasons = list[str]()
+        self.server: DomainServer | None = None
+        self.relay: Ear | None = None
+
+    def start_proxy(self, secret: str = SECRET) -> DomainServer:
+        if self.server:
+            self.server.close()
+        settings = DomainSettings(
+            number=DOMAIN,
+            hosts=(PROXY,),
+            ports=PortMap(self.ports, self.ports),
+            proxy_address_for=lambda _: PROXY,
+            note=lambda reason, *_: self.reasons.append(reason),
+            judge=lambda *_: True,
+            relay=LanRelay(self.bind, RelayProof(secret, time.time)),
+        )
+        times = chain([0.0], count(REMEMBERED + 1))  # each datagram comes a second later
+        self.server = DomainServer(
+            settings,
+            PROXY,
+            times.__next__,
+            lambda address: address == INSIDE,
+            lambda: None,
+        )
+        self.server.start()
+        return self.server
+
+    def start_relay(self, secret: str = SECRET) -> Ear:
+        if self.relay:
+            self.relay.close()
+        discovery = HostPort(PROXY, self.ports.first)
+        self.relay = Ear(EarSettings(DOMAIN, LAN, self.bind, discovery, secret))
+        self.relay.start()
+        return self.relay
+
+    def close(self) -> None:
+        for program in (self.server, self.relay):
+            if program:
+                program.close()
+
+    async def hears_the_lan(self) -> None:
+        """Hold that the proxy takes from the relay what a laptop announces."""
+        self.reasons.clear()
+        with closing(bind(LAPTOP, 0)) as laptop:
+            send_through(laptop, LAPTOP, loop=True)
+
+            def has_come() -> bool:
+                laptop.sendto(spdp(B, LAPTOP), ON_LAN)
+                return bool(self.server and self.server.domain.outside.by_prefix)
+
+            await until(has_come, "the relay carries what the laptop announces")
+
+    async def is_announced(self) -> None:
+        """Hold that the relay takes from the proxy what a participant inside announces."""
+        assert self.server
+        well_known = PROXY, self.server.domain.settings.unicast_port
+        with closing(bind(INSIDE, 0)) as insider, on_lan() as listening:
+
+            def has_come() -> bool:
+                insider.sendto(spdp(A, INSIDE), well_known)
+                return A in announced(listening)
+
+            await until(has_come, "the LAN hears of the participant inside")
+
+
+@contextmanager
+def on_lan() -> Iterator[socket.socket]:
+    """A socket that hears the group."""
+    with closing(group_socket(HostPort(*ON_LAN))) as sock:
+        join(sock, LAPTOP)
+        yield sock
+
+
+def announced(listening: socket.socket) -> set[bytes]:
+    """The prefixes of what waits at a socket."""
+    prefixes = set[bytes]()
+    try:
+        while True:
+            prefixes.add(source_prefix(listening.recv(65536)))
+    except BlockingIOError:
+        return prefixes
+
+
+@pytest.fixture
+async def boundary() -> AsyncIterator[Boundary]:
+    made = Boundary()
+    yield made
+    made.close()
+
+
+Start = Callable[[Boundary], object]
+ORDERS: dict[str, list[Start]] = {
+    "proxy first": [Boundary.start_proxy, Boundary.start_relay],
+    "relay first": [Boundary.start_relay, Boundary.start_proxy],
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+async def test_both_may_start_again_in_any_order(boundary: Boundary, order: str) -> None:
+    for start in ORDERS[order]:
+        start(boundary)
+    await boundary.hears_the_lan()
+    await boundary.is_announced()
+    for start in ORDERS[order]:
+        start(boundary)
+        await boundary.hears_the_lan()
+        await boundary.is_announced()
+
+
+async def test_a_process_at_the_relays_address_is_refused(boundary: Boundary) -> None:
+    """It has the address of the relay, and was taken for it."""
+    server = boundary.start_proxy()
+    discovery = PROXY, boundary.ports.first
+    forged = RelayProof("another secret", time.time).sealed(Direction.TO_PROXY, spdp(B, LAPTOP))
+    with closing(bind(RELAY, 0)) as process:
+        process.sendto(forged, discovery)
+        await until(lambda: boundary.reasons == ["relay_proof"], "the forged proof is refused")
+        process.sendto(spdp(B, RELAY), discovery)
+        await until(lambda: "not_a_peer" in boundary.reasons, "so is what has none")
+    assert not server.domain.outside.by_prefix
+    assert not server.domain.rediscovery.ear_heard
+
+
+async def test_a_process_at_the_proxys_address_announces_nothing(
+    boundary: Boundary, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever had the proxy's address was announced to the LAN."""
+    relay = boundary.start_relay()
+    good = RelayProof(SECRET, time.time)
+    forged = RelayProof("another secret", time.time).sealed(Direction.TO_LAN, spdp(B, PROXY))
+    reflected = good.sealed(Direction.TO_PROXY, spdp(B, PROXY))
+    old = RelayProof(SECRET, lambda: time.time() - 60).sealed(Direction.TO_LAN, spdp(B, PROXY))
+    refused = [spdp(B, PROXY), forged, reflected, old]
+    target = boundary.bind.host, boundary.bind.port
+    with closing(bind(PROXY, 0)) as process, on_lan() as listening:
+        for datagram in refused:
+            process.sendto(datagram, target)
+        # What comes after them is announced: so they were taken in before.
+        process.sendto(good.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
+        async with asyncio.timeout(PATIENCE):
+            datagram = await asyncio.get_running_loop().sock_recv(listening, 65536)
+    assert source_prefix(datagram) == A
+    assert (relay.dropped, relay.to_lan) == (len(refused), 1)
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1
+    assert "it has no proof: run the proxy and its LAN relay in one version" in warnings[0]
+
+
+async def test_refused_datagrams_cost_the_proxy_none_of_its_allowance(boundary: Boundary) -> None:
+    relay = boundary.start_relay()
+    target = boundary.bind.host, boundary.bind.port
+    good = RelayProof(SECRET, time.time)
+    with closing(bind(PROXY, 0)) as process:
+        process.sendto(spdp(B, PROXY), target)
+        await until(lambda: relay.dropped == 1, "the datagram is refused")
+        assert not relay._rates._by_source
+        process.sendto(good.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
+        await until(lambda: relay.to_lan == 1, "the proxy is announced")
+    assert PROXY in relay._rates._by_source
+
+
+async def test_secrets_that_differ_are_told(
+    boundary: Boundary, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By the proxy, which counts it, and in the log of the relay."""
+    server = boundary.start_proxy()
+    boundary.start_relay("another secret")
+    with closing(bind(LAPTOP, 0)) as laptop:
+        send_through(laptop, LAPTOP, loop=True)
+
+        def has_come() -> bool:
+            laptop.sendto(spdp(B, LAPTOP), ON_LAN)
+            server._send(server.domain.own.announced_outside())
+            return "relay_proof" in boundary.reasons and bool(caplog.records)
+
+        await until(has_come, "both say what is wrong")
+    assert "give the proxy and its LAN relay one secret" in caplog.text
