@@ -266,6 +266,12 @@ def test_a_process_at_the_relays_address_is_not_the_relay(abused, good, robot, f
             flood.wait(AMONG // 2)
             served(good, robot, b"amid")
         assert {"not_a_peer", "relay_proof"} <= abused.refused()
+        assert not {"claimed_address", "own_port"} & abused.refused()
+        # Nor does the relay itself lead there, if a machine on the LAN forges its source.
+        for number, claim in enumerate(claims):
+            forge(EAR, (APART, first), carried(claim[0], spdp(prefix(20 + number), *claim)))
+        served(good, robot, b"after")
+        assert {"claimed_address", "own_port"} <= abused.refused()
         assert counted.bytes_from([APART, APART_HOST]) == 0
     (domain,) = abused.status()["domains"]
     assert {participant["address"] for participant in domain["outside"]} == {robot.address}

@@ -111,6 +111,7 @@ class Ros2:
                 proxy_address_for=address_towards,
                 note=self._runtime.refusals.note,
                 judge=self._is_allowed,
+                is_inside=self._is_inside,
                 both_ways=settings.direction == "both",
                 relay=_relay(settings),
             )

@@ -41,7 +41,15 @@ class Bench:
         self.runtime = runtime = Runtime(parse_settings(told))
         self.tools = tools or FakeTools()
         ports, pool = PortMap(RANGE, RANGE), PortPool(RANGE)
-        domain = DomainSettings(0, ("192.0.2.1",), ports, str, lambda *_: None, lambda *_: True)
+        domain = DomainSettings(
+            number=0,
+            hosts=("192.0.2.1",),
+            ports=ports,
+            proxy_address_for=str,
+            note=lambda *_: None,
+            judge=lambda *_: True,
+            is_inside=lambda _: True,
+        )
         refused = Refused(domain.note)
         proofs = AddressProofs(b"a secret")
         self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs)

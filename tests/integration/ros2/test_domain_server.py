@@ -37,6 +37,7 @@ async def server() -> AsyncIterator[DomainServer]:
         proxy_address_for=lambda _: PROXY,
         note=lambda *_: None,
         judge=lambda *_: True,
+        is_inside=lambda address: address == INSIDE,
         peers=(HostPort(OUTSIDE, 0),),
     )
     times = chain([0.0], repeat(REMEMBERED + 1))

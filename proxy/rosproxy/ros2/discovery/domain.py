@@ -17,7 +17,8 @@ Every datagram may be forged. So
 - the prefix of a participant that is there can't be taken at another address or on the other side;
 - a participant outside is one whose address is a peer's, or that the LAN relay has heard from
   there, and the proxy itself sends to its locators at that very address alone;
-- the LAN relay is known by the proof of a shared secret;
+- the LAN relay is known by the proof of a shared secret, and the address that it claims for a
+  participant is neither inside nor the proxy's own;
 - until one outside has shown that it gets what it is sent (it names the prefix that it answers), it
   is sent no more bytes than came from it: nobody can make the proxy flood somebody else;
 - each source may make only so much discovery in a second, what it leads to included.
@@ -27,6 +28,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 from rosproxy.ros2.discovery.announced_participant import first_metatraffic
+from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import LanRelay, Outgoing, sent_to
@@ -41,7 +43,14 @@ from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
 from rosproxy.ros2.protocol.envelope import unwrapped
 from rosproxy.ros2.protocol.relay_proof import Direction
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
-from rosproxy.ros2.protocol.rtps import MAGIC, NO_VENDOR, RtpsError, by_source, source_vendor
+from rosproxy.ros2.protocol.rtps import (
+    MAGIC,
+    NO_VENDOR,
+    RtpsError,
+    by_source,
+    source_prefix,
+    source_vendor,
+)
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
@@ -101,9 +110,13 @@ class Domain(DomainParticipants):
         try:
             content = relay.proof.opened(Direction.TO_PROXY, datagram)
             source, announcement = unwrapped(content)
+            is_known = source_prefix(announcement) in self.inside.by_prefix
         except RtpsError as error:
             return self._drop("relay_proof", relay.address.host, str(error))
         self.rediscovery.ear_heard = True
+        if fault := claim_fault(source, self.settings):
+            # With IPv6 the relay may hear the inside network, too (groups.py, _IP_MULTICAST_ALL).
+            return [] if is_known else self._drop("claimed_address", source, fault)
         return self._heard_at_discovery(announcement, source, True, now)
 
     def _heard_at_discovery(

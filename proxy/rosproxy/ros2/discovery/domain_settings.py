@@ -84,6 +84,7 @@ class DomainSettings:
     those outside that are told of participants inside, with port 0 at their well-known ports;
     ``relay`` is the program that passes announcements on to the LAN.
     ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
+    ``is_inside`` tells whether an address lies in an inside network.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
     """
 
@@ -93,6 +94,7 @@ class DomainSettings:
     proxy_address_for: Callable[[str], str]
     note: Note
     judge: Judge
+    is_inside: Callable[[str], bool]
     both_ways: bool = False
     peers: tuple[HostPort, ...] = ()
     relay: LanRelay | None = None

@@ -21,6 +21,7 @@ from rosproxy.ros2.discovery.announced_participant import (
     note_endpoints,
     traits,
 )
+from rosproxy.ros2.discovery.claimed_addresses import is_proxy_port
 from rosproxy.ros2.discovery.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
@@ -93,6 +94,10 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             fault = traits(spdp, datagram, source).locator_fault
             text = f"it announces no locator for discovery at {source} ({fault})"
             self.refused("no_locator", source, text)
+            return None
+        if self._is_own_port(metatraffic):
+            text = f"it announces {metatraffic} for discovery, a port of the proxy itself"
+            self.refused("own_port", source, text)
             return None
         participant = participant or self._add(prefix, datagram, source, now)
         if participant is not None:
@@ -320,8 +325,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         elif not self.settings.both_ways:
             return None if _leads_elsewhere(outsider, near, only_heard, locator) else locator
         else:
-            is_own = locator.host == outsider.address
-            lease = self._lease(outsider, locator, LeaseKind.DATA) if is_own else None
+            is_led = locator.host == outsider.address and not self._is_own_port(locator)
+            lease = self._lease(outsider, locator, LeaseKind.DATA) if is_led else None
         return HostPort(near, lease.port) if lease else None
 
     def _lease(
@@ -344,6 +349,10 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         elif kind is LeaseKind.METATRAFFIC:
             lease.kind = kind
         return lease
+
+    def _is_own_port(self, locator: HostPort) -> bool:
+        """Whether a locator is a port of the proxy itself: a stand-in there would lead inside."""
+        return is_proxy_port(locator, self.stand_ins, self.settings)
 
     def _users(self, port: int) -> int:
         return len(self.stand_ins.get(port, ()))

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Sequence
+from ipaddress import ip_address, ip_network
 
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
@@ -21,6 +22,7 @@ INSIDE, OTHER, NEAR = "172.30.0.5", "172.30.0.6", "172.30.0.2"
 HOST, ROBOT, STRANGER = "10.0.0.1", "10.0.0.9", "10.0.0.66"
 EAR = HostPort("172.30.0.1", 7500)
 A, B = b"\x01\x0f" + bytes(10), b"\x01\x0f" + bytes(range(10))
+NETWORK = ip_network("172.30.0.0/24")
 SECRET = "a secret of both"
 UNIX_TIME = 1.7e9
 PROOF = RelayProof(SECRET, lambda: UNIX_TIME)
@@ -47,6 +49,7 @@ def make_domain(
         proxy_address_for=lambda _: NEAR,
         note=lambda *_: None,
         judge=judge,
+        is_inside=lambda address: ip_address(address) in NETWORK,
         both_ways=both_ways,
         peers=tuple(HostPort(peer, 7410) for peer in peers),
         relay=LanRelay(ear, PROOF) if ear else None,

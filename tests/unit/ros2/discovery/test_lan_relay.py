@@ -1,20 +1,31 @@
-"""The LAN relay: whom the proxy takes for it."""
+"""The LAN relay: whom the proxy takes for it, and which addresses it may claim."""
+
+from collections.abc import Callable
 
 import pytest
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_proof import WINDOW_S, Direction, RelayProof
+from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery.domains import (
     EAR,
+    HOST,
     INSIDE,
+    NEAR,
     NOW,
+    OTHER,
     PROOF,
+    RANGE,
     ROBOT,
     SECRET,
     STRANGER,
     UNIX_TIME,
+    A,
     B,
     carried,
     make_domain,
@@ -22,6 +33,10 @@ from tests.unit.ros2.discovery.domains import (
     spdp,
     to,
 )
+from tests.unit.ros2.protocol.messages import data, message, payload
+
+PUBLISHED = RANGE.advertise.first + 3
+LISTEN = RANGE.listen.first + 3
 
 
 def watched(domain: Domain) -> list[str]:
@@ -104,3 +119,123 @@ def test_what_the_relay_is_told_has_a_proof() -> None:
     sealed = [sent.datagram for sent in told if sent.target == EAR]
     assert len(sealed) == 3
     assert all(PROOF.opened(Direction.TO_LAN, datagram) for datagram in sealed)
+
+
+IMPOSSIBLE = {
+    INSIDE: "an inside address",
+    EAR.host: "the relay's, inside",
+    "172.30.0.255": "broadcast, inside",
+    "127.0.0.1": "loopback",
+    "::1": "loopback",
+    "0.0.0.0": "unspecified",
+    "::": "unspecified",
+    "239.255.0.1": "multicast",
+    "ff02::1": "multicast",
+    "255.255.255.255": "broadcast",
+    "fe80::1": "of a link",
+    "10.99.0.2": "the proxy's own, outside of inside",
+}
+
+
+@pytest.mark.parametrize("address", IMPOSSIBLE)
+def test_a_claimed_address_is_not_inside_nor_the_proxys(address: str) -> None:
+    """A stand-in led to port 9999 of a host inside, and to the proxy itself."""
+    domain = make_domain(both_ways=True)
+    domain.settings.proxy_address_for = lambda a: "10.99.0.2" if a == "10.99.0.2" else NEAR
+    meet(domain)
+    reasons = watched(domain)
+    assert domain.heard_outside(carried(address, spdp(B, address, 9999)), EAR.host, NOW) == []
+    assert reasons == ["claimed_address"]
+    assert not domain.outside.by_prefix
+    assert not domain.outside.stand_ins
+    assert domain.rediscovery.ear_heard
+
+
+def test_a_participant_inside_that_the_relay_hears_is_no_fault() -> None:
+    """With IPv6 the relay hears it where another program on the host has joined its network."""
+    domain = make_domain()
+    meet(domain)
+    reasons = watched(domain)
+    before = dict(domain.rates._by_source)
+    assert domain.heard_outside(carried(INSIDE, spdp(A, INSIDE)), EAR.host, NOW) == []
+    assert not reasons
+    # Nor is its own allowance charged, which a forged source on the LAN would use up.
+    assert domain.rates._by_source == before
+
+
+@pytest.mark.parametrize("is_own", [False, True])
+@pytest.mark.parametrize("address", [ROBOT, "169.254.7.7", "2001:db8::9", HOST])
+def test_any_other_address_may_be_claimed(address: str, is_own: bool) -> None:
+    """Programs on the relay's machine have the advertised address, which may be the proxy's."""
+    domain = make_domain(both_ways=True)
+    if is_own and address == HOST:
+        domain.settings.proxy_address_for = lambda a: a
+    meet(domain)
+    sent = domain.heard_outside(carried(address, spdp(B, address, 7412)), EAR.host, NOW)
+    assert to(sent, INSIDE)
+    leads = {lease.target for lease in domain.outside.by_prefix[B].leases.values()}
+    assert leads == {HostPort(address, 7412), HostPort(address, 7413)}
+
+
+def by_relay(domain: Domain, host: str, port: int) -> None:
+    domain.heard_outside(carried(host, spdp(B, host, port)), EAR.host, NOW)
+
+
+def by_peer(domain: Domain, host: str, port: int) -> None:
+    domain.heard_outside(spdp(B, host, port), host, NOW)
+
+
+def at_a_lease(domain: Domain, host: str, port: int) -> None:
+    (lease, *_) = domain.inside.by_prefix[A].leases.values()
+    domain.at_lease(lease.port, spdp(B, host, port), host, NOW)
+
+
+@pytest.mark.parametrize("way", [by_relay, by_peer, at_a_lease])
+@pytest.mark.parametrize("port", [PUBLISHED, LISTEN, 7410, 20001])
+def test_no_stand_in_leads_to_a_port_of_the_proxy(
+    way: Callable[[Domain, str, int], None], port: int
+) -> None:
+    """Where the advertised host is the proxy's own machine: the range, and what inside uses."""
+    domain = make_domain(peers=(HOST,), both_ways=True)
+    domain.settings.proxy_address_for = lambda _: HOST
+    domain.outside.stand_ins[20001] = []
+    meet(domain)
+    reasons = watched(domain)
+    way(domain, HOST, port)
+    assert reasons == ["own_port"]
+    assert not domain.outside.by_prefix
+
+
+def test_another_machine_may_have_ports_of_the_same_numbers() -> None:
+    domain = make_domain(both_ways=True)
+    meet(domain)
+    for number, port in enumerate([PUBLISHED, LISTEN, 7410]):
+        prefix = B[:-1] + bytes([number])
+        domain.heard_outside(carried(ROBOT, spdp(prefix, ROBOT, port)), EAR.host, NOW)
+    domain.heard_outside(carried(HOST, spdp(B, HOST, LISTEN)), EAR.host, NOW)
+    assert len(domain.outside.by_prefix) == 4
+
+
+@pytest.mark.parametrize(
+    ("host", "port"), [(HOST, PUBLISHED), (INSIDE, 9999), (NEAR, LISTEN), (OTHER, 7410)]
+)
+def test_other_locators_of_an_announcement_get_no_stand_in(host: str, port: int) -> None:
+    """User's data of inside went through the proxy to inside again."""
+    domain = make_domain(peers=(), both_ways=True)
+    meet(domain)
+    located = [
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(host, port)),
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(HOST, 7410)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(host, port)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(HOST, 7411)),
+    ]
+    told = [(pid, pack_locator(locator, "<")) for pid, locator in located]
+    datagram = message(data(payload(told)), prefix=B)
+    if host == HOST:  # the first one for discovery at the claimed address is the one that counts
+        datagram = message(data(payload(told[1:])), prefix=B)
+    assert to(domain.heard_outside(carried(HOST, datagram), EAR.host, NOW), INSIDE)
+    leads = {lease.target: lease.kind for lease in domain.outside.by_prefix[B].leases.values()}
+    assert leads == {
+        HostPort(HOST, 7410): LeaseKind.METATRAFFIC,
+        HostPort(HOST, 7411): LeaseKind.DATA,
+    }

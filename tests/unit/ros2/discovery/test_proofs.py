@@ -216,18 +216,20 @@ def test_a_question_is_no_longer_than_what_came() -> None:
 @pytest.mark.parametrize("known", [True, False])
 def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
     """They know nothing of a proxy outside, and can't answer."""
-    asking, asked = make_domain(peers=()), make_domain(peers=())
+    asked = make_domain(peers=())
+    asking = make_domain(peers=())
+    asking.settings.hosts = (LAPTOP,)
     sent = meet(asked)
     (announced,) = to(sent, EAR.host)
     (meta, _) = reached_at(announced)
     padded = spdp(A, HOST, meta.port, padding=PADDING)
     (question,) = questions(asking.heard_outside(carried(HOST, padded), EAR.host, NOW), HOST)
     if known:
-        hear(asked, B, HOST)
-    back = asked.at_lease(meta.port - 1000, question, HOST, NOW)
+        hear(asked, B, LAPTOP)
+    back = asked.at_lease(meta.port - 1000, question, LAPTOP, NOW)
     assert bool(back) is known
     for out in back:
-        assert out.target == HostPort(HOST, 46000)
+        assert out.target == HostPort(LAPTOP, 46000)
         assert len(out.datagram) <= len(question)
         prefix = source_prefix(question)
         assert acknowledged(out.datagram, prefix, BuiltinWriter.PUBLICATIONS) == [1]

@@ -1,0 +1,43 @@
+"""Where a participant outside can't be, whatever a datagram claims.
+
+The LAN relay passes on the source address of what it hears, and a source address may be forged. The
+proxy opens ports inside that lead to a participant outside: none may lead back inside, to the
+machine of the proxy, or to the proxy's own ports.
+"""
+
+from collections.abc import Container
+
+from rosproxy.net.addresses import HostPort, as_ip, is_loopback, is_of_link
+from rosproxy.ros2.discovery.domain_settings import DomainSettings
+
+_BROADCAST = "255.255.255.255"
+
+
+def claim_fault(address: str, settings: DomainSettings) -> str | None:
+    """Return why no participant outside can be at an address; None if a participant can.
+
+    The advertised host may be claimed, also where the proxy itself has that address. Programs on
+    the LAN relay's machine are participants there, and `is_proxy_port` protects the proxy's ports.
+    """
+    parsed = as_ip(address)
+    if parsed is None or is_loopback(address) or address == _BROADCAST or parsed.is_multicast:
+        return f"{address} is no address of a machine on a LAN"
+    if is_of_link(address):
+        return f"{address} means something on its own link alone; use a global address there"
+    if settings.is_inside(address):
+        return f"{address} lies in an inside network"
+    if address not in settings.hosts and settings.proxy_address_for(address) == address:
+        return f"{address} is an address of the proxy itself"
+    return None
+
+
+def is_proxy_port(locator: HostPort, stand_ins: Container[int], settings: DomainSettings) -> bool:
+    """Return whether a locator is a port of the proxy, as outside or the proxy's machine sees it.
+
+    A stand-in that led there would lead back inside. ``stand_ins`` are the ports that are open.
+    """
+    if locator.port in settings.ports.advertise and locator.host in settings.hosts:
+        return True
+    port = locator.port
+    is_open = port in settings.ports.listen or port == settings.unicast_port or port in stand_ins
+    return is_open and settings.proxy_address_for(locator.host) == locator.host
