@@ -105,6 +105,17 @@ class Domain(DomainParticipants):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
 
+    def source_of(self, datagram: bytes, source: str) -> str:
+        """The address at which a datagram was heard, by the LAN relay or the proxy itself."""
+        relay = self.settings.relay
+        if relay is None or source != relay.address.host or datagram.startswith(MAGIC):
+            return source
+        try:
+            heard_at, _ = unwrapped(relay.proof.opened(Direction.TO_PROXY, datagram))
+        except RtpsError:
+            return source
+        return heard_at
+
     def _heard_by_relay(self, relay: LanRelay, datagram: bytes, now: float) -> list[Outgoing]:
         """What the LAN relay has heard, if the proof is good and the claimed address can be."""
         try:

@@ -6,7 +6,6 @@ User data and the admin endpoint come first: sockets are read at once, and what 
 
 import asyncio
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue
@@ -14,28 +13,24 @@ from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue
 ROUND = 16 * 1024
 """Bytes that are read and sent in a round. The longest datagram has a round of its own, of 5 ms."""
 
-Read = Callable[[bytes, str], Sequence[Outgoing]]
-"""Reads a datagram from a source, sends what follows from it, and returns that."""
-
-
-class _Datagram(NamedTuple):
-    """A datagram that waits, and what reads it."""
-
-    content: bytes
-    read: Read
+Read = Callable[[], Sequence[Outgoing]]
+"""Reads a datagram, sends what follows from it, and returns that."""
 
 
 class DiscoveryReader:
     """Reads datagrams in a fair order, until it is closed. Needs a running event loop."""
 
     def __init__(self) -> None:
-        self._queue = DiscoveryQueue[_Datagram]()
+        self._queue = DiscoveryQueue[Read]()
         self._loop = asyncio.get_running_loop()
         self._round: asyncio.Handle | None = None
 
-    def put(self, source: str, is_known: bool, datagram: bytes, read: Read) -> bool:
-        """Have a datagram read when the turn of its source comes. Return False if it is lost."""
-        has_room = self._queue.put(source, is_known, _Datagram(datagram, read), len(datagram))
+    def put(self, source: str, is_known: bool, size: int, read: Read) -> bool:
+        """Have a datagram of so many bytes read when the turn of its source comes.
+
+        Return False if it is lost.
+        """
+        has_room = self._queue.put(source, is_known, read, size)
         self._schedule()
         return has_room
 
@@ -54,7 +49,7 @@ class DiscoveryReader:
         try:
             spent = 0
             while spent < ROUND and (waiting := self._queue.pop()):
-                sent = waiting.item.read(waiting.item.content, waiting.source)
+                sent = waiting.item()
                 led_to = sum(len(out.datagram) + OVERHEAD for out in sent)
                 self._queue.charge(waiting.source, led_to)
                 spent += waiting.size + led_to

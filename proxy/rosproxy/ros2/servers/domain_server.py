@@ -295,10 +295,12 @@ class DomainServer:
 
     def _queue(self, take: Take, datagram: bytes, source: str) -> None:
         """Have discovery read when the turn of its source comes."""
-        is_known = self.domain.is_known(source)
-        if not self._reader.put(source, is_known, datagram, partial(self._carry_out, take)):
+        heard_at = self.domain.source_of(datagram, source)
+        is_known = self.domain.is_known(heard_at)
+        read = partial(self._carry_out, take, datagram, source)
+        if not self._reader.put(heard_at, is_known, len(datagram), read):
             text = "more discovery waits to be read than has room"
-            self.domain.refused("rate", source, text)
+            self.domain.refused("rate", heard_at, text)
 
     def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:
         """Send what follows from a datagram, and return that."""

@@ -239,3 +239,13 @@ def test_other_locators_of_an_announcement_get_no_stand_in(host: str, port: int)
         HostPort(HOST, 7410): LeaseKind.METATRAFFIC,
         HostPort(HOST, 7411): LeaseKind.DATA,
     }
+
+
+def test_what_the_relay_carries_waits_as_the_one_that_was_heard() -> None:
+    """Else a flood on the LAN would have all that it carries wait."""
+    domain = make_domain()
+    heard = carried(ROBOT, spdp(B, ROBOT))
+    assert domain.source_of(heard, EAR.host) == ROBOT
+    assert domain.source_of(heard, STRANGER) == STRANGER
+    for datagram, _ in WITHOUT_THE_SECRET.values():
+        assert domain.source_of(datagram, EAR.host) == EAR.host
