@@ -30,7 +30,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.desired import answers_to, needed_by
+from rosproxy_operator.docker.planner.aliases import answers_to, needed_by
 from rosproxy_operator.docker.planner.duplicates import Selection, free_name, select
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (

@@ -11,6 +11,7 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
 )
+from rosproxy_operator.docker.planner.aliases import assign_aliases
 from rosproxy_operator.docker.planner.allocation import after_refusals, allocate
 from rosproxy_operator.docker.planner.container_steps import (
     PlanContext,
@@ -18,7 +19,7 @@ from rosproxy_operator.docker.planner.container_steps import (
     removal_steps,
     wanted_steps,
 )
-from rosproxy_operator.docker.planner.desired import assign_aliases, desire
+from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
 from rosproxy_operator.docker.planner.label_policy import within_bounds
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.desired import assign_aliases, desire
+from rosproxy_operator.docker.planner.aliases import assign_aliases
+from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Network
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory, with_exited
