@@ -23,6 +23,7 @@ _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _PATTERN = re.compile(
     r"(?:http://)?(?P<host>[a-z0-9_.*?-]+|\[[0-9a-f:.*?]+\])(?::(?P<port>[0-9*?]{1,5}))?/?"
 )
+_NAME_PATTERN = re.compile(r"[a-z0-9_.*?-]{1,253}")
 
 
 def read_host_pattern(text: str) -> str:
@@ -36,6 +37,14 @@ def read_host_pattern(text: str) -> str:
             f"{text[:40]!r} is not of the form HOST or HOST:PORT, such as robot*:11311"
         )
     return f"{match['host']}:{match['port'] or '*'}"
+
+
+def read_name_pattern(text: str) -> str:
+    """A pattern of host names, in lower case; * and ? are wildcards. Raises ValueError."""
+    pattern = text.strip().lower()
+    if not _NAME_PATTERN.fullmatch(pattern):
+        raise ValueError(f"{text[:40]!r} is not a host name such as robot or *.lab.example")
+    return pattern
 
 
 def read_shared_master_uri(text: str) -> str:
@@ -103,6 +112,7 @@ def read_uplink(text: str) -> str:
 PORTS = Number("N", 1, MOST_PORTS)
 SHARED_MASTER_URI = Text("URI", read_shared_master_uri)
 HOST_PATTERN = Text("HOST[:PORT]", read_host_pattern)
+NAME_PATTERN = Text("HOST", read_name_pattern)
 PEER_NAME = Text("HOST[:PORT]", read_peer_name)
 LAN = Text("ADDRESS|none", read_lan)
 MEMORY = Text("SIZE", read_memory)

@@ -125,6 +125,19 @@ class PlanSettings:
             note="separated by spaces",
         ),
     ] = ()
+    allow_alias: Annotated[
+        tuple[str, ...],
+        Option(
+            "A name that a label or `ROS_MASTER_URI` may [give a proxy](labels.md#names) on the "
+            "container's networks: the host name of its master. `*` and `?` stand for other "
+            "characters: `robot*`, `*.lab.example`. That of `--master-uri` is allowed in any case. "
+            "Repeatable.",
+            option_values.NAME_PATTERN,
+            repeatable=True,
+            default="names of a LAN that no container has or had",
+            note="separated by spaces",
+        ),
+    ] = ()
     redirect: Annotated[
         bool,
         Option(

@@ -51,6 +51,11 @@ log = logging.getLogger(__name__)
 
 PATIENCE = 0.1
 """Seconds that a look waits for inspections; later ones count from the next look on."""
+FIRST_PATIENCE = 1.0
+"""Seconds that an observer's first look waits, when nothing is inspected yet.
+
+A proxy gets no name that a container has, and only inspections tell the aliases of containers.
+"""
 _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_SANDBOX: Sandbox,
     ROLE_PROXY: Proxy,
@@ -233,6 +238,7 @@ class DockerObserver:
         self._engine, self._settings, self._masters = engine, settings, masters
         self._inspector = Inspector(engine, late)
         self._fresh = secrets.token_hex(32)
+        self._has_looked = False
 
     @property
     def waiting(self) -> bool:
@@ -258,7 +264,9 @@ class DockerObserver:
         )
         labelled = ((row["Id"], self._read_own(row)) for row in rows)
         own_roles = {key: own.role for key, own in labelled if own}
-        await self._inspector.update(rows, own_roles, patience)
+        least = 0.0 if self._has_looked else FIRST_PATIENCE
+        await self._inspector.update(rows, own_roles, max(patience, least))
+        self._has_looked = True
         networks = tuple(map(engine_json.read_network, net_rows))
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
         # A bridge's gateway is an address of the host's own network namespace. In another one, the

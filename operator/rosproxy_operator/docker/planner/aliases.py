@@ -1,51 +1,83 @@
 """The names under which the nodes of containers find their proxies, by network.
 
-An engine answers with all containers that have a name, in any order. So no name is taken that
-another one holds: nodes would reach now one, now the other.
+An engine answers with all containers that have a name, in any order. So a proxy gets no name that
+a container has: nodes would reach now one, now the other. A proxy that has such a name loses it.
 """
 
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels.readers import ALIAS, MASTER_URI
-from rosproxy_operator.docker.planner.model import (
-    Container,
-    Desired,
-    HostState,
-    Key,
-    Member,
-    Sandbox,
+from rosproxy_operator.docker.planner.labels.alias_bounds import (
+    alias_refusal,
+    is_allowed_by_administrator,
 )
-from rosproxy_operator.docker.planner.specs import master, proxy_name
+from rosproxy_operator.docker.planner.labels.readers import ALIAS, MASTER_URI
+from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
+from rosproxy_operator.docker.planner.taken_names import (
+    FormerNames,
+    NamesByNetwork,
+    places_of,
+    present_names,
+)
+from rosproxy_operator.docker.settings import PlanSettings
 
 Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
 """For a key and a network, the names of the key's proxy there."""
-_GONE = frozenset({"dead", "removing"})
+
+
+@dataclass(frozen=True, slots=True)
+class Naming:
+    """The names of the proxies, by key and network, and problems of containers without theirs.
+
+    ``withdrawn`` are names, by network, that no proxy there may have or keep.
+    """
+
+    aliases: Aliases
+    withdrawn: Mapping[str, frozenset[str]]
+    problems: tuple[Problem, ...]
+
+    def is_misnamed(self, sandbox: Container, network: str) -> bool:
+        """Whether a sandbox has a name on a network that no proxy may have there.
+
+        The engine takes no single name away: to lose one, the sandbox has to join the network anew.
+        """
+        # The engine gives these names by itself, so that joining anew would change nothing.
+        lasting = {sandbox.name.lower(), sandbox.id[:12]}
+        withdrawn = self.withdrawn.get(network, frozenset()) - lasting
+        return any(answers_to(sandbox, network, name) for name in withdrawn)
 
 
 @dataclass(frozen=True, slots=True)
 class _Claim:
-    """A name on a network, the proxies that want it, and the containers and proxies with it."""
+    """A name on a network, the proxies that want it, and the containers and proxies with it.
+
+    ``refusal`` says why a label may not give the name; it is empty if a label may.
+    """
 
     network: str
     alias: str
     claimants: tuple[Desired, ...]
     containers: tuple[str, ...]
     holders: tuple[Key, ...]
+    refusal: str = ""
+
+    @property
+    def withdrawn(self) -> bool:
+        """Whether no proxy may have the name."""
+        return bool(self.containers or self.refusal)
 
     @property
     def owner(self) -> Key | None:
-        """The proxy that gets the name; None if another container on the network has it.
+        """The proxy that gets the name; None if no proxy may have the name, or wants it.
 
-        A proxy that already has the name keeps it, so that no connection is cut. Otherwise it goes
-        to the first one whose containers look for it, else to the first that would have it. One
-        that shares its name with another container loses it when it joins the network anew.
+        A proxy that already has the name keeps it, so that no connection is cut. Otherwise the
+        first proxy gets it whose containers look for it, else the first that wants it.
         """
-        if self.containers:
+        if self.withdrawn or not self.claimants:
             return None
         if self.holders:
             return self.holders[0]
@@ -53,32 +85,41 @@ class _Claim:
         return (needed or [d.key for d in self.claimants])[0]
 
 
-def assign_aliases(
-    desired: Collection[Desired], observed: HostState
-) -> tuple[Aliases, list[Problem]]:
-    """The names of the proxies that are wanted, and the containers that won't find theirs.
+@dataclass(frozen=True, slots=True)
+class _NameFacts:
+    """What decides on a name: the host, the names of its containers, and the settings."""
 
-    ``desired`` is sorted by key.
+    observed: HostState
+    settings: PlanSettings
+    present: NamesByNetwork
+    former: FormerNames
+
+
+def assign_aliases(
+    desired: Collection[Desired], observed: HostState, settings: PlanSettings, former: FormerNames
+) -> Naming:
+    """The names of the proxies, and the containers that won't find theirs.
+
+    ``desired`` is sorted by key. ``former`` are the names that containers have or had.
     """
     aliases: dict[Key, dict[str, tuple[str, ...]]] = {}
+    withdrawn: dict[str, frozenset[str]] = {}
     problems: list[Problem] = []
-    neighbours: dict[str, list[Container]] = defaultdict(list)
-    for container in observed.containers:
-        for network in container.networks:
-            neighbours[network].append(container)
-    for network in sorted({name for d in desired if d.live for name in d.networks}):
+    facts = _NameFacts(observed, settings, present_names(observed), former)
+    for network in sorted({name for d in desired for name in d.networks}):
         proxies = [d for d in desired if network in d.networks]
         claims = [
-            _claim(network, alias, proxies, neighbours[network], observed.sandboxes)
-            for alias in sorted({name for d in proxies if d.live for name in _names(d.key)})
+            _claim(network, alias, proxies, facts)
+            for alias in sorted({name for d in proxies for name in _names(d.key)})
         ]
         for claim in claims:
             if claim.owner is not None:
                 names = aliases.setdefault(claim.owner, {})
                 names[network] = (*names.get(network, ()), claim.alias)
+        withdrawn[network] = frozenset(claim.alias for claim in claims if claim.withdrawn)
         common = next((claim for claim in claims if claim.alias == ALIAS), None)
         problems += [problem for claim in claims for problem in _problems(claim, common)]
-    return aliases, problems
+    return Naming(aliases, withdrawn, tuple(problems))
 
 
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
@@ -107,19 +148,15 @@ def _names(key: Key) -> tuple[str, ...]:
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
 
 
-def _claim(
-    network: str,
-    alias: str,
-    proxies: Iterable[Desired],
-    neighbours: Iterable[Container],
-    sandboxes: Iterable[Sandbox],
-) -> _Claim:
-    containers = [
-        container.name
-        for container in neighbours
-        if container.state not in _GONE and answers_to(container, network, alias)
-    ]
-    holding = [s for s in sandboxes if answers_to(s.container, network, alias)]
+def _claim(network: str, alias: str, proxies: Collection[Desired], facts: _NameFacts) -> _Claim:
+    observed = facts.observed
+    places = [*places_of(alias, network, (n.name for n in observed.networks))]
+    containers = {
+        holder
+        for where, name in places
+        for holder in facts.present.get(where, {}).get(name, frozenset())
+    }
+    holding = [s for s in observed.sandboxes if answers_to(s.container, network, alias)]
     staying = [d.key for d in proxies if d.key in {s.key for s in holding}]
     # One that is restarting can't leave the network: it answers there again in a moment.
     stuck = sorted(s.key for s in holding if s.container.state == "restarting")
@@ -129,38 +166,61 @@ def _claim(
         claimants=tuple(d for d in proxies if d.live and alias in _names(d.key)),
         containers=tuple(sorted(containers)),
         holders=tuple(dict.fromkeys([*staying, *stuck])),
+        refusal="" if alias == ALIAS or is_proxy_name(alias) else _refusal(alias, places, facts),
     )
 
 
+def _refusal(alias: str, places: Iterable[tuple[str, str]], facts: _NameFacts) -> str:
+    """Why the name of a master's host is not for a proxy, though no container has the name now."""
+    if refusal := alias_refusal(alias, facts.settings):
+        return refusal
+    former = next((facts.former[place] for place in places if place in facts.former), "")
+    if not former or is_allowed_by_administrator(alias, facts.settings):
+        return ""
+    return f"container {former} had the name, and may come back"
+
+
 def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
-    """Warnings for containers that look for their proxy by a name that others have.
+    """Warnings for containers that look for their proxy by a name that the proxy has not.
 
     ``common`` is the claim to the name that all proxies would have.
     """
     for claimant in claim.claimants:
-        if _has_name(claim, claimant.key):
-            continue
-        holders = [f"container {name}" for name in claim.containers]
-        rivals = {*claim.holders, claim.owner or claimant.key} - {claimant.key}
-        holders += [_holder(claim, key) for key in sorted(rivals)]
         key = claimant.key
+        if _has_name(claim, key):
+            continue
         host = ALIAS if common and _has_name(common, key) else proxy_name(key)
         for member in _seekers(claimant, claim.network, claim.alias):
             fix = f"set ROS_MASTER_URI=http://{host}:{master(key).port}"
             if MASTER_URI not in member.container.labels:
                 # Without it a variable that names a proxy leaves open which master is meant.
                 fix += f" and the label {MASTER_URI}={key.master_uri}"
-            yield Problem(
-                f"container {member.container.name}",
-                f"looks for its proxy by the name {claim.alias}, but on network {claim.network} "
-                f"{listed(holders)} answers to it, so its nodes go around their proxy: {fix}",
-                fatal=False,
+            text = (
+                f"looks for its proxy by the name {claim.alias}, but {_obstacle(claim, key, fix)}"
             )
+            yield Problem(f"container {member.container.name}", text, fatal=False)
+
+
+def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
+    """What keeps a proxy from a name, and what the user or the administrator can do."""
+    if claim.refusal and not claim.containers:
+        return (
+            f"labels may not give a proxy that name on network {claim.network}: {claim.refusal}. "
+            "Its nodes go around their proxy. Start the operator with --allow-alias "
+            f"{claim.alias}, or {fix}"
+        )
+    holders = [f"container {name}" for name in claim.containers]
+    rivals = {*claim.holders, claim.owner or key} - {key}
+    holders += [_holder(claim, rival) for rival in sorted(rivals)]
+    return (
+        f"on network {claim.network} {listed(holders)} answers to it, so its nodes go around "
+        f"their proxy: {fix}"
+    )
 
 
 def _has_name(claim: _Claim, key: Key) -> bool:
     """Whether a proxy, and nobody else, answers to the name, or will."""
-    return key == claim.owner and not claim.containers and len(claim.holders) <= 1
+    return key == claim.owner and len(claim.holders) <= 1
 
 
 def _holder(claim: _Claim, key: Key) -> str:

@@ -8,7 +8,7 @@ Networks are joined after the start: an engine that starts a container with seve
 them in any order, and may lay the published ports over one and then move them to the uplink.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 from msgspec.structs import replace
@@ -30,7 +30,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.aliases import answers_to, needed_by
+from rosproxy_operator.docker.planner.aliases import Naming, answers_to, needed_by
 from rosproxy_operator.docker.planner.duplicates import Selection, free_name, select
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
@@ -57,7 +57,7 @@ _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 
 @dataclass(frozen=True, slots=True)
 class PlanContext:
-    """One key that is wanted, what there is for it, and what it gets: ports, and names by network.
+    """One key that is wanted, what there is for it, and what it gets: ports, and names.
 
     ``creatable``: the image and the uplink are there or can be made.
     """
@@ -66,8 +66,12 @@ class PlanContext:
     settings: PlanSettings
     desired: Desired
     ports: PortRange
-    aliases: Mapping[str, tuple[str, ...]]
+    naming: Naming
     creatable: bool
+
+    def aliases(self, network: str) -> tuple[str, ...]:
+        """The proxy's names on a network."""
+        return self.naming.aliases.get(self.desired.key, {}).get(network, ())
 
     def taken(self, own: Iterable[OwnContainer]) -> frozenset[str]:
         """The names of all containers but these."""
@@ -144,19 +148,28 @@ def removal_steps(
 
 
 def disconnect_steps(
-    observed: HostState, desired: Desired, planned: Collection[Action], uplink: str
+    observed: HostState,
+    desired: Desired,
+    planned: Collection[Action] | None,
+    uplink: str,
+    naming: Naming,
 ) -> Iterator[Disconnect]:
-    """Take sandboxes that stay off the networks on which nobody wants them any more.
+    """Take sandboxes that stay off the networks on which no container wants them any more.
 
-    ``planned`` are the key's other actions, which may say so themselves.
+    ``planned`` are the key's other actions, which may say so themselves. Without any, a sandbox
+    also leaves where it has a name that it must not have: no other step makes it join anew.
     """
+    is_idle = not desired.live or planned is None
+    planned = planned or ()
     gone = _removed(planned)
     for sandbox in observed.sandboxes_of(desired.key):
         container = sandbox.container
         if container.state in _CHANGEABLE and container.name not in gone:
             for network in _joined(observed, container):
                 action = Disconnect(container.name, network)
-                if network not in desired.networks | {uplink} and action not in planned:
+                unwanted = network not in desired.networks | {uplink}
+                misnamed = is_idle and naming.is_misnamed(container, network)
+                if (unwanted or misnamed) and action not in planned:
                     yield action
 
 
@@ -231,11 +244,12 @@ def _join_steps(context: PlanContext, kept: Container) -> Iterator[Action]:
     if context.settings.uplink not in kept.networks:
         yield Connect(kept.name, context.settings.uplink, ())
     for network in sorted(context.desired.networks):
-        if network in kept.networks and not _lacks_alias(context, kept, network):
+        misnamed = context.naming.is_misnamed(kept, network) or _lacks_alias(context, kept, network)
+        if network in kept.networks and not misnamed:
             continue
         if network in kept.networks:
             yield Disconnect(kept.name, network)
-        yield Connect(kept.name, network, context.aliases.get(network, ()))
+        yield Connect(kept.name, network, context.aliases(network))
 
 
 def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
@@ -245,7 +259,7 @@ def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
     """
     return any(
         needed_by(context.desired, network, alias)
-        for alias in context.aliases.get(network, ())
+        for alias in context.aliases(network)
         if not answers_to(kept, network, alias)
     )
 
@@ -265,7 +279,7 @@ def _start_steps(context: PlanContext, selection: Selection, kept: Container) ->
 
 def _connect(context: PlanContext, name: str) -> Iterator[Action]:
     for network in sorted(context.desired.networks):
-        yield Connect(name, network, context.aliases.get(network, ()))
+        yield Connect(name, network, context.aliases(network))
 
 
 def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:

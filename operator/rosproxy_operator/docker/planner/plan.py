@@ -11,7 +11,7 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.aliases import assign_aliases
+from rosproxy_operator.docker.planner.aliases import Naming, assign_aliases
 from rosproxy_operator.docker.planner.allocation import after_refusals, allocate
 from rosproxy_operator.docker.planner.container_steps import (
     PlanContext,
@@ -92,7 +92,7 @@ def plan(
     memory = with_exited(memory, members, now)
     desired, bad_networks = desire(observed, settings, members, memory, now)
     memory = after_look(memory, observed, desired, settings.grace, now)
-    aliases, missed = assign_aliases(desired, observed)
+    naming = assign_aliases(desired, observed, settings, memory.names)
     live = {d.key for d in desired if d.live}
     memory = after_refusals(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
@@ -104,16 +104,15 @@ def plan(
     }
     for wanted in desired:
         if ports := memory.planned.get(wanted.key):  # else its problem is reported already
-            names = aliases.get(wanted.key, {})
-            context = PlanContext(observed, settings, wanted, ports, names, creatable)
+            context = PlanContext(observed, settings, wanted, ports, naming, creatable)
             steps = wanted_steps(context)
             planned[wanted.key] = steps if steps is None else with_ear(context, steps)
-    problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *missed, *tight]
+    problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *naming.problems, *tight]
     problems += _unwell(observed, live)
     problems += _deaf(observed, settings, live)
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))
-    groups = [*_possible_groups(observed, settings, desired, planned)]
+    groups = [*_possible_groups(observed, settings, desired, planned, naming)]
     deferred = tuple(group for group in groups if _waits(group, observed, settings.uplink))
     docker_plan = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
@@ -150,10 +149,11 @@ def _possible_groups(
     settings: PlanSettings,
     desired: Collection[Desired],
     planned: Mapping[Key, list[Action] | None],
+    naming: Naming,
 ) -> Iterator[Group]:
     """All groups but those of keys of which a container is busy, and the redirects'."""
     busy = {own.key for own in observed.own if own.container.name in observed.busy}
-    groups = _groups(observed, settings.uplink, desired, planned)
+    groups = _groups(observed, settings.uplink, desired, planned, naming)
     yield from (group for group in groups if group.key not in busy)
     for steps in redirect_steps(observed, settings, desired):
         yield Group(steps.key, steps.actions, f"container {steps.container}", steps.cure)
@@ -164,10 +164,12 @@ def _groups(
     uplink: str,
     desired: Collection[Desired],
     planned: Mapping[Key, list[Action] | None],
+    naming: Naming,
 ) -> Iterator[Group]:
     """First what makes names free, then the uplink, then one key after the other."""
     for wanted in desired:
-        for action in disconnect_steps(observed, wanted, planned.get(wanted.key) or [], uplink):
+        others = planned.get(wanted.key)
+        for action in disconnect_steps(observed, wanted, others, uplink, naming):
             yield Group(wanted.key, (action,))
     all_actions = [action for actions in planned.values() for action in actions or ()]
     joins = (isinstance(a, Connect) and a.network == uplink for a in all_actions)

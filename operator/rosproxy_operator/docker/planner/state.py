@@ -6,6 +6,11 @@ from dataclasses import dataclass, field, replace
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.port_negotiation import MOVED_FOR, TAKEN_FOR, Move, within
 from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.taken_names import (
+    FormerNames,
+    present_names,
+    remember_names,
+)
 
 # One that is only created has published no port yet: its range may still turn out to be taken.
 _HAS_SERVED = SERVING | {"exited", "dead", "removing"}
@@ -29,7 +34,8 @@ class DockerMemory:
     ``exited`` are containers, by id, since when they are seen not to run; ``absent`` proxies since
     when nobody wants them. ``served`` is the range on which a proxy was last seen to serve,
     ``planned`` the one with which one is being created. ``refusals`` are by the name of the
-    sandbox. ``taken`` are ports that the engine has refused, and when.
+    sandbox. ``taken`` are ports that the engine has refused, and when. ``names`` are those that
+    containers have or had (`remember_names`).
     """
 
     exited: Mapping[str, float] = field(default_factory=dict)
@@ -39,6 +45,7 @@ class DockerMemory:
     refusals: Mapping[str, PortRefusal] = field(default_factory=dict)
     taken: Mapping[int, float] = field(default_factory=dict)
     moved: Mapping[Key, Move] = field(default_factory=dict)
+    names: FormerNames = field(default_factory=dict)
 
     def port_taken(self, name: str, port: int | None, now: float) -> "DockerMemory":
         """Note that the engine could not start the sandbox ``name``: a port of it is taken."""
@@ -70,6 +77,7 @@ def after_look(
         refusals={name: refusal for name, refusal in memory.refusals.items() if name in idle},
         taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
         moved={key: move for key, move in memory.moved.items() if now - move.at < MOVED_FOR},
+        names=remember_names(memory.names, present_names(observed), observed.containers),
     )
 
 

@@ -134,6 +134,22 @@ class Invariants:
                         self.check_names(member, member.networks & fine)
 
         self.check_redirects(live)
+        self.check_no_name_is_shared()
+
+    def check_no_name_is_shared(self) -> None:
+        """No proxy answers to a name of a stranger on the same network."""
+        strangers = [box for box in self.strangers() if box.state not in ("dead", "removing")]
+        for sandbox, own in self.own("running", "paused", role=ROLE_SANDBOX):
+            # The simulated engine keeps the name that a container had when it joined.
+            container_names = {sandbox.name, sandbox_name(own.key)}
+            for network, (_, names) in sandbox.networks.items():
+                others = {
+                    name
+                    for box in strangers
+                    if network in box.networks
+                    for name in box.networks[network][1] | {box.name}
+                }
+                assert not (names - container_names) & others, network
 
     def check_redirects(self, live: list[Member]) -> None:
         """Who gives the address of his master is led to his proxy, and nobody else is."""

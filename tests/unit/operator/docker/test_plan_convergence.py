@@ -75,5 +75,7 @@ def test_a_bad_object_does_not_change_what_is_done_for_others(
     alone = planned(seen, SETTINGS, memory, now)
     plan = planned(with_bad, SETTINGS, memory, now)
     assert plan.groups == alone.groups
-    assert (plan.memory, plan.again_in) == (alone.memory, alone.again_in)
+    # The name of the bad container is remembered as any name of a container is.
+    memory = replace(plan.memory, names=alone.memory.names)
+    assert (memory, plan.again_in) == (alone.memory, alone.again_in)
     assert set(alone.problems) <= set(plan.problems)

@@ -7,6 +7,9 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.master_resolver import MasterResolver
+from rosproxy_operator.docker import snapshot
+from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.engine_json import (
     container_of,
     environment,
@@ -23,8 +26,10 @@ from rosproxy_operator.docker.planner.model import (
     Network,
     Sandbox,
 )
-from rosproxy_operator.docker.snapshot import address_in, foreign_ports
+from rosproxy_operator.docker.snapshot import DockerObserver, address_in, foreign_ports
 from tests.unit.operator.docker import captured
+from tests.unit.operator.docker.builders import SETTINGS
+from tests.unit.operator.docker.conftest import FakeEngine
 
 APP = Network(captured.APP_ID, "app")
 
@@ -159,3 +164,20 @@ def test_the_engine_knows_names_that_no_name_server_has() -> None:
     assert address_in(state, "robot", "0-rosproxy") == ""
     ended = replace(state, containers=(replace(core, state="exited"),))
     assert address_in(ended, "roscore", "0-rosproxy") == ""
+
+
+async def test_the_first_look_waits_longer_for_inspections(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a proxy gets the alias of a container that is not inspected yet."""
+    waited: list[float] = []
+
+    async def update(_: object, __: object, ___: object, patience: float) -> None:
+        waited.append(patience)
+
+    monkeypatch.setattr(snapshot.Inspector, "update", update)
+    engine.knows[f"/images/{SETTINGS.proxy_image}/json"] = {"Id": "sha256:1"}
+    observer = DockerObserver(DockerClient(), SETTINGS, MasterResolver(lambda: None), lambda: None)
+    for _ in range(2):
+        await observer.look()
+    assert waited == [snapshot.FIRST_PATIENCE, snapshot.PATIENCE]

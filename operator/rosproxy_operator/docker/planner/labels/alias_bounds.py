@@ -1,0 +1,71 @@
+"""Which names a label may give a proxy on a network: the administrator's, else those of a LAN.
+
+A proxy answers to the host name of its master, so that ``ROS_MASTER_URI`` needs no change. An image
+can carry that name: all containers of the network would then reach the proxy in place of the
+service of that name. No list of names or ports tells a robot from a database. So there are two
+rules: the name has the form of a LAN's names, or the administrator lists the name; and no container
+has or had the name (`planner.taken_names`).
+
+The address of a name is no criterion. Services of a company have private addresses as robots do.
+The owner of a public name can give the name a private address. A robot can have a public address.
+Besides, the answer of a name server changes, and each change would cut connections.
+"""
+
+import re
+from fnmatch import fnmatchcase
+
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy_operator.docker.settings import PlanSettings
+
+LAN_SUFFIXES = ("local", "lan", "home", "localdomain", "home.arpa", "test")
+"""Ends of names that belong to a single LAN.
+
+``local``: RFC 6762, 3. ``lan`` and ``home``: RFC 6762, appendix G. ``home.arpa``: RFC 8375, 3.
+``test``: RFC 6761, 6.2. ``localdomain``: the end that Debian's and Red Hat's hosts files have.
+"""
+# Private as well, but left out, since services have such names: corp, intranet and private
+# (RFC 6762, appendix G) are the networks of companies. ICANN has reserved internal for private use
+# (Board resolution 2024.07.29.06), but there are metadata.google.internal, host.docker.internal,
+# gateway.docker.internal and host.containers.internal.
+_CLUSTER_SUFFIX = "cluster.local"
+"""The end of a Kubernetes cluster's names (kubelet: --cluster-domain)."""
+_OWN_PREFIX = "rosproxy"
+"""How the names of the operator's and the proxies' containers begin."""
+_LONGEST_NAME = 253
+"""Characters of a host name (RFC 1035, 2.3.4)."""
+_HOST_NAME = re.compile(r"(?!-)[a-z0-9_-]{1,63}(?<!-)(\.(?!-)[a-z0-9_-]{1,63}(?<!-))*")
+
+
+def is_allowed_by_administrator(name: str, settings: PlanSettings) -> bool:
+    """Whether an option of the administrator names a host, given in lower case."""
+    master = parse_slave_uri(settings.master_uri or "")
+    is_own_master = master is not None and name == master.host.lower()
+    return is_own_master or any(fnmatchcase(name, p) for p in settings.allow_alias)
+
+
+def alias_refusal(name: str, settings: PlanSettings) -> str:
+    """Why labels may not give a proxy a name (in lower case); empty for a name that they may."""
+    if not _HOST_NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
+        return "it is no host name"
+    if is_allowed_by_administrator(name, settings):
+        return ""
+    if settings.allow_alias:
+        return (
+            f"it matches none of the operator's --allow-alias ({', '.join(settings.allow_alias)})"
+        )
+    return _lan_refusal(name)
+
+
+def _lan_refusal(name: str) -> str:
+    """Why a name is not that of a LAN's host; empty for the name of one."""
+    if name.startswith(_OWN_PREFIX):
+        return f"names that begin with {_OWN_PREFIX} are the operator's own"
+    if _ends_in(name, _CLUSTER_SUFFIX):
+        return f"names in .{_CLUSTER_SUFFIX} are those of a cluster's services"
+    if "." in name and not any(_ends_in(name, suffix) for suffix in LAN_SUFFIXES):
+        return f"it is neither one word nor in .{', .'.join(LAN_SUFFIXES)}"
+    return ""
+
+
+def _ends_in(name: str, suffix: str) -> bool:
+    return name == suffix or name.endswith(f".{suffix}")
