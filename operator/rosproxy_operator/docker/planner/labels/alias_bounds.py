@@ -15,6 +15,7 @@ import re
 from fnmatch import fnmatchcase
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy_operator.docker.planner.labels.readers import LONGEST_HOST
 from rosproxy_operator.docker.settings import PlanSettings
 
 LAN_SUFFIXES = ("local", "lan", "home", "localdomain", "home.arpa", "test")
@@ -31,8 +32,6 @@ _CLUSTER_SUFFIX = "cluster.local"
 """The end of a Kubernetes cluster's names (kubelet: --cluster-domain)."""
 _OWN_PREFIX = "rosproxy"
 """How the names of the operator's and the proxies' containers begin."""
-_LONGEST_NAME = 253
-"""Characters of a host name (RFC 1035, 2.3.4)."""
 _HOST_NAME = re.compile(r"(?!-)[a-z0-9_-]{1,63}(?<!-)(\.(?!-)[a-z0-9_-]{1,63}(?<!-))*")
 
 
@@ -45,7 +44,7 @@ def is_allowed_by_administrator(name: str, settings: PlanSettings) -> bool:
 
 def alias_refusal(name: str, settings: PlanSettings) -> str:
     """Why labels may not give a proxy a name (in lower case); empty for a name that they may."""
-    if not _HOST_NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
+    if not _HOST_NAME.fullmatch(name) or len(name) > LONGEST_HOST:
         return "it is no host name"
     if is_allowed_by_administrator(name, settings):
         return ""

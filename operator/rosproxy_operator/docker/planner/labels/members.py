@@ -2,9 +2,10 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.common.spelling import NEAR, VERY_NEAR, nearest
 from rosproxy_operator.docker.planner.labels import bounds, readers, ros_versions
 from rosproxy_operator.docker.planner.labels.own_address import wrong_own_address
@@ -22,6 +23,12 @@ from rosproxy_operator.docker.settings import PlanSettings
 _PREFIX = "rosproxy"
 # One that has exited may come back: for the grace its proxy stays on its networks (see `desire`).
 _COUNTED = ALIVE | {"exited"}
+MOST_LABELS = 256
+"""Labels of a container whose spelling is checked: each check takes some 30 microseconds."""
+MOST_UNKNOWN = 8
+"""Unknown labels of a container that are told one by one; the others are counted."""
+LONGEST_NAME = 80
+"""Characters of a label's name that are told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +139,7 @@ def _requests(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> tuple[list[Member], list[str]]:
     """What a container gets of what it asks for, by version of ROS, and the warnings for it."""
+    readers.refuse_long_values(container.labels)
     served = ros_versions.versions(container)
     requests = [_request(container, observed, settings, proxies)] if "1" in served else []
     if "2" in served:
@@ -195,14 +203,13 @@ def _exposed(container: Container, settings: PlanSettings) -> bool:
 
 def _own(container: Container) -> list[str]:
     """The labels that are meant for this operator, misspelt ones too."""
-    return sorted(
-        name
-        for name in container.labels
-        # Without the prefix only a name that is very near counts, as it may be another program's.
-        # io.rosproxy.domain, the operator's own, is 0.91 near to rosproxy.domain.
-        if name.lower().startswith(f"{_PREFIX}.")
-        or (nearest(name, LABELS, VERY_NEAR) and not name.startswith(f"io.{_PREFIX}."))
-    )
+    prefixed = [name for name in container.labels if name.lower().startswith(f"{_PREFIX}.")]
+    # Without the prefix only a name that is very near counts, as it may be another program's.
+    # io.rosproxy.domain, the operator's own, is 0.91 near to rosproxy.domain.
+    others = (name for name in container.labels if not name.startswith(f"io.{_PREFIX}."))
+    checked = islice(others, MOST_LABELS)
+    near = [name for name in checked if nearest(name, LABELS, VERY_NEAR)]
+    return sorted({*prefixed, *near})
 
 
 def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
@@ -221,14 +228,18 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     own = _own(container)
     if container.labels.get(ENABLE, "").strip().lower() == "false":
         return
-    for name in own:
-        if name not in LABELS:
-            near = nearest(name, LABELS, NEAR)
-            fix = f"did you mean {near}?" if near else f"there are {', '.join(LABELS)}"
-            yield f"label {name} is unknown and ignored; {fix}"
-    misspelt = any(nearest(name, LABELS, NEAR) == ENABLE for name in own)  # warned of above
+    unknown = [name for name in own if name not in LABELS]
+    told = unknown[:MOST_UNKNOWN]
+    for name in told:
+        near = nearest(name, LABELS, NEAR)
+        fix = f"did you mean {near}?" if near else f"there are {', '.join(LABELS)}"
+        yield f"label {bounded(name, LONGEST_NAME)} is unknown and ignored; {fix}"
+    if left_out := len(unknown) - len(told):
+        yield f"{left_out} more labels {_PREFIX}.… are unknown and ignored; take them off"
+    misspelt = any(nearest(name, LABELS, NEAR) == ENABLE for name in told)  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
-        yield f"{listed(f'label {name}' for name in own)} ignored: add the label {ENABLE}=true"
+        names = listed(f"label {bounded(name, LONGEST_NAME)}" for name in own)
+        yield f"{names} ignored: add the label {ENABLE}=true"
 
 
 def _advertised(request: Member, observed: HostState) -> str:

@@ -44,8 +44,10 @@ BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve on them, so no proxy can be found there."""
 MOST_LABEL_RULES = 100
 """Rules that a container may have."""
-LONGEST_POLICY = 16 * 1024
-"""Characters of all of them."""
+LONGEST_VALUE = 16 * 1024
+"""Characters of a label's value: those of all rules of a container."""
+LONGEST_HOST = 253
+"""Characters of a host name (RFC 1035, 2.3.4)."""
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
@@ -65,6 +67,14 @@ def quoted(value: str) -> str:
 def named(label: str, labels: Labels) -> str:
     """A label and its value, as messages show it."""
     return f"label {label}={quoted(labels[label])}"
+
+
+def refuse_long_values(labels: Labels) -> None:
+    """Raise UnusableLabel for a value that is too long to be read with each look."""
+    for label in LABELS:
+        if len(labels.get(label, "")) > LONGEST_VALUE:
+            fix = "join rules by globs" if label == POLICY else "shorten the value"
+            raise UnusableLabel(f"label {label} has more than {LONGEST_VALUE} characters: {fix}")
 
 
 def enabled(labels: Labels, otherwise: bool) -> bool:
@@ -126,12 +136,8 @@ def policy(labels: Labels) -> tuple[Rule, ...]:
 
     One that can't be read leaves the container out: what its user wants to hide is not to be seen.
     """
-    text = labels.get(POLICY, "")
-    if len(text) > LONGEST_POLICY:
-        cause = f"label {POLICY} has more than {LONGEST_POLICY} characters: join rules by globs"
-        raise UnusableLabel(cause)
     try:
-        rules = parse_rules(text)
+        rules = parse_rules(labels.get(POLICY, ""))
     except ValueError as error:
         raise UnusableLabel(f"label {POLICY}: {error}") from None
     if len(rules) > MOST_LABEL_RULES:
@@ -338,7 +344,8 @@ def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
     """A master's URI in its one form: host in lower case, no slash at the end."""
     host_port = parse_slave_uri(uri.strip())
     path = urlsplit(uri.strip()).path.rstrip("/") if host_port else ""
-    if host_port is None or not host_port.host.isascii() or not _PATH.fullmatch(path):
+    is_readable = host_port and host_port.host.isascii() and len(host_port.host) <= LONGEST_HOST
+    if host_port is None or not is_readable or not _PATH.fullmatch(path):
         raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
     host = host_port.host.lower()
     if is_loopback(host):
