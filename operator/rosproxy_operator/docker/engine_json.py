@@ -6,14 +6,16 @@ inspection of a container tells. Whatever the engine has nothing to say of may b
 
 from collections.abc import Iterable
 from ipaddress import IPv4Network, ip_network
+from itertools import islice
 from typing import Any, TypedDict
 
 import msgspec
 
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
 from rosproxy_operator.docker.planner.own_containers import CreationFacts
-from rosproxy_operator.docker.planner.specs import MANAGED, SECRET
+from rosproxy_operator.docker.planner.specs import FORMER_TOKEN, MANAGED, SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
@@ -22,6 +24,14 @@ _VARIABLES = frozenset(
     | {"ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_IP", "ROS_HOSTNAME"}
 )
 """Variables that tell the version of ROS in a container, and how its nodes find each other."""
+_KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
+LONGEST_TEXT = 4096
+"""Characters that are kept of a variable or an argument; a longer one ends in an ellipsis.
+
+An image can have megabytes of both, and they are kept as long as the container is there.
+"""
+MOST_ARGUMENTS = 16
+"""Arguments that are kept of a command: those of the operator's own containers have two."""
 
 
 class _State(TypedDict, total=False):
@@ -82,8 +92,22 @@ class _Inspection(TypedDict, total=False):
 
 
 def check_inspection(inspection: object) -> Json:
-    """What is read of an inspection. Raises msgspec.ValidationError for wrong types."""
-    return dict(msgspec.convert(inspection, _Inspection))
+    """What is read of an inspection, bounded. Raises msgspec.ValidationError for wrong types."""
+    document = dict(msgspec.convert(inspection, _Inspection))
+    config = dict(dig(document, "Config") or {})
+    variables = (text for text in config.get("Env") or () if _name(text) in _KEPT_VARIABLES)
+    texts = {
+        "Env": variables,
+        "Entrypoint": islice(config.get("Entrypoint") or (), MOST_ARGUMENTS),
+        "Cmd": islice(config.get("Cmd") or (), MOST_ARGUMENTS),
+    }
+    for key, items in texts.items():
+        config[key] = [bounded(text, LONGEST_TEXT) for text in items]
+    return {**document, "Config": config}
+
+
+def _name(variable: str) -> str:
+    return variable.partition("=")[0]
 
 
 def dig(document: Any, *keys: str) -> Any:

@@ -11,6 +11,9 @@ from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.docker import snapshot
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.engine_json import (
+    LONGEST_TEXT,
+    MOST_ARGUMENTS,
+    check_inspection,
     container_of,
     environment,
     read_container,
@@ -28,7 +31,7 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.snapshot import DockerObserver, address_in, foreign_ports
 from tests.unit.operator.docker import captured
-from tests.unit.operator.docker.builders import SETTINGS
+from tests.unit.operator.docker.builders import SETTINGS, observed, read_members
 from tests.unit.operator.docker.conftest import FakeEngine
 
 APP = Network(captured.APP_ID, "app")
@@ -181,3 +184,30 @@ async def test_the_first_look_waits_longer_for_inspections(
     for _ in range(2):
         await observer.look()
     assert waited == [snapshot.FIRST_PATIENCE, snapshot.PATIENCE]
+
+
+# what is kept of an inspection
+
+
+def kept_of(**config: Any) -> dict[str, Any]:
+    return check_inspection({**captured.inspected(), "Config": config})
+
+
+def test_of_the_variables_those_are_kept_that_are_read() -> None:
+    kept = kept_of(Env=["A=" + "a" * 1_000_000, "ROS_DISTRO=noetic", "B", "ROS_DOMAIN_ID=3"])
+    assert environment(kept) == {"ROS_DISTRO": "noetic", "ROS_DOMAIN_ID": "3"}
+
+
+def test_what_is_kept_of_a_container_is_bounded() -> None:
+    uri = "http://robot:11311/" + "a" * 1_000_000
+    kept = kept_of(
+        Env=[f"ROS_MASTER_URI={uri}"], Cmd=["a" * 1_000_000] * 1000, Entrypoint=None, User="1"
+    )
+    assert len(str(kept["Config"])) < (MOST_ARGUMENTS + 1) * (LONGEST_TEXT + 10) + 100
+    assert kept["Config"]["User"] == "1"
+    # Cut off, a URI must not become another one.
+    labels = {"rosproxy.enable": "true"}
+    found = container(kept, Labels=labels)
+    served, problems = read_members(observed(found))
+    assert served == ()
+    assert "ROS_MASTER_URI" in problems[0].text
