@@ -23,7 +23,7 @@ What its nodes have registered is removed a moment later, and must not become vi
 """
 
 
-def within_bounds(
+def with_bounded_rules(
     members: Collection[Member], settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
     """The members whose rules their proxies can hold, and problems of the others."""

@@ -21,7 +21,8 @@ from rosproxy_operator.docker.planner.container_steps import (
 )
 from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
-from rosproxy_operator.docker.planner.label_policy import within_bounds
+from rosproxy_operator.docker.planner.label_peers import with_bounded_peers
+from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.redirect import redirect_steps
@@ -88,7 +89,7 @@ def plan(
     monotonic clock that goes on as long as the memory does.
     """
     members, unplaced = find_members(labels, observed, settings)
-    members, crowded = within_bounds(members, settings)
+    members, crowded = _within_bounds(members, settings)
     memory = with_exited(memory, members, now)
     desired, bad_networks = desire(observed, settings, members, memory, now)
     memory = after_look(memory, observed, desired, settings.grace, now)
@@ -124,6 +125,15 @@ def plan(
     )
     delays = [delay for delay in _delays(observed, settings, docker_plan, now) if delay > 0]
     return replace(docker_plan, again_in=min(delays, default=None))
+
+
+def _within_bounds(
+    members: Collection[Member], settings: PlanSettings
+) -> tuple[tuple[Member, ...], list[Problem]]:
+    """The members as far as their proxies can hold what all of their labels ask for together."""
+    members, crowded = with_bounded_rules(members, settings)
+    members, peerless = with_bounded_peers(members, settings)
+    return members, [*crowded, *peerless]
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:

@@ -9,7 +9,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import MOST_RULES, Rule, parse_rules
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create
-from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, within_bounds
+from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, with_bounded_rules
 from rosproxy_operator.docker.planner.labels.readers import MOST_LABEL_RULES
 from rosproxy_operator.docker.planner.model import Attachment, Key, Member
 from rosproxy_operator.docker.planner.proxy_news import ProxyNews, network_facts
@@ -157,18 +157,18 @@ def crowd(**rules: int) -> list[Member]:
 def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
     settings = replace(SETTINGS, policy=administrators_policy([RULES * 400], "enforce"))
     members = crowd(a=100, b=100, c=1, d=100, e=100, f=100, g=100, h=0)
-    left, (problem,) = within_bounds(members, settings)
+    left, (problem,) = with_bounded_rules(members, settings)
     assert {member.container.name for member in left} == set("abcdefh")
     assert (problem.subject, problem.fatal) == ("container g", True)
     assert "can't hold its rules besides those of others (at most 1000" in problem.text
-    assert within_bounds(members, SETTINGS) == (tuple(members), ())
+    assert with_bounded_rules(members, SETTINGS) == (tuple(members), ())
 
 
 def test_proxies_are_bounded_each_for_itself() -> None:
     other = Key("http://other:11311", "192.0.2.10")
     more = [replace(member, key=other) for member in crowd(x=100)]
     members = [*crowd(**{f"c{number}": 100 for number in range(10)}), *more]
-    assert within_bounds(members, SETTINGS)[1] == ()
+    assert with_bounded_rules(members, SETTINGS)[1] == ()
 
 
 def test_the_plan_leaves_out_whom_a_proxy_can_not_hold() -> None:
