@@ -186,6 +186,13 @@ def rules() -> dict[str, set[str]]:
     return {resource: set(verbs.split()) for resource, verbs in lines}
 
 
+def test_the_chart_gives_users_no_right_to_a_status() -> None:
+    """A Service that is lost is made anew at the address that the status of its RosProxy has."""
+    text = (ROOT / "charts/rosproxy-operator/templates/rbac.yaml").read_text()
+    for_users = text.partition(".Values.rbac.aggregate")[2]
+    assert re.findall(r"resources: (.+)", for_users) == ["[rosproxies]", "[rosproxies]"]
+
+
 def test_the_chart_grants_what_the_code_calls_and_no_more() -> None:
     granted: dict[str, set[str]] = {}
     text = (ROOT / "charts/rosproxy-operator/templates/rbac.yaml").read_text()

@@ -280,6 +280,18 @@ def test_a_service_leads_to_the_proxy_on_the_callers_own_node() -> None:
     ]
 
 
+def test_a_rosproxy_chooses_no_name_and_no_address_of_its_service() -> None:
+    """The host of its master is a name for its own proxies, and for pods that ask for it."""
+    alias = {"ip": "192.0.2.9", "hostnames": ["db"]}
+    made = manifests.service(rosproxy(master=MasterSpec("http://db:5432"), host_aliases=(alias,)))
+    assert made["metadata"]["name"] == "rosproxy-robot"
+    assert made["spec"].keys() == {
+        *("type", "selector", "internalTrafficPolicy", "publishNotReadyAddresses", "ports")
+    }
+    assert made["spec"]["type"] == "ClusterIP"
+    assert "db" not in str(made)
+
+
 def test_a_service_is_read_back_as_it_was_made() -> None:
     made = manifests.service(rosproxy(), "10.96.1.1")
     service = objects.service({**made, "metadata": {**made["metadata"], "uid": "u"}})

@@ -37,7 +37,9 @@ def test_a_proxys_name_is_always_a_host_name(of: str, node: str) -> None:
 
 @given(LABEL)
 def test_a_services_name_is_a_label(of: str) -> None:
-    assert len(names.service_id(Name("ros", of)).name) <= 63
+    name = names.service_id(Name("ros", of)).name
+    assert len(name) <= 63
+    assert name == f"rosproxy-{of}"  # never that of a service such as db
 
 
 def test_names_are_in_the_rosproxys_namespace() -> None:
