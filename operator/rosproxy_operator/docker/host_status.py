@@ -16,6 +16,7 @@ from rosproxy import __version__
 from rosproxy.admin.admin_client import AdminClient, AdminError, default_url
 from rosproxy.cli.terminal import size, watch, write
 from rosproxy.net.addresses import HostPort
+from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.master_resolver import MasterResolver
 from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker.engine_client import DockerClient
@@ -95,9 +96,10 @@ def show_plan(host: HostStatus, as_json: bool, wait: float) -> int:
     if as_json:
         write(json.dumps(shown, indent=2))
     else:
-        write("\n".join(status["actions"]) or "Nothing to do.")
+        # Names of labels are whatever an image says, and stand in texts of problems.
+        write("\n".join(map(clean, status["actions"])) or "Nothing to do.")
         for problem in status["problems"]:
-            write(f"{problem['subject']}: {problem['text']}")
+            write(clean(f"{problem['subject']}: {problem['text']}"))
     return STEPS_LEFT if status["actions"] else int(_is_wrong(status))
 
 
@@ -141,7 +143,7 @@ def watch_status(host: HostStatus) -> None:
         try:
             return render(asyncio.run(host.now()), columns, lines)
         except EngineError as error:
-            return f"{time.strftime('%H:%M:%S')} {error}"
+            return f"{time.strftime('%H:%M:%S')} {clean(error)}"
 
     watch(draw)
 

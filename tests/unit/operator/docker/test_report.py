@@ -130,6 +130,12 @@ def test_each_action_is_one_line(action: Action, text: str) -> None:
             ["Nothing to do.", "uplink: odd"],
             0,
         ),
+        (
+            ["start container a\nuplink: odd"],
+            [{"subject": "container a\r", "text": "label rosproxy.\x1b[2J\nb", "fatal": False}],
+            ["start container a\\nuplink: odd", "container a\\r: label rosproxy.\\x1b[2J\\nb"],
+            3,
+        ),
     ],
 )
 def test_a_plan_is_its_lines_and_its_exit_code(
