@@ -6,7 +6,7 @@ import pytest
 
 from tests.docker.controller import Controller, Proxy, proxies, published_ranges, the_proxy
 from tests.docker.engine import docker, inspect, wait_until
-from tests.docker.inside import ENABLE, Inside, unique
+from tests.docker.inside import ENABLE, Container, Inside, unique
 
 OPTIONS = ("--max-ports", "8")
 
@@ -113,3 +113,64 @@ def test_proxy_is_bounded_and_has_no_token_and_its_controller_knows_it_anyway(
     wait_until(lambda: network in proxy.networks, 60, controller.logs)
     assert proxy.id == before
     assert "HTTP 403" not in controller.logs()
+
+
+SERVER = ("python3", "-m", "http.server", "5432")
+_URL = "http://db:5432/"
+ASK = (
+    *("python3", "-c"),
+    f"import urllib.request as r; print(r.urlopen('{_URL}', timeout=5).headers['Server'])",
+)
+
+
+@pytest.fixture
+def claimed(net: Inside) -> str:
+    """A network on which a label wants the name db, which leads to a container elsewhere."""
+    net.idle(net.network(), labels=(), options=("--network-alias", "db"))
+    return net.network()
+
+
+def claim(net: Inside, network: str) -> Proxy:
+    """Start a container whose label names db as its master; the proxy on the network."""
+    net.idle(network, uri="", labels=(ENABLE, "rosproxy.master-uri=http://db:5432"))
+    wait_until(lambda: bool(on(network)), 60, lambda: docker("ps", "--all"))
+    return on(network)[0]
+
+
+def on(network: str) -> list[Proxy]:
+    """The proxies on a network."""
+    return [proxy for proxy in proxies() if network in proxy.networks]
+
+
+def assert_reached(net: Inside, network: str, server: Container, proxy: Proxy) -> None:
+    """Assert that db leads a third container to the server alone, and rosproxy to the proxy."""
+    client = net.idle(network, labels=())
+    own = {server.address(network)}
+    wait_until(lambda: client.resolve("db") == own, 60, lambda: str(proxy.aliases(network)))
+    wait_until(lambda: "SimpleHTTP" in client.run(*ASK, check=False), 30, server.name)
+    assert client.resolve("rosproxy") == {proxy.address(network)}
+
+
+def test_label_leaves_a_container_that_comes_later_its_name(
+    controller: Controller, net: Inside, claimed: str
+) -> None:
+    proxy = claim(net, claimed)
+    assert "db" in proxy.aliases(claimed)
+
+    server = net.run(claimed, *SERVER, labels=(), options=("--network-alias", "db"))
+
+    assert_reached(net, claimed, server, proxy)
+    assert proxy.running
+
+
+def test_label_leaves_a_stopped_container_its_name(
+    controller: Controller, net: Inside, claimed: str
+) -> None:
+    server = net.run(claimed, *SERVER, labels=(), options=("--network-alias", "db"))
+    docker("stop", "--time", "0", server.name)
+
+    proxy = claim(net, claimed)
+
+    assert "db" not in proxy.aliases(claimed)
+    docker("start", server.name)
+    assert_reached(net, claimed, server, proxy)
