@@ -88,6 +88,11 @@ class Abused(Process):
         told = [line for line in lines if line.startswith("rosproxy_refused_total{")]
         return {line.split('"')[1] for line in told if float(line.split()[-1])}
 
+    def metric(self, name: str) -> float:
+        """The value of a metric, by its name with its labels."""
+        (line,) = (line for line in self.get("/metrics").splitlines() if line.startswith(name))
+        return float(line.split()[-1])
+
     def lease(self, of: FakeNode) -> Address:
         """Where outside reaches a node."""
         lease = next(lease for lease in self.status()["nodes"] if of.name in lease["nodes"])

@@ -13,9 +13,11 @@ from time import monotonic
 from types import TracebackType
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.protocol.reliable import heartbeats
+from rosproxy.ros2.protocol.rtps import NO_VENDOR, source_prefix, source_vendor
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import spdp
+from tests.unit.ros2.protocol.messages import message, submessage
 
 WELL_KNOWN = 7410
 AGAIN = 0.1
@@ -51,6 +53,17 @@ class Participant:
         for target in to:
             self.meta.sendto(spdp(self.prefix, self.address, self.port), target)
 
+    def proves_to_receive(self, asked: Callable[[], object]) -> None:
+        """Answer the question that the proxy sends to this address; ``asked`` is done meanwhile."""
+        question = self._wait(self.meta, asked, _is_question)
+        told = read_discovery(question).of_participant
+        assert told is not None
+        (meta, _) = (locator for _, locator in told.reached_at(question))
+        info_dst = submessage(0x0E, 0, source_prefix(question))
+        body = bytes([0, 0, 3, 0xC7, 0, 0, 3, 0xC2]) + bytes(20)
+        answer = message(info_dst, submessage(0x06, 0, body), prefix=self.prefix)
+        self.meta.sendto(answer, (meta.host, meta.port))
+
     def hears(self, prefix: bytes, asked: Callable[[], object]) -> list[HostPort]:
         """The locators in another's announcement, once that comes; ``asked`` is done meanwhile."""
         datagram = self._wait(self.meta, asked, lambda received: _announces(received, prefix))
@@ -84,6 +97,11 @@ def _announces(datagram: bytes, prefix: bytes) -> bool:
     return source_prefix(datagram) == prefix and told is not None and not told.ended
 
 
+def _is_question(datagram: bytes) -> bool:
+    told = read_discovery(datagram).of_participant
+    return told is not None and source_vendor(datagram) == NO_VENDOR and any(heartbeats(datagram))
+
+
 def packet(source: str, to: Address, datagram: bytes) -> bytes:
     """An IPv4 packet with a datagram from any address; the kernel adds what is zero here."""
     length = 8 + len(datagram)
@@ -101,11 +119,16 @@ def forge(source: str, to: Address, datagram: bytes) -> None:
 class Flood:
     """Sends datagrams over and over while the context lasts; ``sent`` counts them.
 
-    Each comes with where it is from, an address of this machine's, and where it goes.
+    Each comes with where it is from, an address of this machine's, and where it goes. ``via`` is
+    the address on whose network forged ones go to a group.
     """
 
-    def __init__(self, datagrams: Iterable[tuple[str, Address, bytes]], is_forged: bool) -> None:
-        self._datagrams, self._is_forged = list(datagrams), is_forged
+    def __init__(
+        self, datagrams: Iterable[tuple[str, Address, bytes]], is_forged: bool, via: str = "0.0.0.0"
+    ) -> None:
+        self._datagrams = list(datagrams)
+        self._is_forged = is_forged
+        self._via = via
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self.sent = 0
@@ -134,6 +157,7 @@ class Flood:
     def _run(self) -> None:
         sources = {source for source, _, _ in self._datagrams}
         raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
+        raw.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._via))
         own = {} if self._is_forged else {source: udp(source) for source in sources}
         for source, to, datagram in itertools.cycle(self._datagrams):
             if self._ended.is_set():

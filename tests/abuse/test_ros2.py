@@ -13,6 +13,7 @@ import pytest
 from examples.demo.fake_http import free_ports
 from examples.demo.proxy_process import clean_environment
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain_settings import MOST_OUTSIDE_UNPROVEN, MOST_PER_UNPROVEN
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -33,6 +34,7 @@ from tests.unit.ros2.protocol.messages import (
 )
 
 GOOD, ROBOT = bytes([1, 15, 1]) + bytes(9), bytes([1, 15, 2]) + bytes(9)
+LAPTOP, NEWCOMER = bytes([1, 15, 4]) + bytes(9), bytes([1, 15, 5]) + bytes(9)
 EVIL, EAR, VICTIM = NODES[1], NODES[19], STRANGERS[9]
 SECRET = "0123456789abcdef"
 """What the proxy and its LAN relay share."""
@@ -162,7 +164,7 @@ async def test_one_address_inside_floods(abused, good, robot):
             (EVIL, ANNOUNCED, spdp(prefix(number), EVIL, 9000 + number)) for number in range(60)
         ]
         with Flood(arrived, is_forged=False):
-            await until(lambda: evil_count() == 60, "they have been taken in")
+            await until(lambda: evil_count() >= 20, "they have been taken in")
         with Flood(announced(), is_forged=False) as flood:
             served(good, robot, b"amid")
             await until(lambda: "rate" in abused.refused(), "it makes more than it may")
@@ -231,7 +233,7 @@ def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
 def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
     """A victim is named by a forger, and inside has much to say to all that it hears of."""
     served(good, robot, b"before")
-    heard = [spdp(prefix(number), VICTIM, 4000 + number) for number in range(50)]
+    heard = [spdp(prefix(number), VICTIM, 4000 + number) for number in range(MOST_PER_UNPROVEN)]
     with closing(Counted(VICTIM)) as counted, abused.watched():
         came = got = 0
         for datagram in heard:
@@ -320,3 +322,30 @@ async def test_somebody_floods_the_lan(abused, good, ear):
         await until(is_announced, "the LAN hears of the one inside")
         flood.wait(AMONG)
     assert ear.poll() is None
+
+
+async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot, ear):
+    """1,200 announcements with leases of 300 s took all places for these 300 s."""
+    served(good, robot, b"before")
+    sources = [f"198.18.{3 + number // 250}.{number % 250 + 1}" for number in range(1200)]
+    said = [
+        (source, GROUP, spdp(prefix(number), source, lease=300))
+        for number, source in enumerate(sources)
+    ]
+    laptop = Participant(LAPTOP, STRANGERS[2], WELL_KNOWN)
+    newcomer = Participant(NEWCOMER, STRANGERS[0], 7440)
+    with closing(laptop), closing(newcomer), abused.watched():
+        with Flood(said, is_forged=True, via=STRANGERS[4]) as flood:
+            flood.wait(AMONG)
+            unproven = abused.metric(
+                'rosproxy_ros2_unproven_participants{domain="0",side="outside"}'
+            )
+            assert 200 < unproven <= MOST_OUTSIDE_UNPROVEN + 1
+            laptop.proves_to_receive(lambda: laptop.announce(GROUP))
+            good.hears(LAPTOP, lambda: laptop.announce(GROUP))
+            good.hears(NEWCOMER, lambda: newcomer.announce(GROUP))
+            served(good, robot, b"amid")
+            flood.wait(2 * AMONG)
+        served(good, robot, b"after")
+        known = {p["guid_prefix"] for p in abused.status()["domains"][0]["outside"]}
+        assert {LAPTOP.hex("."), ROBOT.hex(".")} <= known

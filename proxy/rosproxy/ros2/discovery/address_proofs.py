@@ -15,7 +15,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
 from rosproxy.ros2.protocol.reliable import heartbeat
-from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
+from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX, SubmessageId
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE_DURATION = 12.0
@@ -23,6 +23,9 @@ LEASE_DURATION = 12.0
 each 8 s and is asked again then."""
 KEPT = 60.0
 """Seconds for which an address has proved to receive, after its last participant has gone."""
+LONGEST_ANSWER = 256
+"""Bytes of an answer that is known without reading it; one of Fast DDS has 72."""
+_INFO_DST = bytes([SubmessageId.INFO_DST])
 
 
 @dataclass(slots=True)
@@ -46,6 +49,18 @@ class AddressProofs:
         self._count += 1
         asks = heartbeat(own, prefix, BuiltinWriter.PUBLICATIONS, 1, self._count)
         return announcement(own, reached_at, LEASE_DURATION, WRITER_ENDPOINTS) + asks[HEADER:]
+
+    def is_answer(self, address: str, datagram: bytes) -> bool:
+        """Whether a datagram is an answer of an address and nothing else, known without reading it.
+
+        A flood of forged sources uses up what may be read of unproven addresses. Answers can't be
+        forged, so they are taken in nevertheless.
+        """
+        return (
+            len(datagram) <= LONGEST_ANSWER
+            and datagram[HEADER : HEADER + 1] == _INFO_DST
+            and datagram[HEADER + 4 : HEADER + 4 + PREFIX] == self._prefix(address)
+        )
 
     def note(self, address: str, datagram: bytes, now: float) -> bool:
         """Take in a datagram; return whether the address proves by it to receive. RtpsError."""

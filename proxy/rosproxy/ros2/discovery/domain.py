@@ -80,7 +80,8 @@ class Domain(DomainParticipants):
 
     def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What came to the group on an inside network, or to the well-known port, from inside."""
-        if self._is_too_much(datagram, source, now):
+        is_answer = self.proofs.is_answer(source, datagram)
+        if not is_answer and self._is_too_much(datagram, source, now):
             return []
         sent = list[Outgoing]()
         try:
@@ -133,7 +134,8 @@ class Domain(DomainParticipants):
     def _heard_at_discovery(
         self, datagram: bytes, source: str, by_relay: bool, now: float
     ) -> list[Outgoing]:
-        if self._is_too_much(datagram, source, now):
+        is_answer = self.proofs.is_answer(source, datagram)
+        if not is_answer and self._is_too_much(datagram, source, now):
             return []
         sent = list[Outgoing]()
         try:
@@ -150,11 +152,15 @@ class Domain(DomainParticipants):
         """Whether an address has proved to receive, or it is a peer's."""
         return self.proofs.has(source) or self.settings.is_peer(source)
 
-    def is_heard_outside(self, source: str) -> bool:
-        """Whether `heard_outside` reads what comes from an address."""
-        relay = self.settings.relay
-        is_relay = relay is not None and source == relay.address.host
-        return is_relay or self.outside.is_met(source)
+    def is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
+        """Whether `heard_outside` reads a datagram, which takes long."""
+        if self.proofs.is_answer(source, datagram):
+            return False
+        return self.outside.is_met(source) or self.source_of(datagram, source) != source
+
+    def is_read_of_inside(self, datagram: bytes, source: str) -> bool:
+        """Whether `heard_inside` reads a datagram, which takes long."""
+        return not self.proofs.is_answer(source, datagram)
 
     def is_read_at(self, port: int, datagram: bytes, source: str) -> bool:
         """Whether `at_lease` reads a datagram, which takes long, and does not just pass it on."""

@@ -95,7 +95,7 @@ class DomainServer:
         settings, domain = self.domain.settings, self.domain
         self._groups.open(_families(self._bind))
         well_known = datagrams.bind(self._bind, settings.unicast_port)
-        self._read(well_known, self._from_inside(domain.heard_inside), self._comes_from_inside)
+        self._read(well_known, self._from_inside(domain.heard_inside), self._is_read_of_inside)
         taken_ports = []
         for port in settings.ports.listen.ports():
             try:
@@ -106,7 +106,7 @@ class DomainServer:
                 taken_ports.append(port)
                 continue
             if port == settings.discovery_port:
-                self._read(sock, self._at_discovery, self._is_heard_outside)
+                self._read(sock, self._at_discovery, self._is_read_at_discovery)
             else:
                 self._read(sock, partial(domain.at_lease, port), partial(domain.is_read_at, port))
         return taken_ports
@@ -228,7 +228,7 @@ class DomainServer:
 
     def _read_group(self, sock: socket.socket) -> None:
         take = self._from_inside(self._heard_in_group)
-        self._loop.add_reader(sock, self._take_in, sock, take, self._comes_from_inside)
+        self._loop.add_reader(sock, self._take_in, sock, take, self._is_read_of_inside)
 
     def _stop_reading(self, sock: socket.socket) -> None:
         self._loop.remove_reader(sock)
@@ -238,11 +238,12 @@ class DomainServer:
         self._sockets.append(sock)
         self._loop.add_reader(sock, self._take_in, sock, take, must_read)
 
-    def _comes_from_inside(self, _: bytes, source: str) -> bool:
-        return self._is_inside(source)
+    def _is_read_of_inside(self, datagram: bytes, source: str) -> bool:
+        return self._is_inside(source) and self.domain.is_read_of_inside(datagram, source)
 
-    def _is_heard_outside(self, datagram: bytes, source: str) -> bool:
-        return datagram != self._secret and self.domain.is_heard_outside(source)
+    def _is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
+        is_own = self._secret and datagram == self._secret
+        return not is_own and self.domain.is_read_at_discovery(datagram, source)
 
     def _from_inside(self, take: Take) -> Take:
         def take_selected(datagram: bytes, source: str, now: float) -> list[Outgoing]:

@@ -6,6 +6,7 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.address_proofs import KEPT, AddressProofs
+from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import (
     MOST_INSIDE_UNPROVEN,
@@ -304,3 +305,29 @@ def test_a_process_has_questions_of_its_own() -> None:
     first, second = AddressProofs(b"one"), AddressProofs(b"another")
     asked = [source_prefix(p.question(LAPTOP, A, [])) for p in (first, second)]
     assert len(Counter(asked)) == 2
+
+
+def test_a_flood_of_forged_sources_holds_up_no_answer() -> None:
+    """An answer was lost by the allowance that all unproven sources share."""
+    domain = make_domain(peers=())
+    meet(domain)
+    (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
+    forge(domain, 0, 1)
+    domain.rates.charge("10.1.0.1", int(BURST), is_known=False)
+    said = answer(asked, B)
+    assert not domain.is_read_at_discovery(said, LAPTOP)
+    domain.heard_outside(said, LAPTOP, NOW)
+    assert domain.outside.by_prefix[B].proven
+    assert domain.is_read_at_discovery(said, STRANGER) is domain.outside.is_met(STRANGER)
+    assert domain.is_read_at_discovery(said + bytes(300), LAPTOP)
+
+
+def test_an_answer_inside_is_not_held_up_either() -> None:
+    domain = make_domain()
+    (asked,) = questions(meet(domain), INSIDE)[-1:]
+    domain.rates.charge(INSIDE, int(BURST), is_known=False)
+    said = [answer(q, A) for q in questions(meet(make_domain()), INSIDE)]
+    assert asked
+    for datagram in said:
+        domain.heard_inside(datagram, INSIDE, NOW)
+    assert domain.proofs.has(INSIDE)
