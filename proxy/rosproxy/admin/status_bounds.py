@@ -1,85 +1,96 @@
-"""Bounds for the document at ``/status``, whatever nodes and strangers call things.
+"""The bound of the document at ``/status``, whatever nodes and strangers call things.
 
-Nodes choose their names and how many they register; anybody outside can add connections. All nodes
-together have MOST characters for these. A node with few is shown in whole, and the others get equal
-shares, so that none hides what another has. Within a node its names come before its connections.
+Nodes choose their names and how many names they register, and any address outside can add
+connections. The document has MOST_BYTES of JSON at most. A document within the bound stays as it
+is. Otherwise each source address gets an equal share, and an address that needs less than its share
+stays whole: no address hides what another address has.
+
+An address that needs more first keeps its rows (nodes, participants and so on) without their lists,
+then as much of each list as fits. Counters named ``left_out`` say how much is missing.
 """
 
 import json
-from collections.abc import Iterable, Sequence
-from itertools import accumulate, chain
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any, TypeVar
 
 import msgspec
 
-from rosproxy.admin.status_document import (
-    ConnectionStatus,
-    EndpointStatus,
-    HiddenStatus,
-    ParticipantStatus,
-    ProxyStatus,
-)
+from rosproxy.admin.status_document import DomainStatus, PolicyStatus, ProxyStatus
+from rosproxy.net.addresses import parse_authority
 
-MOST = 512 * 1024
-"""Characters of JSON for what nodes have registered and who is connected to them. A hundred nodes
-with ten topics and as many connections each have 250,000."""
-MOST_HIDDEN = 256 * 1024
-"""The same for what the policy hides."""
-MOST_OF_PARTICIPANTS = 128 * 1024
-"""The same for topics and services of the participants of ROS 2 on one side of a domain."""
-CONNECTION_OVERHEAD = 160
-"""Characters of a connection besides its texts."""
-ListEntry = str | ConnectionStatus
-_LISTS = ("nodes", "publishes", "services", "subscribes", "parameters", "connections")
+MOST_BYTES = 1024 * 1024
+"""Bytes of JSON. A hundred nodes with ten topics and as many connections each have 250,000."""
+_COUNTER = 10
+"""Bytes by which the counter of a row may grow."""
+_MOST_LISTS = 8
+"""Lists of a row at most."""
+_COUNTERS = 4096
+"""The same for all counters that belong to no row."""
+_FIRST = ("nodes", "inside", "outside", "stand_ins", "udpros", "layers", "peers")
+"""Tables whose rows an owner keeps before those of the other tables."""
+_NOT_COUNTED = "types"
+"""The list whose entries ``left_out`` does not count: each entry belongs to a name."""
+_NOT_ASCII = re.compile(r"[^\x00-\x7f]+")
+Item = TypeVar("Item")
+Parent = TypeVar("Parent", bound=msgspec.Struct)
+Row = Any
+"""A struct, or a text."""
+VisitTable = Callable[[str, Sequence[Row], Callable[[Row], str]], tuple[Row, ...]]
+"""Gets the name of a table, its rows, and what gives a row's owner; returns the rows to show."""
 
 
-def bounded(status: ProxyStatus, most: int = MOST) -> ProxyStatus:
-    """The status with so much of each node's lists that all fit; ``left_out`` counts the rest."""
-    wanted = [sum(map(_size, _items(node))) for node in status.nodes]
-    if sum(wanted) <= most:
+def bounded(status: ProxyStatus, most: int = MOST_BYTES) -> ProxyStatus:
+    """The status with so much of its tables that it has ``most`` bytes as JSON."""
+    excess = _size(status) - most
+    if excess <= 0:
         return status
-    shares = fair_shares(wanted, most)
-    nodes = (_cut(node, share) for node, share in zip(status.nodes, shares, strict=True))
-    return msgspec.structs.replace(status, nodes=tuple(nodes))
+    entries = _entries(status)
+    wanted: defaultdict[str, int] = defaultdict(int)
+    for entry in entries:
+        wanted[entry.owner] += entry.size
+    room = max(sum(wanted.values()) - excess - _COUNTERS, 0)
+    shares = dict(zip(wanted, fair_shares(list(wanted.values()), room), strict=True))
+    for owner, share in shares.items():
+        if share < wanted[owner]:
+            _fit([entry for entry in entries if entry.owner == owner], share)
+    shown = iter(entries)
+
+    def visit(_name: str, rows: Sequence[Row], _owner: Callable[[Row], str]) -> tuple[Row, ...]:
+        visited = [next(shown) for _ in rows]
+        return tuple(entry.row for entry in visited if not entry.is_left_out)
+
+    return _visit_tables(status, visit)
 
 
-def first_hidden(hidden: Sequence[HiddenStatus], most: int = MOST_HIDDEN) -> list[HiddenStatus]:
-    """The first of the hidden names, as many as fit."""
-    sizes = accumulate(len(msgspec.json.encode(h)) for h in hidden)
-    return [h for h, size in zip(hidden, sizes, strict=True) if size <= most]
+def left_out(status: ProxyStatus) -> int:
+    """How many rows and names the status lacks."""
+    policy = status.policy or PolicyStatus()
+    counts = [status.left_out, policy.left_out, policy.layers_left_out]
+    counts += [node.left_out for node in status.nodes]
+    counts += [layer.left_out for layer in policy.layers]
+    for domain in status.domains:
+        counts += [domain.left_out, domain.mismatches_left_out]
+        counts += [participant.left_out for participant in (*domain.inside, *domain.outside)]
+    return sum(counts)
 
 
-def bounded_names(
-    participants: Iterable[ParticipantStatus], most: int = MOST_OF_PARTICIPANTS
-) -> tuple[ParticipantStatus, ...]:
-    """Participants with so many of each one's names that all fit."""
-    all_participants = tuple(participants)
-    sizes = [[len(msgspec.json.encode(name)) + 1 for name in _names(p)] for p in all_participants]
-    shares = fair_shares([sum(name_sizes) for name_sizes in sizes], most)
-    return tuple(
-        _with_names(p, sum(1 for used in accumulate(name_sizes) if used <= share))
-        for p, name_sizes, share in zip(all_participants, sizes, shares, strict=True)
-    )
-
-
-def _names(participant: ParticipantStatus) -> tuple[str, ...]:
-    return (*participant.publishes, *participant.subscribes, *participant.services)
-
-
-def _with_names(participant: ParticipantStatus, count: int) -> ParticipantStatus:
-    """A participant with the first of its names."""
-    subscribed = max(count - len(participant.publishes), 0)
-    return msgspec.structs.replace(
-        participant,
-        publishes=participant.publishes[:count],
-        subscribes=participant.subscribes[:subscribed],
-        services=participant.services[: max(subscribed - len(participant.subscribes), 0)],
-        left_out=participant.left_out + len(_names(participant)) - count,
-    )
+def encode(value: object) -> bytes:
+    """A document, or a part of it, as JSON in ASCII: a terminal that shows it comes to no harm."""
+    encoded = msgspec.json.encode(value)
+    if encoded.isascii():
+        return encoded
+    # Outside of texts JSON is ASCII.
+    return _NOT_ASCII.sub(lambda run: json.dumps(run[0])[1:-1], encoded.decode()).encode()
 
 
 def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
     """How much each gets of ``most``: what it wants, or as much as all others that want more."""
-    shares, remaining = [0] * len(wanted), most
+    shares = [0] * len(wanted)
+    remaining = most
     by_size = sorted(range(len(wanted)), key=wanted.__getitem__)
     for served, index in enumerate(by_size):
         shares[index] = min(wanted[index], remaining // (len(wanted) - served))
@@ -87,29 +98,139 @@ def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
     return shares
 
 
-def _cut(node: EndpointStatus, share: int) -> EndpointStatus:
-    """A node with the first items of its lists, as many as fit."""
-    lists: dict[str, tuple[ListEntry, ...]] = {}
+def fair_shares_by_owner(owners: Sequence[str], wanted: Sequence[int], most: int) -> list[int]:
+    """The same where several of them have one owner: owners get fair shares, then each one."""
+    by_owner: defaultdict[str, list[int]] = defaultdict(list)
+    for index, owner in enumerate(owners):
+        by_owner[owner].append(index)
+    totals = [sum(wanted[index] for index in own) for own in by_owner.values()]
+    shares = [0] * len(wanted)
+    for own, room in zip(by_owner.values(), fair_shares(totals, most), strict=True):
+        for index, share in zip(own, fair_shares([wanted[i] for i in own], room), strict=True):
+            shares[index] = share
+    return shares
+
+
+def fair_choice(items: Iterable[Item], owner: Callable[[Item], str], most: int) -> list[Item]:
+    """The first items of each owner, ``most`` in all, in their order."""
+    every = list(items)
+    if len(every) <= most:
+        return every
+    by_owner: defaultdict[str, list[int]] = defaultdict(list)
+    for index, item in enumerate(every):
+        by_owner[owner(item)].append(index)
+    shares = fair_shares([len(own) for own in by_owner.values()], most)
+    chosen = [own[:share] for own, share in zip(by_owner.values(), shares, strict=True)]
+    return [every[index] for index in sorted(index for own in chosen for index in own)]
+
+
+@dataclass(slots=True)
+class _Entry:
+    """A row of a table, its owner, and its bytes as JSON with the comma that follows."""
+
+    table: str
+    owner: str
+    row: Row
+    size: int
+    is_left_out: bool = False
+
+
+def _entries(status: ProxyStatus) -> list[_Entry]:
+    entries: list[_Entry] = []
+
+    def visit(name: str, rows: Sequence[Row], owner: Callable[[Row], str]) -> tuple[Row, ...]:
+        entries.extend(_Entry(name, owner(row), row, _size(row) + 1) for row in rows)
+        return tuple(rows)
+
+    _visit_tables(status, visit)
+    return entries
+
+
+def _visit_tables(status: ProxyStatus, visit: VisitTable) -> ProxyStatus:
+    """The status with what ``visit`` returns for each table that others can make long."""
+    policy = status.policy and _with_tables(
+        status.policy,
+        visit,
+        layers=lambda _: "layers",
+        hidden=lambda hidden: hidden.address,
+    )
+    domains = tuple(
+        _with_tables(
+            domain,
+            visit,
+            peers=lambda _: "peers",
+            inside=lambda participant: participant.address,
+            outside=lambda participant: participant.address,
+            mismatches=_owners_of_mismatches(domain),
+        )
+        for domain in status.domains
+    )
+    return _with_tables(
+        msgspec.structs.replace(status, policy=policy, domains=domains),
+        visit,
+        nodes=lambda node: _host(f"//{node.address}"),
+        stand_ins=lambda stand_in: _host(stand_in.uri),
+        udpros=lambda subscription: subscription.peer,
+    )
+
+
+def _with_tables(parent: Parent, visit: VisitTable, **owners: Callable[[Row], str]) -> Parent:
+    """The parent with the visited tables, and with what they lack added to its counters."""
+    changes: dict[str, Any] = {}
+    for name, owner in owners.items():
+        rows = getattr(parent, name)
+        changes[name] = visit(name, rows, owner)
+        counter = f"{name}_left_out"
+        counter = counter if hasattr(parent, counter) else "left_out"
+        before = changes.get(counter, getattr(parent, counter))
+        changes[counter] = before + len(rows) - len(changes[name])
+    return msgspec.structs.replace(parent, **changes)
+
+
+def _owners_of_mismatches(domain: DomainStatus) -> Callable[[Row], str]:
+    """What gives the address of the participant inside that a mismatch is about."""
+    addresses = {participant.guid_prefix: participant.address for participant in domain.inside}
+    return lambda mismatch: addresses.get(mismatch.writer, addresses.get(mismatch.reader, ""))
+
+
+def _host(uri: str) -> str:
+    address = parse_authority(uri)
+    return address.host if address else uri
+
+
+def _fit(entries: Sequence[_Entry], room: int) -> None:
+    """Shorten the rows of one owner, or leave them out, until they have ``room`` bytes."""
+    ranks = {table: rank for rank, table in enumerate(_FIRST)}
+    ordered = sorted(entries, key=lambda entry: ranks.get(entry.table, len(ranks)))
+    bare_sizes = [_size(_shortened(entry.row, 0)) + 1 + _COUNTER for entry in ordered]
+    kept = sum(1 for used in accumulate(bare_sizes) if used <= room)
+    for entry in ordered[kept:]:
+        entry.is_left_out = True
+    room -= sum(bare_sizes[:kept])
+    # `_shortened` counts a comma for the last entry of each list, too.
+    in_lists = [
+        max(entry.size - bare, 0) + _COUNTER + _MOST_LISTS
+        for entry, bare in zip(ordered[:kept], bare_sizes, strict=False)
+    ]
+    for entry, share in zip(ordered[:kept], fair_shares(in_lists, room), strict=True):
+        entry.row = _shortened(entry.row, share)
+
+
+def _shortened(row: Row, room: int) -> Row:
+    """A row with the first entries of its lists, as many as fit into ``room`` bytes."""
+    lists: dict[str, Any] = {}
     left_out = 0
-    for name in _LISTS:
-        kept: list[ListEntry] = []
-        for item in getattr(node, name):
-            share -= _size(item)
-            if share >= 0:
-                kept.append(item)
-            else:
-                left_out += 1
-        lists[name] = tuple(kept)
-    return msgspec.structs.replace(node, **lists, left_out=left_out)
+    for name in getattr(row, "__struct_fields__", ()):
+        entries = getattr(row, name)
+        if isinstance(entries, tuple):
+            used = [size for size in accumulate(_size(e) + 1 for e in entries) if size <= room]
+            lists[name] = entries[: len(used)]
+            room -= used[-1] if used else 0
+            left_out += 0 if name == _NOT_COUNTED else len(entries) - len(used)
+    if not lists:
+        return row
+    return msgspec.structs.replace(row, **lists, left_out=row.left_out + left_out)
 
 
-def _items(node: EndpointStatus) -> chain[ListEntry]:
-    return chain.from_iterable(getattr(node, name) for name in _LISTS)
-
-
-def _size(item: ListEntry) -> int:
-    """Characters of an item as JSON, with what separates it from the next; about."""
-    if isinstance(item, str):
-        return len(json.dumps(item)) + 2
-    texts = item.kind, item.name, item.caller_id, item.peer
-    return CONNECTION_OVERHEAD + sum(len(json.dumps(text)) for text in texts)
+def _size(value: object) -> int:
+    return len(encode(value))

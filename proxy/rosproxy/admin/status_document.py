@@ -3,15 +3,15 @@
 `rosproxy.admin.common_status` fills it in; ``rosproxy status``, ``rosproxy doctor`` and the
 operator read it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made
 of what ROS nodes say of themselves and may come from another version of the proxy. So reading is
-tolerant: unknown keys are ignored, what is missing or of another type gets its default, and items
-of a list that are of another type are left out. The proxy bounds texts and lists by what it admits
-(`rosproxy.ros1.protocol.name_lengths`), but another version may not, and texts may hold control
-characters: `rosproxy.telemetry.text` makes them fit to be shown.
+tolerant: unknown keys are ignored, and what is missing or of another type gets its default. The
+proxy bounds the document as a whole (`rosproxy.admin.status_bounds`), and ``left_out`` counts what
+is missing. Another version may not, and texts may hold control characters.
 
 Times are in seconds, rates in bytes per second; ``sent`` is what went outside.
 """
 
 import json
+from contextlib import suppress
 from types import UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -168,8 +168,7 @@ class EndpointStatus(msgspec.Struct, frozen=True):
     """What is registered with one slave URI: one node as a rule, several for nodelets.
 
     ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
-    ``state`` is one of `rosproxy.ros1.registry.endpoint.STATES`. ``left_out``: how many names and
-    connections there are besides those in the lists (`rosproxy.admin.status_bounds`).
+    ``state`` is one of `rosproxy.ros1.registry.endpoint.STATES`.
     """
 
     nodes: Names = ()
@@ -200,23 +199,26 @@ class LayerStatus(msgspec.Struct, frozen=True):
     mode: str = ""
     rules: Names = ()
     addresses: Count | None = None
+    left_out: Count = 0
 
 
 class HiddenStatus(msgspec.Struct, frozen=True):
-    """What the policy keeps from the master: ``kind`` of rule, name, node, and the rule."""
+    """What the policy keeps from the master: ``kind`` of rule, name, node, rule, the address."""
 
     kind: str = ""
     name: str = ""
     node: str = ""
     reason: str = ""
+    address: str = ""
 
 
 class PolicyStatus(msgspec.Struct, frozen=True):
-    """The layers of rules in force, what is hidden by them, and how much of that is left out."""
+    """The layers of rules in force, and the names that these rules hide."""
 
     layers: tuple[LayerStatus, ...] = ()
     hidden: tuple[HiddenStatus, ...] = ()
-    left_out: int = 0
+    left_out: Count = 0
+    layers_left_out: Count = 0
 
 
 class ProblemStatus(msgspec.Struct, frozen=True):
@@ -303,8 +305,7 @@ class DomainStatus(msgspec.Struct, frozen=True):
     """A domain of ROS 2: its participants, and what became of datagrams.
 
     ``discovery`` is where outside announces itself to the proxy, ``direction`` that of the proxy.
-    ``dropped`` were refused, ``lost`` the kernel did not take. ``data_plane``: how user data is
-    forwarded. ``mismatches_left_out``: how many more there are.
+    ``dropped`` were refused, ``lost`` the kernel did not take; ``data_plane`` is for user data.
     """
 
     domain: Count = 0
@@ -321,6 +322,7 @@ class DomainStatus(msgspec.Struct, frozen=True):
     outside: tuple[ParticipantStatus, ...] = ()
     mismatches: tuple[MismatchStatus, ...] = ()
     mismatches_left_out: Count = 0
+    left_out: Count = 0
 
 
 class ProxyStatus(msgspec.Struct, frozen=True):
@@ -347,6 +349,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     nodes: tuple[EndpointStatus, ...] = ()
     domains: tuple[DomainStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()
+    left_out: Count = 0
 
 
 def parse_status(text: str | bytes) -> ProxyStatus:
@@ -380,21 +383,18 @@ def _convert_leniently(value: object, kind: type[Document]) -> Document:
         raw_fields = value if isinstance(value, dict) else {}
     fields = {}
     for field in msgspec.structs.fields(kind):
-        try:
+        with suppress(KeyError, msgspec.ValidationError):
             fields[field.name] = _convert_field(raw_fields[field.encode_name], field.type)
-        except (KeyError, msgspec.ValidationError):
-            continue
     return kind(**fields)
 
 
 def _convert_field(value: Any, kind: Any) -> Any:
-    """A value as a field's type. Raises ValidationError where nothing of it fits."""
+    """A value as a field's type; lists are of structs or of texts. Raises ValidationError."""
     inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
     is_struct = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
     if is_struct and isinstance(value, dict) and get_origin(kind) is not tuple:
         return _convert_leniently(value, inner)
     if get_origin(kind) is not tuple or not isinstance(value, list):
         return msgspec.convert(value, kind)
-    # All lists in these documents are of structs or of texts.
     items = [item for item in value if isinstance(item, dict if is_struct else str)]
     return tuple(_convert_leniently(item, inner) if is_struct else item for item in items)

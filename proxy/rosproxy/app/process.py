@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from rosproxy.admin.admin_client import default_url
 from rosproxy.admin.admin_server import Action, AdminServer
 from rosproxy.admin.common_status import common_status
+from rosproxy.admin.status_bounds import bounded
 from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.app.policy_sources import PolicySources
 from rosproxy.app.self_check import SelfCheck
@@ -103,11 +104,11 @@ class App:
         return to_json(self.state())
 
     def state(self) -> ProxyStatus:
-        """The state."""
+        """The state, within the bound of the status."""
         status = replace(common_status(self.runtime), range_probe=self._check.result)
         for stack in self.stacks:
             status = stack.add_to(status)
-        return status
+        return bounded(status)
 
     def _actions(self) -> dict[str, Action]:
         """What posts at the admin endpoint do: in ROS 1 and ROS 2 where both know them.

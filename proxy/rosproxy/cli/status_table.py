@@ -8,6 +8,7 @@ nodes say of themselves passes through `clean`.
 from collections.abc import Iterator, Sequence
 
 from rosproxy.admin import status_document as document
+from rosproxy.admin.status_bounds import left_out
 from rosproxy.cli.domain_table import domain_lines
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.tables import GAP, besides_first, table
@@ -65,6 +66,8 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     if settings.publish_master:
         host = clean(settings.advertise_host)
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
+    if missing := left_out(status):
+        yield f"left out {plural(missing, 'name')} and entries: /status is bounded, see limits.md"
 
 
 def _master(master: document.MasterStatus) -> str:

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from operator import attrgetter, itemgetter
 
 import msgspec
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from rosproxy.admin import status_document as document
-from rosproxy.admin.common_status import with_hidden
-from rosproxy.admin.status_bounds import bounded
+from rosproxy.admin.common_status import MOST_HIDDEN, with_hidden
+from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
@@ -23,6 +24,9 @@ from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 from rosproxy.ros1.upkeep.message_counter import MessageCounter
 from rosproxy.telemetry.metrics import NamedNodes
+
+MOST_CONNECTIONS = 1000
+"""Connections of a node that the status lists; each address that connects has a fair share."""
 
 
 @dataclass(eq=False)
@@ -38,13 +42,13 @@ class Ros1State(Collector):
     _down: NamedNodes = field(default_factory=NamedNodes)
 
     def add_to(self, status: document.ProxyStatus) -> document.ProxyStatus:
-        """The state, with what ``rosproxy status`` and ``doctor`` show of ROS 1, within bounds."""
+        """The state, with what ``rosproxy status`` and ``doctor`` show of ROS 1."""
         context = self._context
         relays: dict[int, list[Relay]] = {}
         for relay in self._tcpros.relays:
             relays.setdefault(relay.port, []).append(relay)
         endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
-        whole = msgspec.structs.replace(
+        return msgspec.structs.replace(
             status,
             retired=context.retired,
             settings=self._settings(status.settings),
@@ -64,10 +68,9 @@ class Ros1State(Collector):
                 for subscription, relay in self._stand_ins.udpros
             ),
             stand_ins=msgspec.convert(self._stand_ins.status(), tuple[document.StandInStatus, ...]),
-            policy=with_hidden(status.policy, list(self._hidden())),
+            policy=with_hidden(status.policy, *self._hidden()),
             nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
         )
-        return bounded(whole)
 
     def collect(self) -> Iterable[Metric]:
         """The state as metrics: gauges, and counters of bytes."""
@@ -194,17 +197,27 @@ class Ros1State(Collector):
             map(str, proxy_signs.overlapping_proxies("1", ports.first, ports.last, settings.admin))
         )
 
-    def _hidden(self) -> Iterator[document.HiddenStatus]:
-        """What the policy keeps from the master."""
+    def _hidden(self) -> tuple[list[document.HiddenStatus], int]:
+        """What the policy keeps from the master, and how much of that is left out."""
         policy = self._context.policy
-        for (kind, name), holders in sorted(self._context.registry.hidden.items(), key=str):
-            for node, endpoint in sorted(holders.items()):
-                rule_kind = KINDS[kind]
-                verdict = policy.judge(rule_kind, name, [node], endpoint.address)
-                yield document.HiddenStatus(rule_kind.value, name, node, verdict.reason)
+        registrations = [
+            (KINDS[kind], name, node, endpoint.address)
+            for (kind, name), holders in self._context.registry.hidden.items()
+            for node, endpoint in holders.items()
+        ]
+        shown = fair_choice(registrations, itemgetter(3), MOST_HIDDEN)
+        shown.sort(key=str)
+        rows = [
+            document.HiddenStatus(
+                kind.value, name, node, policy.judge(kind, name, [node], address).reason, address
+            )
+            for kind, name, node, address in shown
+        ]
+        return rows, len(registrations) - len(rows)
 
     def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
         problems = self._context.problems.at(endpoint.port)
+        shown_relays = fair_choice(relays, attrgetter("peer"), MOST_CONNECTIONS)
         return document.EndpointStatus(
             nodes=tuple(endpoint.caller_ids),
             uri=endpoint.uri,
@@ -217,8 +230,9 @@ class Ros1State(Collector):
             services=tuple(endpoint.names(Kind.SERVICE)),
             parameters=tuple(endpoint.names(Kind.PARAM)),
             connections=msgspec.convert(
-                relays, tuple[document.ConnectionStatus, ...], from_attributes=True
+                shown_relays, tuple[document.ConnectionStatus, ...], from_attributes=True
             ),
+            left_out=len(relays) - len(shown_relays),
             problems=tuple(problem.text for problem in problems),
             data_plane=msgspec.convert(self._plane.status_of(endpoint), document.NodePlaneStatus),
         )

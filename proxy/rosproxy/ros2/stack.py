@@ -256,8 +256,8 @@ class Ros2:
         Beside ROS 1, the networks, the ports and the data plane are those of ROS 1.
         """
         domains = self.state.status()
-        hidden = list(self.state.hidden(self._runtime.policy))
-        status = replace(status, domains=domains, policy=with_hidden(status.policy, hidden))
+        policy = with_hidden(status.policy, *self.state.hidden(self._runtime.policy))
+        status = replace(status, domains=domains, policy=policy)
         if self._settings.for_ros1:
             return status
         return replace(

@@ -553,6 +553,7 @@ async def test_the_status_tells_layers_and_hidden_names(make_proxy, make_node):
             "mode": "enforce",
             "rules": ["deny publish /chatter"],
             "addresses": None,
+            "left_out": 0,
         }
     ]
     assert policy["hidden"] == [
@@ -561,5 +562,6 @@ async def test_the_status_tells_layers_and_hidden_names(make_proxy, make_node):
             "name": "/chatter",
             "node": "/talker",
             "reason": "policy of --policy: deny publish /chatter",
+            "address": talker.address,
         }
     ]

@@ -1,28 +1,220 @@
-"""The document at ``/status`` stays small, and nobody hides what a neighbour has."""
+"""The document at ``/status`` stays small, and no address hides what another one has."""
 
 import json
+import re
+from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from rosproxy.admin.status_bounds import (
-    MOST,
-    MOST_HIDDEN,
+    MOST_BYTES,
     bounded,
-    bounded_names,
+    encode,
+    fair_choice,
     fair_shares,
-    first_hidden,
+    fair_shares_by_owner,
 )
 from rosproxy.admin.status_document import (
     ConnectionStatus,
+    DomainStatus,
     EndpointStatus,
     HiddenStatus,
+    LayerStatus,
+    LocatorStatus,
+    MismatchStatus,
+    NamedTypeStatus,
     ParticipantStatus,
+    PolicyStatus,
+    ProblemStatus,
     ProxyStatus,
-    to_json,
+    StandInStatus,
+    UdprosStatus,
+    parse_status,
 )
 
-NAMES = tuple(f"/topic{number}" for number in range(20))
+GOOD, EVIL = "172.18.0.5", "172.18.0.66"
+LONG = "x" * 1000
+MANY = tuple(f"/{number}{LONG}" for number in range(2000))
+GOOD_NODE = EndpointStatus(
+    nodes=("/good",),
+    address=f"{GOOD}:40001",
+    publishes=tuple(f"/topic{number}" for number in range(20)),
+    connections=(ConnectionStatus(name="/topic1"),),
+    problems=("a problem",),
+)
+GOOD_PARTICIPANT = ParticipantStatus(
+    guid_prefix="01",
+    address=GOOD,
+    publishes=("/scan",),
+    types=(NamedTypeStatus("/scan", "sensor_msgs/msg/LaserScan"),),
+    leases=(LocatorStatus(11401),),
+)
+GOOD_DOMAIN = DomainStatus(
+    inside=(GOOD_PARTICIPANT,),
+    mismatches=(MismatchStatus(name="/scan", writer="01", reader="09"),),
+    peers=("robot",),
+)
+GOOD_STATUS = ProxyStatus(
+    nodes=(GOOD_NODE,),
+    stand_ins=(StandInStatus(11500, f"http://{GOOD}:40002/"),),
+    udpros=(UdprosStatus("/camera", "/viewer", GOOD),),
+    policy=PolicyStatus(
+        layers=(LayerStatus("administrator", rules=("deny publish /camera",)),),
+        hidden=(HiddenStatus("publish", "/camera", "/good", "a rule", GOOD),),
+    ),
+    domains=(GOOD_DOMAIN,),
+    problems=(ProblemStatus(subject="/good", text="a problem"),),
+)
+EVIL_NODE = EndpointStatus(
+    nodes=("/evil",),
+    address=f"{EVIL}:40001",
+    subscribes=MANY,
+    connections=(ConnectionStatus(caller_id=LONG),) * 2000,
+)
+EVIL_PARTICIPANT = ParticipantStatus(
+    guid_prefix="66",
+    address=EVIL,
+    publishes=MANY,
+    types=tuple(NamedTypeStatus(name, LONG) for name in MANY),
+)
+
+
+def _policy(status: ProxyStatus, **more: Any) -> ProxyStatus:
+    assert status.policy
+    rows = {name: (*rows, *getattr(status.policy, name)) for name, rows in more.items()}
+    return replace(status, policy=replace(status.policy, **rows))
+
+
+def _domain(status: ProxyStatus, **more: Any) -> ProxyStatus:
+    (domain,) = status.domains
+    rows = {name: (*rows, *getattr(domain, name)) for name, rows in more.items()}
+    return replace(status, domains=(replace(domain, **rows),))
+
+
+FLOODS = {
+    "names of a node": replace(GOOD_STATUS, nodes=(EVIL_NODE, GOOD_NODE)),
+    "nodes": replace(
+        GOOD_STATUS,
+        nodes=(*(EndpointStatus(uri=LONG, address=f"{EVIL}:{n}") for n in range(2000)), GOOD_NODE),
+    ),
+    "stand-ins": replace(
+        GOOD_STATUS,
+        stand_ins=(
+            *(StandInStatus(n, f"http://{EVIL}:{n + 1}/{LONG}") for n in range(2000)),
+            *GOOD_STATUS.stand_ins,
+        ),
+    ),
+    "UDPROS": replace(
+        GOOD_STATUS, udpros=(UdprosStatus(LONG, LONG, EVIL),) * 2000 + GOOD_STATUS.udpros
+    ),
+    "hidden names": _policy(
+        GOOD_STATUS,
+        hidden=tuple(HiddenStatus("publish", name, "/evil", "a rule", EVIL) for name in MANY),
+    ),
+    "layers": _policy(
+        GOOD_STATUS,
+        layers=tuple(LayerStatus(name[:200], rules=(LONG[:100],) * 10) for name in MANY[:1000]),
+    ),
+    "names of a participant": _domain(GOOD_STATUS, inside=(EVIL_PARTICIPANT,)),
+    "participants": _domain(GOOD_STATUS, inside=(replace(EVIL_PARTICIPANT, types=()),) * 500),
+    "participants outside": _domain(GOOD_STATUS, outside=(EVIL_PARTICIPANT,) * 100),
+    "ports": _domain(
+        GOOD_STATUS,
+        inside=(ParticipantStatus(address=EVIL, leases=(LocatorStatus(where=LONG),) * 16),) * 500,
+    ),
+    "mismatches": _domain(
+        GOOD_STATUS,
+        inside=(ParticipantStatus("66", EVIL),),
+        mismatches=tuple(MismatchStatus(name=name, writer="66", reader="09") for name in MANY),
+    ),
+    "peers": _domain(GOOD_STATUS, peers=MANY),
+}
+
+
+@pytest.mark.parametrize("flood", FLOODS)
+def test_every_list_is_bounded_and_hides_nothing_of_others(flood: str) -> None:
+    status = FLOODS[flood]
+    shown = bounded(status)
+    assert len(encode(status)) > MOST_BYTES
+    assert 0.5 * MOST_BYTES < len(encode(shown)) <= MOST_BYTES
+    assert parse_status(encode(shown)) == shown
+    assert GOOD_NODE in shown.nodes
+    assert GOOD_STATUS.problems == shown.problems
+    assert set(GOOD_STATUS.stand_ins) <= set(shown.stand_ins)
+    assert set(GOOD_STATUS.udpros) <= set(shown.udpros)
+    assert shown.policy
+    assert GOOD_STATUS.policy
+    assert set(GOOD_STATUS.policy.hidden) <= set(shown.policy.hidden)
+    (domain,) = shown.domains
+    assert GOOD_PARTICIPANT in domain.inside
+    assert set(GOOD_DOMAIN.mismatches) <= set(domain.mismatches)
+    assert set(GOOD_STATUS.policy.layers) <= set(shown.policy.layers)
+    assert _rows(shown) + _rows_left_out(shown) == _rows(status)
+    assert re.search(rb'left_out":[1-9]', encode(shown))
+
+
+def _rows(status: ProxyStatus) -> int:
+    """How many rows the tables have."""
+    policy, (domain,) = status.policy, status.domains
+    assert policy
+    return sum(
+        map(
+            len,
+            (
+                *(status.nodes, status.stand_ins, status.udpros, policy.layers, policy.hidden),
+                *(domain.inside, domain.outside, domain.mismatches, domain.peers),
+            ),
+        )
+    )
+
+
+def _rows_left_out(status: ProxyStatus) -> int:
+    policy, (domain,) = status.policy, status.domains
+    assert policy
+    counters = domain.left_out, domain.mismatches_left_out, policy.layers_left_out
+    return status.left_out + policy.left_out + sum(counters)
+
+
+def test_an_address_that_is_cut_keeps_its_rows_before_their_lists() -> None:
+    (first, second) = bounded(ProxyStatus(nodes=(EVIL_NODE, EVIL_NODE))).nodes
+    assert first == second
+    assert (first.nodes, first.connections) == (("/evil",), ())
+    assert first.left_out == 4000 - len(first.subscribes)
+    assert len(first.subscribes) > 0.4 * MOST_BYTES / 1010
+
+
+def test_what_fits_is_left_as_it_is() -> None:
+    assert bounded(GOOD_STATUS) is GOOD_STATUS
+
+
+def test_letters_count_as_they_are_sent() -> None:
+    """In JSON of ASCII each of these takes six bytes or twelve; so the document was larger."""
+    status = ProxyStatus(nodes=(EndpointStatus(publishes=("é\U0001f916\x1b\u202e" * 100,) * 1000),))
+    shown = encode(bounded(status))
+    assert shown.isascii()
+    assert len(shown) <= MOST_BYTES
+    assert json.loads(shown)["nodes"][0]["publishes"][0] == "é\U0001f916\x1b\u202e" * 100
+
+
+ROWS = st.builds(
+    EndpointStatus,
+    address=st.sampled_from(["10.0.0.1:1", "10.0.0.2:2", "?"]),
+    publishes=st.lists(st.text(max_size=60), max_size=20).map(tuple),
+    services=st.lists(st.text(max_size=60), max_size=20).map(tuple),
+)
+
+
+@given(st.lists(ROWS, max_size=12), st.integers(0, 20_000))
+def test_it_fits_whatever_there_is(nodes: list[EndpointStatus], most: int) -> None:
+    status = ProxyStatus(nodes=tuple(nodes))
+    shown = bounded(status, most)
+    assert len(encode(shown)) <= max(most, len(encode(ProxyStatus())) + 10)
+    assert sum(
+        len(node.publishes) + len(node.services) + node.left_out for node in shown.nodes
+    ) <= sum(len(node.publishes) + len(node.services) for node in nodes)
 
 
 @given(st.lists(st.integers(0, 10**6), max_size=30), st.integers(0, 10**6))
@@ -31,68 +223,19 @@ def test_shares_are_fair(wanted: list[int], most: int) -> None:
     assert all(0 <= share <= want for share, want in zip(shares, wanted, strict=True))
     assert sum(shares) <= most
     cut = [share for share, want in zip(shares, wanted, strict=True) if share < want]
-    if cut:  # nobody has more than one that was cut, but for what does not divide
+    if cut:  # no share is larger than one that was cut, but for what does not divide
         assert max(shares) - min(cut) <= 1
         assert most - sum(shares) < len(wanted)
 
 
-@given(st.lists(st.lists(st.text(max_size=300), max_size=30), max_size=6), st.integers(0, 5000))
-def test_it_fits_and_counts_what_is_missing(given_names: list[list[str]], most: int) -> None:
-    status = ProxyStatus(nodes=tuple(EndpointStatus(publishes=tuple(n)) for n in given_names))
-    shortened = bounded(status, most)
-    empty = ProxyStatus(nodes=(EndpointStatus(),) * len(given_names))
-    longest = len(json.dumps(to_json(empty))) + most + 10 * len(given_names)
-    assert len(json.dumps(to_json(shortened))) <= longest
-    for names, node in zip(given_names, shortened.nodes, strict=True):
-        assert node.left_out == len(names) - len(node.publishes)
+def test_shares_of_several_with_one_owner() -> None:
+    assert fair_shares_by_owner("aaab", [10, 10, 10, 5], 11) == [2, 2, 2, 5]
+    assert fair_shares_by_owner("aab", [1, 2, 3], 6) == [1, 2, 3]
+    assert fair_shares_by_owner("", [], 6) == []
 
 
-def test_who_has_little_is_shown_in_whole() -> None:
-    evil = EndpointStatus(
-        nodes=("/evil",),
-        subscribes=tuple("/" + "x" * 1000 + str(number) for number in range(2000)),
-        connections=(ConnectionStatus(caller_id="y" * 1000),) * 2000,
-    )
-    good = EndpointStatus(
-        nodes=("/good",), publishes=NAMES, connections=(ConnectionStatus(name="/topic1"),)
-    )
-    first, second, third = bounded(ProxyStatus(nodes=(evil, good, evil))).nodes
-    assert second == good
-    assert (first.nodes, first.connections) == (("/evil",), ())
-    assert first == third
-    assert first.left_out == 4000 - len(first.subscribes)
-    assert len(first.subscribes) > 0.9 * MOST / 2 / 1010
-
-
-def test_what_fits_is_left_as_it_is() -> None:
-    status = ProxyStatus(nodes=(EndpointStatus(publishes=NAMES),))
-    assert bounded(status) is status
-
-
-def test_what_is_hidden_is_bounded_too() -> None:
-    """A node may register any number of long names that a rule hides."""
-    many = [HiddenStatus("publish", f"/{n}" + "x" * 1000, "/node", "a rule") for n in range(5000)]
-    shown = first_hidden(many)
-    assert 0 < sum(len(json.dumps(to_json(hidden))) for hidden in shown) < 1.1 * MOST_HIDDEN
-    assert shown == many[: len(shown)]
-    assert first_hidden(many[:3]) == many[:3]
-
-
-@given(st.lists(st.lists(st.integers(0, 30), max_size=9), max_size=5), st.integers(0, 300))
-def test_names_of_participants_fit(lengths: list[list[int]], most: int) -> None:
-    """Sixty participants with the longest names had megabytes of them."""
-    before = [
-        ParticipantStatus(
-            publishes=tuple("p" * length for length in own),
-            subscribes=tuple("s" * length for length in own),
-            services=tuple("v" * length for length in own),
-        )
-        for own in lengths
-    ]
-    after = bounded_names(before, most)
-    shown = [(*p.publishes, *p.subscribes, *p.services) for p in after]
-    assert sum(len(name) + 3 for names in shown for name in names) <= most
-    for full, shortened, names in zip(before, after, shown, strict=True):
-        everything = (*full.publishes, *full.subscribes, *full.services)
-        assert everything[: len(names)] == names
-        assert shortened.left_out == len(everything) - len(names)
+def test_each_owner_has_its_first_items_chosen() -> None:
+    items = [*(("evil", n) for n in range(100)), ("good", 0), ("good", 1)]
+    chosen = fair_choice(items, lambda item: item[0], 10)
+    assert chosen == [*(("evil", n) for n in range(8)), ("good", 0), ("good", 1)]
+    assert fair_choice(items[:10], lambda item: item[0], 10) == items[:10]

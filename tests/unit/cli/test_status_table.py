@@ -123,6 +123,8 @@ def test_what_the_proxy_has_left_out_is_told() -> None:
     lines = lines_of(make_node(left_out=1234))
     assert [line for line in lines if "1234 more names and connections" in line]
     assert not [line for line in lines_of(make_node()) if "not shown" in line]
+    assert "left out 1234 names and entries: /status is bounded, see limits.md" in lines
+    assert not [line for line in lines_of(make_node()) if "left out" in line]
 
 
 def test_a_narrow_terminal_gives_addresses_a_line_of_their_own() -> None:

@@ -34,6 +34,13 @@ def test_a_sound_proxy() -> None:
     ]
 
 
+def test_a_status_that_leaves_something_out() -> None:
+    facts = make_facts(status=make_status(make_node(left_out=1234)))
+    (whole, cut) = of("admin", facts)
+    assert (whole.severity, cut.severity) == (Severity.OK, Severity.INFO)
+    assert "leaves 1234 names and entries out" in cut.text
+
+
 def test_no_proxy_answers() -> None:
     finding = only(check(without_proxy()))
     assert (finding.severity, finding.check) == (Severity.ERROR, "admin")

@@ -5,6 +5,7 @@ from urllib.parse import urlsplit
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, published_range
+from rosproxy.admin.status_bounds import left_out
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import duration
@@ -38,6 +39,9 @@ def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.status is not None:
         up = duration(facts.status.uptime)
         yield ok("admin", "proxy", f"rosproxy {facts.status.version} at {facts.admin}, up {up}")
+        if missing := left_out(facts.status):
+            text = f"its status leaves {missing} names and entries out, of which nothing is found"
+            yield note("admin", "proxy", text, "rosproxy status shows which container has so many")
     elif facts.admin_error:
         text = f"{facts.admin_error}. All other findings were made without it"
         fix = "docker ps; docker logs CONTAINER; docker exec CONTAINER rosproxy doctor"
