@@ -8,13 +8,17 @@ path of a POST has an action; actions wait for each other as far as they have to
 
 Callers are few and friendly, so its bounds are tight and no options: a source with too many
 connections loses its oldest, and a caller that sends half a request or reads no reply is cut off.
+Status and metrics are costly: callers share what is made (`shared_document`), and take slots.
+/healthz and /readyz take none, and are always served.
 """
 
 import asyncio
+import contextlib
 import hashlib
 import hmac
 import json
 import logging
+import socket
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,10 +27,13 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
+from rosproxy.admin.replies import send_shared, unavailable
 from rosproxy.admin.requests import BodyError
-from rosproxy.admin.status_changes import StatusChanges, TooManyWaiting
-from rosproxy.admin.status_document import ProxyStatus, to_json
-from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.admin.shared_document import SharedDocument
+from rosproxy.admin.status_changes import StatusChanges, StatusSnapshot
+from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.net.addresses import HostPort, is_loopback, plain_address
+from rosproxy.net.fair_slots import FairSlots, NoSlot
 from rosproxy.net.http_client import CallFailed, TooLong, read_bounded
 from rosproxy.net.sockets import BACKLOG, end_if_stalled
 
@@ -37,6 +44,16 @@ MAX_BODY = 1024 * 1024
 """Longest body in bytes of a POST."""
 MOST_CONNECTIONS = 32
 """Connections from one address: an operator, a health check and Prometheus have one or two each."""
+MOST_REPLIES = 16
+"""Replies with the status or the metrics that are under way."""
+MOST_REPLIES_EACH = 4
+"""The same to one address: an operator, Prometheus and a person have one each."""
+SEND_BUFFER = 64 * 1024
+"""Bytes that the kernel keeps of a reply; Linux takes twice as many (socket(7), SO_SNDBUF).
+
+By default it keeps up to 4 MB, whatever the reader takes.
+"""
+JSON = {"Content-Type": "application/json; charset=utf-8"}
 IDLE_TIMEOUT = 75.0
 """Seconds in which the next request must have arrived, the first one as well."""
 BODY_TIMEOUT = 10.0
@@ -68,11 +85,19 @@ class AdminServer:
     _token_hash: str | None
     _routes: Mapping[tuple[str, str], Handler]
     _runner: web.ServerRunner | None = None
+    _snapshots: SharedDocument[StatusSnapshot] = field(init=False)
+    _exposition: SharedDocument[bytes] = field(init=False)
     _changes: StatusChanges = field(init=False)
+    _replies: FairSlots = field(init=False)
 
     def __post_init__(self) -> None:
-        """Nobody waits yet."""
-        self._changes = StatusChanges(self._status)
+        """Nobody asks yet."""
+        self._snapshots = SharedDocument(lambda: StatusSnapshot.take(self._status))
+        self._exposition = SharedDocument(lambda: generate_latest(self._metrics))
+        self._changes = StatusChanges(self._snapshots.newest)
+        work = "replies with the status or the metrics are under way"
+        advice = "read one to its end before you ask again"
+        self._replies = FairSlots(work, MOST_REPLIES, MOST_REPLIES_EACH, advice)
 
     async def start(self, listener: HostPort) -> None:
         """Listen. Raises OSError."""
@@ -85,16 +110,16 @@ class AdminServer:
         """Stop listening."""
         # Else aiohttp waits for those handlers, up to a minute (web_runner.py, shutdown_timeout).
         self._changes.end()
+        self._snapshots.close()
+        self._exposition.close()
         if self._runner is not None:
             await self._runner.cleanup()
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         method = "GET" if request.method == "HEAD" else request.method
         page, route = self._pages().get(request.path), self._routes.get((method, request.path))
-        if request.path == CHANGES and request.method == "GET":
-            return await self._wait(request)
         if page is not None and method == "GET":
-            return page()
+            return await page(request)
         if route is not None:
             return await route(request)
         has_action = request.path in self._actions
@@ -108,21 +133,36 @@ class AdminServer:
         text = "405: Method Not Allowed"
         return web.Response(status=405, text=text, headers={"Allow": methods})
 
-    def _pages(self) -> dict[str, Callable[[], web.Response]]:
+    def _pages(self) -> dict[str, Handler]:
         return {
-            "/healthz": lambda: web.Response(text="ok\n"),
-            "/readyz": self._readiness,
-            "/metrics": lambda: web.Response(
-                body=generate_latest(self._metrics), headers={"Content-Type": CONTENT_TYPE_LATEST}
-            ),
-            "/status": lambda: web.json_response(to_json(self._status())),
+            "/healthz": _tell_health,
+            "/readyz": self._tell_readiness,
+            "/metrics": self._tell_metrics,
+            "/status": self._tell_status,
+            CHANGES: self._wait,
         }
 
-    def _readiness(self) -> web.Response:
+    async def _tell_metrics(self, request: web.BaseRequest) -> web.StreamResponse:
+        try:
+            with self._replies.slot(_address(request)):
+                body = await self._exposition.newest()
+                return await send_shared(request, [body], {"Content-Type": CONTENT_TYPE_LATEST})
+        except NoSlot as error:
+            return unavailable(error)
+
+    async def _tell_status(self, request: web.BaseRequest) -> web.StreamResponse:
+        try:
+            with self._replies.slot(_address(request)):
+                snapshot = await self._snapshots.newest()
+                return await send_shared(request, [snapshot.body], JSON)
+        except NoSlot as error:
+            return unavailable(error)
+
+    async def _tell_readiness(self, _request: web.BaseRequest) -> web.Response:
         reason = self._unready()
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
-    async def _wait(self, request: web.BaseRequest) -> web.Response:
+    async def _wait(self, request: web.BaseRequest) -> web.StreamResponse:
         """Answer once the state is another one than the caller knows (``since``)."""
         if not self._may_post(request):
             return self._forbidden(f"GET {CHANGES}")
@@ -132,12 +172,14 @@ class AdminServer:
         except ValueError:
             return web.Response(status=400, text="rosproxy: within: must be seconds\n")
         try:
-            version, status = await self._changes.after(
-                since, within, lambda: transport is not None and not transport.is_closing()
-            )
-        except TooManyWaiting:
-            return web.Response(status=503, text="rosproxy: too many callers wait; ask /status\n")
-        return web.json_response({"version": version, "status": to_json(status)})
+            with self._changes.slots.slot(_address(request)):
+                snapshot = await self._changes.after(
+                    since, within, lambda: transport is not None and not transport.is_closing()
+                )
+                head = f'{{"version":"{snapshot.version}","status":'.encode()
+                return await send_shared(request, [head, snapshot.body, b"}"], JSON)
+        except NoSlot as error:
+            return unavailable(error)
 
     def _forbidden(self, operation: str) -> web.Response:
         hint = "" if self._token_hash else "; this proxy has no token"
@@ -165,15 +207,28 @@ class AdminServer:
     def _may_post(self, request: web.BaseRequest) -> bool:
         """Whether a caller may post.
 
-        A browser on this host is on loopback too; its ``Origin`` says for which page it calls.
+        A browser on this host is on loopback too. Its ``Origin`` says for which page it calls; an
+        image or a script of a page is asked for without one, but with ``Sec-Fetch-Site``.
         """
+        is_page = bool({"Origin", "Sec-Fetch-Site"} & request.headers.keys())
+        return self._knows_token(request) or (is_loopback(request.remote or "") and not is_page)
+
+    def _knows_token(self, request: web.BaseRequest) -> bool:
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
-        if self._token_hash and scheme == "Bearer":
-            # aiohttp keeps bytes that are no UTF-8 as surrogates.
-            token_hash = hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
-            if hmac.compare_digest(token_hash, self._token_hash):
-                return True
-        return is_loopback(request.remote or "") and "Origin" not in request.headers
+        if not self._token_hash or scheme != "Bearer":
+            return False
+        # aiohttp keeps bytes that are no UTF-8 as surrogates.
+        token_hash = hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
+        return hmac.compare_digest(token_hash, self._token_hash)
+
+
+async def _tell_health(_request: web.BaseRequest) -> web.Response:
+    return web.Response(text="ok\n")
+
+
+def _address(request: web.BaseRequest) -> str:
+    """The address that a request comes from."""
+    return plain_address(request.remote or "")
 
 
 class _BoundedServer(web.Server):
@@ -187,12 +242,19 @@ class _BoundedServer(web.Server):
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
         """Take a connection in, and end the oldest one of its source if that has too many."""
-        end_if_stalled(transport.get_extra_info("socket"))
+        sock = transport.get_extra_info("socket")
+        end_if_stalled(sock)
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         source = _source(handler)
         same_source = [c for c in self.connections if _source(c) == source]
         open_connections = [c for c in same_source if c.transport is not None]
         if len(open_connections) >= MOST_CONNECTIONS:  # those that end stay until the next turn
-            open_connections[0].force_close()
+            oldest = open_connections[0]
+            # Closing alone keeps what the reader has not taken until the kernel gives it up.
+            if oldest.transport is not None:
+                oldest.transport.abort()
+            oldest.force_close()
         super().connection_made(handler, transport)
 
 

@@ -19,6 +19,7 @@ from functools import partial
 from rosproxy.admin.doctor_finding import DoctorFinding
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.doctor.collect import collect_running
+from rosproxy.net.fair_slots import FairSlots
 from rosproxy.net.tasks import Tasks
 from rosproxy.page.graph_document import graph_document, relayed
 from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
@@ -39,12 +40,11 @@ PER_NODE = 6
 """Questions to each node in a round at most."""
 MOST_WATCHERS = 16
 """Pages that are open at the same time."""
+MOST_WATCHERS_EACH = 6
+"""The same from one address. Chromium and Firefox have six connections to a server at most, so that
+a person with many tabs has no more in any case."""
 LINGER = 10.0
 """Seconds for which it goes on after the last watcher: pages are loaded again, operators poll."""
-
-
-class TooManyWatchers(Exception):
-    """Nobody more is served; the message says so."""
 
 
 class Ended(Exception):
@@ -60,7 +60,9 @@ class Feed:
 
     def __init__(self, tasks: Tasks, make: Callable[[], AsyncGenerator[Json]]) -> None:
         self._tasks, self._make = tasks, make
-        self.watchers = 0
+        self.watchers = FairSlots(
+            "pages are open", MOST_WATCHERS, MOST_WATCHERS_EACH, "close one of them"
+        )
         self._newest: Json | None = None
         self._renewed = asyncio.Condition()
         self._making: asyncio.Task[None] | None = None
@@ -73,17 +75,16 @@ class Feed:
         return self._making is None
 
     @contextlib.contextmanager
-    def watching(self) -> Iterator[None]:
-        """As long as this lasts, documents are made. Raises TooManyWatchers, Ended."""
+    def watching(self, source: str) -> Iterator[None]:
+        """As long as this lasts, documents are made for an address. Raises NoSlot, Ended."""
         if self._closed:
             raise Ended
-        if self.watchers >= MOST_WATCHERS:
-            raise TooManyWatchers(f"{MOST_WATCHERS} pages are open already; close one of them")
-        self._enter()
         try:
-            yield
+            with self.watchers.slot(source):
+                self._begin()
+                yield
         finally:
-            self._leave()
+            self._end_later()
 
     async def after(self, former: Json | None, within: float) -> Json | None:
         """Another document than the ``former``; None if none comes ``within`` these seconds.
@@ -109,17 +110,15 @@ class Feed:
     def _is_news(self, former: Json | None) -> bool:
         return self._newest is not None and self._newest is not former
 
-    def _enter(self) -> None:
-        self.watchers += 1
+    def _begin(self) -> None:
         if self._ending:
             self._ending.cancel()
             self._ending = None
         if self._making is None or self._making.done():
             self._making = self._tasks.spawn(self._keep_making(), "the live page")
 
-    def _leave(self) -> None:
-        self.watchers -= 1
-        if not self.watchers and not self._closed:
+    def _end_later(self) -> None:
+        if not self.watchers.taken and not self._closed:
             self._ending = asyncio.get_running_loop().call_later(LINGER, self._end)
 
     def _end(self) -> None:

@@ -17,9 +17,12 @@ from urllib.parse import parse_qs
 
 from aiohttp import web
 
+from rosproxy.admin.replies import send_shared, unavailable, write_pieces
+from rosproxy.net.addresses import plain_address
+from rosproxy.net.fair_slots import NoSlot
 from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy.page.changes import changes
-from rosproxy.page.feed import Ended, Feed, TooManyWatchers
+from rosproxy.page.feed import Ended, Feed
 from rosproxy.page.page_document import Json
 from rosproxy.page.visitors import SESSION, Visitors, cookie_name
 
@@ -43,6 +46,7 @@ _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+_JSON_HEADERS = {**_HEADERS, "Content-Type": "application/json; charset=utf-8"}
 _FILES = {
     "/page.js": ("page.js", "text/javascript"),
     "/view.js": ("view.js", "text/javascript"),
@@ -58,6 +62,7 @@ class Page:
     def __init__(self, feed: Feed, visitors: Visitors) -> None:
         self.feed, self.visitors = feed, visitors
         self._encoded: tuple[Json | None, Json, bytes] | None = None
+        self._whole: tuple[Json, bytes] | None = None
 
     @property
     def routes(self) -> Mapping[tuple[str, str], Handler]:
@@ -115,11 +120,13 @@ class Page:
         if not self.visitors.may_look(request):
             return _refusal()
         try:
-            with self.feed.watching():
+            with self.feed.watching(_source(request)):
                 document = await self.feed.after(None, FIRST)
-        except (TooManyWatchers, Ended) as error:
+                if document is None:
+                    return _not_now()
+                return await send_shared(request, [self._encode(document)], _JSON_HEADERS)
+        except (NoSlot, Ended) as error:
             return _not_now(error)
-        return _not_now() if document is None else web.json_response(document, headers=_HEADERS)
 
     async def _stream(self, request: web.BaseRequest) -> web.StreamResponse:
         """The document and then, as long as the browser is there, what changes in it."""
@@ -131,10 +138,10 @@ class Page:
         response = web.StreamResponse(headers={**_HEADERS, "Cache-Control": "no-store"})
         response.content_type = "text/event-stream"
         try:
-            with self.feed.watching():
+            with self.feed.watching(_source(request)):
                 await response.prepare(request)
                 await self._send(response)
-        except TooManyWatchers as error:
+        except NoSlot as error:
             return _not_now(error)
         except (Ended, ConnectionError):
             pass
@@ -149,8 +156,15 @@ class Page:
         while True:
             newest = await self.feed.after(former, HEARTBEAT)
             # Of a comment, which is shorter, a browser tells the page nothing.
-            await response.write(_clock_event() if newest is None else self._event(former, newest))
+            event = _clock_event() if newest is None else self._event(former, newest)
+            await write_pieces(response, event)
             former = newest or former
+
+    def _encode(self, document: Json) -> bytes:
+        """A document as JSON, encoded once for all who ask for it."""
+        if self._whole is None or self._whole[0] is not document:
+            self._whole = document, json.dumps(document, separators=(",", ":")).encode()
+        return self._whole[1]
 
     def _event(self, former: Json | None, newest: Json) -> bytes:
         """An event. Most watchers have seen the same, so that it is encoded once."""
@@ -196,5 +210,9 @@ def _refusal() -> web.Response:
 
 
 def _not_now(reason: object = "") -> web.Response:
-    text = f"rosproxy: {reason or 'nothing is known yet; try again'}\n"
-    return web.Response(status=503, text=text, headers={**_HEADERS, "Retry-After": "10"})
+    return unavailable(reason or "nothing is known yet; try again", _HEADERS)
+
+
+def _source(request: web.BaseRequest) -> str:
+    """The address that a request comes from."""
+    return plain_address(request.remote or "")

@@ -10,15 +10,17 @@ import pytest
 from examples.demo.fake_master import FakeMaster
 from rosproxy.admin import status_changes
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.net import Reply, exchange, until
+from tests.integration.net import HOST, OUTSIDE, Reply, exchange, until
 from tests.integration.proxy import Proxy
 
 
-async def wait(proxy: Proxy, since: str = "", within: str = "60", *headers: str) -> Reply:
+async def wait(
+    proxy: Proxy, since: str = "", within: str = "60", *headers: str, source: str = OUTSIDE
+) -> Reply:
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     path = f"/status/changes?since={quote(since)}&within={within}"
     lines = [f"GET {path} HTTP/1.1", "Host: x", *headers, "", ""]
-    return await exchange(address, "\r\n".join(lines).encode())
+    return await exchange(address, "\r\n".join(lines).encode(), source)
 
 
 async def changes(proxy: Proxy, since: str = "", within: str = "60") -> tuple[str, dict[str, Any]]:
@@ -61,24 +63,43 @@ async def test_nonsense_is_no_time(make_proxy: MakeProxy, within: str) -> None:
 
 
 async def test_so_many_may_wait(make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who goes away makes room, and nobody is waited for when the proxy ends."""
+    """A caller that goes away makes room, and the end of the proxy ends the waiting."""
+    monkeypatch.setattr(status_changes, "POLL_INTERVAL", 0.01)
+    proxy = await make_proxy()
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
+    version, _ = await changes(proxy)
+    room = proxy.app._admin._changes
+    each = room.slots.each
+    some = [asyncio.create_task(wait(proxy, version)) for _ in range(each)]
+    await until(lambda: room.slots.taken == each, "all wait")
+    refused = await wait(proxy, version)
+    assert refused.status == 503
+    assert b"4 callers wait for a change from 127.0.1.9 already; ask /status" in refused.body
+    some[0].cancel()
+    await until(lambda: room.slots.taken < each, "there is room again")
+    room.end()
+    assert {(await task).status for task in some[1:]} == {200}
+
+
+async def test_one_address_does_not_take_all_places(
+    make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(status_changes, "POLL_INTERVAL", 0.01)
     proxy = await make_proxy()
     await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     version, _ = await changes(proxy)
     room = proxy.app._admin._changes
     some = [asyncio.create_task(wait(proxy, version)) for _ in range(status_changes.MOST_WAITING)]
-    await until(lambda: room._waiting == status_changes.MOST_WAITING, "all wait")
-    refused = await wait(proxy, version)
-    assert refused.status == 503
-    some[0].cancel()
-    await until(lambda: room._waiting < status_changes.MOST_WAITING, "there is room again")
+    await until(lambda: room.slots.taken == room.slots.each, "as many wait as may")
+    assert (await wait(proxy, "", "0", source=HOST)).status == 200
     room.end()
-    assert {(await task).status for task in some[1:]} == {200}
+    statuses = [(await task).status for task in some]
+    assert sorted(statuses) == [200] * 4 + [503] * 4
 
 
 async def test_no_web_page_may_wait(proxy: Proxy) -> None:
     assert (await wait(proxy, "", "0")).status == 200
-    refused = await wait(proxy, "", "0", "Origin: http://page.example")
-    assert refused.status == 403
-    assert refused.body.startswith(b"rosproxy: GET /status/changes is for callers on this host")
+    for header in ("Origin: http://page.example", "Sec-Fetch-Site: cross-site"):
+        refused = await wait(proxy, "", "0", header)
+        assert refused.status == 403
+        assert refused.body.startswith(b"rosproxy: GET /status/changes is for callers on this host")

@@ -4,7 +4,7 @@ import asyncio
 import json
 import re
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
 import aiohttp
@@ -13,6 +13,7 @@ import pytest
 from examples.demo.fake_http import value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
+from rosproxy.page.feed import MOST_WATCHERS, MOST_WATCHERS_EACH
 from tests.integration.admin_calls import post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -214,17 +215,33 @@ async def test_nobody_is_asked_while_nobody_looks(proxy: Proxy, node: FakeNode) 
     assert asked() == before
 
 
-async def test_so_many_pages_and_no_more(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosproxy.page.feed.MOST_WATCHERS", 1)
+async def test_so_many_pages_and_no_more(proxy: Proxy) -> None:
+    proxy.app.page.feed.watchers.most = 1
     async with opened(proxy):
         refused = await get(proxy, "/events")
         assert refused.status == 503
         assert refused.headers["retry-after"] == "10"
         assert b"1 pages are open already" in refused.body
         assert (await get(proxy, "/graph")).status == 503
-    await until(lambda: not proxy.app.page.feed.watchers, "it is noticed that the page has gone")
+    watchers = proxy.app.page.feed.watchers
+    await until(lambda: not watchers.taken, "it is noticed that the page has gone")
     async with opened(proxy) as page:
         await page.follow()
+
+
+async def test_one_address_does_not_have_all_pages(proxy: Proxy) -> None:
+    """One address held all sixteen, so that a person elsewhere saw none."""
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    watchers = proxy.app.page.feed.watchers
+    async with AsyncExitStack() as stack:
+        for _ in range(MOST_WATCHERS):
+            wire = await stack.enter_async_context(connect(address))
+            await wire.send(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert (await wire.reader.readline()).startswith(b"HTTP/1.1 ")
+        assert watchers.taken == MOST_WATCHERS_EACH < MOST_WATCHERS
+        assert (await get(proxy, "/graph")).status == 503
+        async with opened(proxy) as page:
+            await page.follow()
 
 
 async def test_a_page_that_reads_nothing_misses_documents_and_holds_few(
@@ -282,7 +299,7 @@ async def test_a_head_has_no_stream(proxy: Proxy) -> None:
     url = f"{admin_url(proxy)}/events"
     async with aiohttp.ClientSession() as session, session.head(url) as reply:
         assert reply.status == 200
-    assert not proxy.app.page.feed.watchers
+    assert not proxy.app.page.feed.watchers.taken
 
 
 async def test_the_proxy_stops_though_pages_are_open(proxy: Proxy) -> None:

@@ -1,0 +1,49 @@
+"""Replies of the admin endpoint and the live page whose bytes many readers share.
+
+A reader that takes nothing holds no copy: the bytes are written in pieces, each once the reader has
+taken most of the pieces before it, and a reader that is too slow is cut off.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Mapping, Sequence
+
+from aiohttp import web
+
+PIECE = 64 * 1024
+"""Bytes that are written at once; aiohttp waits for the reader after two of them at the latest."""
+REPLY_TIMEOUT = 60.0
+"""Seconds in which a reader must have taken a reply: 1 MiB at 140 kbit/s."""
+
+
+async def write_pieces(response: web.StreamResponse, body: bytes) -> None:
+    """Write bytes no faster than the reader takes them. Raises ConnectionError."""
+    shared = memoryview(body)
+    for start in range(0, len(shared), PIECE):
+        await response.write(shared[start : start + PIECE])
+
+
+async def send_shared(
+    request: web.BaseRequest, parts: Sequence[bytes], headers: Mapping[str, str]
+) -> web.StreamResponse:
+    """Send a reply with these bytes, one part after the other."""
+    response = web.StreamResponse(headers=headers)
+    response.content_length = sum(map(len, parts))
+    # A reader that has gone needs no reply.
+    with contextlib.suppress(ConnectionError):
+        try:
+            async with asyncio.timeout(REPLY_TIMEOUT):
+                await response.prepare(request)
+                for part in parts if request.method != "HEAD" else ():
+                    await write_pieces(response, part)
+                await response.write_eof()
+        except TimeoutError:
+            if request.transport is not None:
+                request.transport.abort()
+    return response
+
+
+def unavailable(reason: object, headers: Mapping[str, str] | None = None) -> web.Response:
+    """The reply to a caller that can't be served now."""
+    text = f"rosproxy: {reason}\n"
+    return web.Response(status=503, text=text, headers={**(headers or {}), "Retry-After": "10"})

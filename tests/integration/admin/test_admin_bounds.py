@@ -1,0 +1,167 @@
+"""What the admin endpoint is asked: how often, and by readers that take nothing."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from examples.demo.fake_node import FakeNode
+from rosproxy.admin.admin_server import MOST_CONNECTIONS, MOST_REPLIES, MOST_REPLIES_EACH
+from rosproxy.admin.replies import PIECE, REPLY_TIMEOUT
+from rosproxy.admin.status_bounds import MOST_BYTES
+from rosproxy.admin.status_document import ProblemStatus
+from tests.clock import pass_time
+from tests.integration.admin_calls import tell
+from tests.integration.net import HOST, OUTSIDE, Reply, Wire, connect, exchange, until
+from tests.integration.proxy import Proxy
+
+
+async def ask(
+    proxy: Proxy,
+    path: str,
+    *headers: str,
+    verb: str = "GET",
+    host: str = "x",
+    source: str = OUTSIDE,
+) -> Reply:
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    lines = [f"{verb} {path} HTTP/1.1", f"Host: {host}", *headers, "", ""]
+    return await exchange(address, "\r\n".join(lines).encode(), source)
+
+
+async def test_readers_that_ask_at_once_share_one_status(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = 0
+    state = proxy.app._admin._status
+
+    def counted() -> Any:
+        nonlocal made
+        made += 1
+        return state()
+
+    monkeypatch.setattr(proxy.app._admin, "_status", counted)
+    sources = [f"127.0.5.{number}" for number in range(MOST_REPLIES)]
+    replies = await asyncio.gather(*(ask(proxy, "/status", source=source) for source in sources))
+    assert {reply.status for reply in replies} == {200}
+    assert 0 < made < MOST_REPLIES / 2
+
+
+async def test_a_reader_sees_what_was_done_before_it_asked(proxy: Proxy, node: FakeNode) -> None:
+    for number in range(5):
+        await node.publish(proxy.master, f"/topic_{number}")
+        shown = json.loads((await ask(proxy, "/status")).body)
+        assert f"/topic_{number}" in shown["nodes"][0]["publishes"]
+        layer = {"name": f"layer {number}", "mode": "audit", "rules": ["deny publish /x"]}
+        await tell(proxy, "/policy", layers=[layer])
+        shown = json.loads((await ask(proxy, "/status")).body)
+        assert shown["policy"]["layers"][-1]["name"] == f"layer {number}"
+
+
+@pytest.fixture
+def large(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> Proxy:
+    """A proxy whose status is as large as it may be."""
+    state = proxy.app._admin._status
+    problems = (ProblemStatus(text="x" * 1000),) * 1000
+    monkeypatch.setattr(proxy.app._admin, "_status", lambda: replace(state(), problems=problems))
+    return proxy
+
+
+@asynccontextmanager
+async def stalled(proxy: Proxy, count: int, source: str = OUTSIDE) -> AsyncIterator[list[Wire]]:
+    """Readers that ask for the status and take nothing of it."""
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    async with AsyncExitStack() as stack:
+        wires = []
+        for _ in range(count):
+            wire = await stack.enter_async_context(connect(address, source))
+            wire.reader._transport.pause_reading()  # type: ignore[attr-defined]
+            await wire.send(b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n")
+            wires.append(wire)
+        yield wires
+
+
+def buffered(proxy: Proxy) -> list[int]:
+    """The bytes that the proxy keeps for each connection to its admin endpoint."""
+    runner = proxy.app._admin._runner
+    assert runner
+    assert runner.server
+    transports = [connection.transport for connection in runner.server.connections]
+    return [transport.get_write_buffer_size() for transport in transports if transport]
+
+
+async def test_a_reader_that_takes_nothing_has_no_copy_of_its_own(large: Proxy) -> None:
+    """Each had one: 32 readers of a status of 20 MB took 1.4 GB."""
+    replies = large.app._admin._replies
+    async with stalled(large, MOST_REPLIES_EACH) as wires:
+        await until(lambda: replies.taken == MOST_REPLIES_EACH, "they are served")
+        await until(lambda: all(buffered(large)), "they stall")
+        assert max(buffered(large)) <= 3 * PIECE
+        for wire in wires:
+            wire.reader._transport.resume_reading()  # type: ignore[attr-defined]
+            body = (await wire.reply()).body
+            assert len(body) > 0.9 * MOST_BYTES
+            assert len(json.loads(body)["problems"]) == 1000
+    await until(lambda: not replies.taken, "they have been served")
+
+
+async def test_one_address_keeps_nothing_from_others(large: Proxy) -> None:
+    replies = large.app._admin._replies
+    async with stalled(large, MOST_REPLIES_EACH):
+        await until(lambda: replies.taken == MOST_REPLIES_EACH, "they are served")
+        for path in ("/status", "/metrics"):
+            refused = await ask(large, path)
+            assert (refused.status, refused.headers["retry-after"]) == (503, "10")
+            assert b"4 replies with the status or the metrics are under way" in refused.body
+            assert b"read one to its end before you ask again" in refused.body
+            assert (await ask(large, path, source=HOST)).status == 200
+        assert (await ask(large, "/healthz")).status == 200
+        assert (await ask(large, "/readyz")).status in (200, 503)
+
+
+async def test_there_is_a_bound_for_all_addresses_together(large: Proxy) -> None:
+    replies = large.app._admin._replies
+    async with AsyncExitStack() as stack:
+        for number in range(MOST_REPLIES // MOST_REPLIES_EACH):
+            source = f"127.0.5.{number}"
+            await stack.enter_async_context(stalled(large, MOST_REPLIES_EACH, source))
+        await until(lambda: replies.taken == MOST_REPLIES, "they are served")
+        assert (await ask(large, "/status")).status == 503
+        assert (await ask(large, "/healthz")).status == 200
+
+
+async def test_a_reader_that_takes_nothing_is_cut_off(large: Proxy) -> None:
+    replies = large.app._admin._replies
+    async with stalled(large, 2) as wires:
+        await until(lambda: replies.taken == 2, "they are served")
+        await pass_time(REPLY_TIMEOUT + 1)
+        await until(lambda: not replies.taken, "they are given up")
+        wires[0].reader._transport.resume_reading()  # type: ignore[attr-defined]
+        with pytest.raises((ConnectionResetError, asyncio.IncompleteReadError)):
+            await wires[0].reply()
+
+
+async def test_a_connection_too_many_ends_the_oldest_with_what_it_has_not_taken(
+    large: Proxy,
+) -> None:
+    """It was closed in order: what was written for it stayed until the kernel gave it up."""
+    replies = large.app._admin._replies
+    address = (large.settings.admin.host, large.settings.admin.port)
+    async with stalled(large, 1), AsyncExitStack() as stack:
+        await until(lambda: any(buffered(large)), "it stalls")
+        for _ in range(MOST_CONNECTIONS):
+            await stack.enter_async_context(connect(address))
+        await until(lambda: not any(buffered(large)), "nothing is kept for it")
+        await until(lambda: not replies.taken, "it has been given up")
+
+
+async def test_a_head_has_no_body(proxy: Proxy) -> None:
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    async with connect(address) as wire:
+        for path in ("/status", "/metrics", "/healthz"):
+            await wire.send(f"HEAD {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+            assert (await wire.reply(head=True)).status == 200

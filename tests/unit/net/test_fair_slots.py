@@ -1,0 +1,29 @@
+"""Slots: so many in all, and no source has all of them."""
+
+import pytest
+
+from rosproxy.net.fair_slots import FairSlots, NoSlot
+
+NEAR, FAR = "192.0.2.1", "192.0.2.2"
+
+
+def test_a_source_has_its_share_and_leaves_the_rest_to_others() -> None:
+    slots = FairSlots("replies are under way", 3, 2, "read one")
+    with slots.slot(NEAR), slots.slot(NEAR):
+        with pytest.raises(
+            NoSlot, match=r"2 replies are under way from 192\.0\.2\.1 already; read"
+        ):
+            slots.slot(NEAR).__enter__()
+        with slots.slot(FAR):
+            assert slots.taken == 3
+            with pytest.raises(NoSlot, match=r"^3 replies are under way already; read one$"):
+                slots.slot("192.0.2.3").__enter__()
+
+
+def test_what_has_ended_makes_room() -> None:
+    slots = FairSlots("replies are under way", 1, 1)
+    for _ in range(3):
+        with pytest.raises(ValueError, match="a mistake"), slots.slot(NEAR):
+            raise ValueError("a mistake")
+    assert slots.taken == 0
+    assert not slots._taken
