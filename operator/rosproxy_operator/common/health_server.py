@@ -1,5 +1,9 @@
-"""The operator's own endpoint: /healthz, /readyz, /metrics, /status, and its proxies' live page."""
+"""The operator's own endpoint: /healthz, /readyz, /metrics, /status, and its proxies' live page.
 
+As at a proxy's endpoint, no path answers by a name that a stranger may have registered.
+"""
+
+import socket
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -8,6 +12,7 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
+from rosproxy.admin.host_rule import is_own_host, refusal
 from rosproxy.net.addresses import HostPort
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
@@ -16,6 +21,7 @@ from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.proxy_client import Json
 
 Check = Callable[[], str | None]
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 GetStatus = Callable[[], Awaitable[Json]]
 """Makes the document at ``/status``; raises LookFailed."""
 
@@ -35,7 +41,7 @@ class HealthServer:
         status: GetStatus | None = None,
     ) -> None:
         self._page = page
-        app = web.Application()
+        app = web.Application(middlewares=[_refuse_strangers_names])
         for (method, path), handler in page.routes.items():
             app.router.add_route(method, path, handler)
         app.router.add_get("/healthz", partial(_check, alive))
@@ -59,6 +65,15 @@ class HealthServer:
         """Stop listening."""
         await self._page.close()
         await self._runner.cleanup()
+
+
+@web.middleware
+async def _refuse_strangers_names(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Answer no request by a name that a stranger may have registered; see `host_rule`."""
+    host = request.headers.get("Host", "")
+    if is_own_host(host, {socket.gethostname().lower()}):
+        return await handler(request)
+    return web.Response(status=403, text=refusal(host))
 
 
 async def _check(check: Check, request: web.Request) -> web.Response:

@@ -72,7 +72,12 @@ class AdminClient:
     def _ask(self, method: str, path: str, within: float) -> str:
         connection = http.client.HTTPConnection(self.server.host, self.server.port, timeout=within)
         try:
-            connection.request(method, path, headers=_authorization())
+            connection.connect()
+            # The address, and not the name: the endpoint refuses names that it does not know as its
+            # own (`rosproxy.admin.host_rule`).
+            address, port = connection.sock.getpeername()[:2]
+            headers = {"Host": str(HostPort(address, port)), **_authorization()}
+            connection.request(method, path, headers=headers)
             reply = connection.getresponse()
             text = reply.read(MAX_REPLY).decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:

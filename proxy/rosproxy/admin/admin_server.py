@@ -4,7 +4,8 @@ GET only reads, and is open to whoever reaches the endpoint, which is on loopbac
 live page, whose routes it is given, decides by itself whom it answers (`rosproxy.page`). POST
 changes things: it is for callers on loopback that are no web page, and for those that know the
 token, of which only the hash is held here. So is waiting for a change (`status_changes`). Each
-path of a POST has an action; actions wait for each other as far as they have to.
+path of a POST has an action; actions wait for each other as far as they have to. No path answers a
+request by a name that a stranger may have registered (`host_rule`).
 
 Callers are few and friendly, so its bounds are tight and no options: a source with too many
 connections loses its oldest, and a caller that sends half a request or reads no reply is cut off.
@@ -19,7 +20,7 @@ import hmac
 import json
 import logging
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +28,7 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
+from rosproxy.admin.host_rule import is_own_host, refusal
 from rosproxy.admin.replies import send_shared, unavailable
 from rosproxy.admin.requests import BodyError
 from rosproxy.admin.shared_document import SharedDocument
@@ -75,7 +77,8 @@ class AdminServer:
     ``status`` is the state; ``unready`` gives the reason why the proxy is not ready, None if it is;
     ``actions`` are what paths do when something is posted there; ``token_hash``, a SHA-256 in hex
     digits, is that of the token with which callers from elsewhere than loopback may post.
-    ``routes`` are served besides, by method and path.
+    ``routes`` are served besides, by method and path; ``own_names`` are those that the proxy is
+    known by, in lower case.
     """
 
     _metrics: CollectorRegistry
@@ -84,6 +87,7 @@ class AdminServer:
     _actions: Mapping[str, Action]
     _token_hash: str | None
     _routes: Mapping[tuple[str, str], Handler]
+    _own_names: Collection[str] = ()
     _runner: web.ServerRunner | None = None
     _snapshots: SharedDocument[StatusSnapshot] = field(init=False)
     _exposition: SharedDocument[bytes] = field(init=False)
@@ -118,6 +122,8 @@ class AdminServer:
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         method = "GET" if request.method == "HEAD" else request.method
         page, route = self._pages().get(request.path), self._routes.get((method, request.path))
+        if not self._answers_by_that_name(request, route):
+            return web.Response(status=403, text=refusal(request.headers.get("Host", "")))
         if page is not None and method == "GET":
             return await page(request)
         if route is not None:
@@ -132,6 +138,15 @@ class AdminServer:
         methods = ",".join(sorted(allowed | ({"HEAD"} if "GET" in allowed else set())))
         text = "405: Method Not Allowed"
         return web.Response(status=405, text=text, headers={"Allow": methods})
+
+    def _answers_by_that_name(self, request: web.BaseRequest, route: Handler | None) -> bool:
+        """Whether the ``Host`` of a request is one to answer by; see `host_rule`.
+
+        Where a token is set the live page asks for it by itself, in a form and by any name.
+        """
+        asks_itself = route is not None and self._token_hash is not None
+        is_own = is_own_host(request.headers.get("Host", ""), self._own_names)
+        return is_own or asks_itself or self._knows_token(request)
 
     def _pages(self) -> dict[str, Handler]:
         return {

@@ -59,6 +59,7 @@ class App:
             },
             settings.token_hash,
             self.page.routes,
+            _own_names(settings),
         )
 
     def _make_page(self) -> Page:
@@ -68,7 +69,8 @@ class App:
         def look() -> AsyncGenerator[dict[str, Any]]:
             return PageWatch(self.state, lambda: self._check.findings, admin).documents()
 
-        return Page(Feed(runtime.tasks, look), Visitors(settings.token_hash, runtime.now))
+        visitors = Visitors(settings.token_hash, runtime.now, own_names=_own_names(settings))
+        return Page(Feed(runtime.tasks, look), visitors)
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
@@ -121,6 +123,11 @@ class App:
 
     def _unready(self) -> str | None:
         return next(filter(None, (stack.unready() for stack in self.stacks)), None)
+
+
+def _own_names(settings: Settings) -> frozenset[str]:
+    """The names that the proxy is known by, in lower case."""
+    return frozenset({settings.advertise_host.lower(), socket.gethostname().lower()})
 
 
 def _together(actions: list[Action]) -> Action:

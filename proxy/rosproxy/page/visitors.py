@@ -6,20 +6,20 @@ port of the host. So it is given once, in a form, for a cookie that lets look an
 minute, so that no token stands in an address. All of them are random, and kept here as hashes.
 
 Without a token the page is for whoever reaches the endpoint, as ``/status`` is; but not for pages
-of strangers, whose name may lead here (DNS rebinding): the host that is asked for must be an
-address or a name that nobody can have registered.
+of strangers (`rosproxy.admin.host_rule`).
 """
 
 import hashlib
 import hmac
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from aiohttp import web
 
+from rosproxy.admin.host_rule import is_own_host
 from rosproxy.admin.requests import EmptyBody, read_body
-from rosproxy.net.addresses import is_address, is_loopback, parse_authority
+from rosproxy.net.addresses import is_loopback
 
 SESSION = 12 * 3600.0
 """Seconds for which a cookie is good."""
@@ -27,8 +27,6 @@ KEY = 60.0
 """Seconds in which a key must be used."""
 MOST = 64
 """Cookies, and keys, that are good at the same time; the oldest goes first."""
-LOCAL = (".localhost", ".local", ".internal")
-"""Ends of names that are nobody's on the Internet."""
 
 
 class ExpiringTokens:
@@ -68,13 +66,19 @@ class ExpiringTokens:
 class Visitors:
     """Decides who may look. ``token_hash``: the SHA-256 of the token, in hex digits.
 
-    ``local``: without one only callers on loopback may.
+    ``local``: without one only callers on loopback may. ``own_names`` are those that the endpoint
+    is known by, in lower case.
     """
 
     def __init__(
-        self, token_hash: str | None, now: Callable[[], float], local: bool = False
+        self,
+        token_hash: str | None,
+        now: Callable[[], float],
+        local: bool = False,
+        own_names: Collection[str] = (),
     ) -> None:
         self._token_hash, self._local = token_hash, local
+        self._own_names = own_names
         self._sessions, self._keys = ExpiringTokens(SESSION, now), ExpiringTokens(KEY, now)
 
     def may_look(self, request: web.BaseRequest) -> bool:
@@ -86,7 +90,7 @@ class Visitors:
             return True
         open_to_all = self._token_hash is None and not self._local
         return (open_to_all or is_loopback(request.remote or "")) and is_own_host(
-            request.headers.get("Host", "")
+            request.headers.get("Host", ""), self._own_names
         )
 
     @property
@@ -129,13 +133,6 @@ def cookie_name(request: web.BaseRequest) -> str:
     _, _, port = request.headers.get("Host", "").rpartition(":")
     # The header is the caller's: only digits of it may get into a cookie's name.
     return f"rosproxy-{port}" if port.isascii() and port.isdecimal() else "rosproxy"
-
-
-def is_own_host(host: str) -> bool:
-    """Whether the ``Host`` of a request is none that a stranger may have registered."""
-    host_port = parse_authority(f"//{host}")
-    name = (host_port.host if host_port else host.partition(":")[0]).lower().rstrip(".")
-    return is_address(name.strip("[]")) or "." not in name or name.endswith(LOCAL)
 
 
 def _hash(text: str) -> str:

@@ -1,7 +1,8 @@
-"""What the admin endpoint is asked: how often, and by readers that take nothing."""
+"""What the admin endpoint is asked: by which name, how often, and by readers that take nothing."""
 
 import asyncio
 import json
+import socket
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
@@ -10,14 +11,21 @@ import pytest
 from msgspec.structs import replace
 
 from examples.demo.fake_node import FakeNode
+from rosproxy.admin.admin_client import AdminClient
 from rosproxy.admin.admin_server import MOST_CONNECTIONS, MOST_REPLIES, MOST_REPLIES_EACH
 from rosproxy.admin.replies import PIECE, REPLY_TIMEOUT
 from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.admin.status_document import ProblemStatus
 from tests.clock import pass_time
 from tests.integration.admin_calls import tell
+from tests.integration.conftest import MakeProxy
 from tests.integration.net import HOST, OUTSIDE, Reply, Wire, connect, exchange, until
 from tests.integration.proxy import Proxy
+
+TOKEN = "0123456789abcdef"
+STRANGE = "evil.example:11312"
+GETS = ("/", "/graph", "/events", "/page.js", "/status", "/status/changes", "/metrics")
+POSTS = ("/containers", "/policy", "/probe", "/retire", "/page-key", "/login")
 
 
 async def ask(
@@ -31,6 +39,44 @@ async def ask(
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     lines = [f"{verb} {path} HTTP/1.1", f"Host: {host}", *headers, "", ""]
     return await exchange(address, "\r\n".join(lines).encode(), source)
+
+
+@pytest.mark.parametrize("path", [*GETS, "/healthz", "/readyz", "/nothing"])
+async def test_a_strangers_name_is_refused_at_every_path(proxy: Proxy, path: str) -> None:
+    """A web page whose name leads here read /status and /metrics."""
+    refused = await ask(proxy, path, host=STRANGE)
+    assert refused.status == 403
+    assert refused.body.startswith(b"rosproxy: evil.example:11312: the admin endpoint does not")
+
+
+@pytest.mark.parametrize("path", POSTS)
+async def test_a_strangers_name_is_refused_for_actions(proxy: Proxy, path: str) -> None:
+    assert (await ask(proxy, path, "Content-Length: 0", verb="POST", host=STRANGE)).status == 403
+
+
+async def test_a_name_that_the_proxy_is_known_by(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(advertise_host="robot.lab.example")
+    assert (await ask(proxy, "/status", host="Robot.lab.example:11312")).status == 200
+    assert (await ask(proxy, "/", host="robot.lab.example:11312")).status == 200
+    assert (await ask(proxy, "/status", host="lab.example")).status == 403
+
+
+async def test_the_token_is_good_by_any_name(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    for path in ("/status", "/metrics", "/status/changes", "/graph"):
+        good = await ask(proxy, path, f"Authorization: Bearer {TOKEN}", host=STRANGE)
+        assert good.status == 200
+        wrong = await ask(proxy, path, "Authorization: Bearer wrong", host=STRANGE)
+        assert wrong.status == 403
+    form = await ask(proxy, "/", host=STRANGE)
+    assert (form.status, b'name="token"' in form.body) == (401, True)
+
+
+async def test_a_hostile_name_is_repeated_in_short_and_harmless(proxy: Proxy) -> None:
+    refused = await ask(proxy, "/status", host=f"evil\x9b.{'x' * 5000}.example")
+    assert refused.status == 403
+    assert refused.body.isascii() or refused.body.decode().replace("\n", "").isprintable()
+    assert len(refused.body) < 500
 
 
 async def test_readers_that_ask_at_once_share_one_status(
@@ -165,3 +211,20 @@ async def test_a_head_has_no_body(proxy: Proxy) -> None:
         for path in ("/status", "/metrics", "/healthz"):
             await wire.send(f"HEAD {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
             assert (await wire.reply(head=True)).status == 200
+
+
+async def test_our_own_commands_may_name_the_proxy_as_they_like(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They send the address: ``rosproxy status --admin robot.example:11312`` goes on working."""
+    host, port = proxy.settings.admin.host, proxy.settings.admin.port
+
+    def resolve(name: str, *rest: Any, **options: Any) -> Any:
+        assert name == "robot.example"
+        return original(host, *rest, **options)
+
+    original = socket.getaddrinfo
+    monkeypatch.setattr(socket, "getaddrinfo", resolve)
+    client = AdminClient(f"http://robot.example:{port}")
+    status = await asyncio.to_thread(client.status)
+    assert status.instance == proxy.app.runtime.instance

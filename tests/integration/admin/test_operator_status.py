@@ -112,3 +112,15 @@ async def test_it_is_json(operator: RunningOperator) -> None:
         session.get(f"http://{operator.address}/status") as reply,
     ):
         assert json.loads(await reply.read()) == DOCUMENT
+
+
+async def test_a_strangers_name_is_refused_at_every_path(operator: RunningOperator) -> None:
+    """A web page whose name leads here read /metrics and /readyz."""
+    url = f"http://{operator.address}"
+    async with aiohttp.ClientSession() as session:
+        for path in ("/healthz", "/readyz", "/metrics", "/status", "/", "/page.js"):
+            async with session.get(f"{url}{path}", headers={"Host": "evil.example"}) as refused:
+                assert refused.status == 403
+                assert "does not answer by this name" in await refused.text()
+            async with session.get(f"{url}{path}", headers={"Host": "localhost:1"}) as good:
+                assert good.status == 200
