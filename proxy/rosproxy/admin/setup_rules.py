@@ -11,7 +11,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warnin
 from rosproxy.admin.requests import PortProbe, RangeProbe
 from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus
 from rosproxy.net.addresses import is_loopback
-from rosproxy.telemetry.text import listed, plural
+from rosproxy.telemetry.text import listed, plural, quoted
 
 FEW_FREE = 0.1
 """Share of the range that should be free at least."""
@@ -134,17 +134,18 @@ def _reached(host: str, from_proxy: str, from_master: str, target: str) -> Docto
         "(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz"
     )
     # `target` ends with the last port that was tried.
-    return error(RANGE, RANGE, text, f"{fix} {host} {target.rpartition(' ')[2]}")
+    return error(RANGE, RANGE, text, f"{fix} {quoted(host)} {target.rpartition(' ')[2]}")
 
 
 def _not_reached(
     host: str, ports: PortsStatus, from_proxy: str, from_master: str, target: str, is_uniform: bool
 ) -> DoctorFinding:
-    fix = f"docker run -p {ports.advertise}:{ports.listen}"
+    published = quoted(f"{ports.advertise}:{ports.listen}")
+    fix = f"docker run -p {published}"
     if from_proxy == "unresolvable":
         fix = BY_ADDRESS
     elif is_uniform:
-        fix += f", and let it through the firewall; or correct --advertise-host, now {host}"
+        fix += f", and let it through the firewall; or correct --advertise-host, now {quoted(host)}"
     else:
         fix = f"publish the whole range: {fix}"
     text = f"{target}: {TEXT_BY_OUTCOME.get(from_proxy, from_proxy)}"
@@ -167,5 +168,6 @@ def _by_udp(host: str, ports: PortsStatus, from_proxy: str, target: str) -> Doct
         f"{target}: what the proxy sends there by UDP does not come back to it. Perhaps only the "
         "way back is missing; perhaps the range is not published for UDP, or a firewall drops it"
     )
-    fix = f"if nobody outside is heard: docker run -p {ports.advertise}:{ports.listen}/udp; is "
-    return note(RANGE, RANGE, text, f"{fix}--advertise-host {host} this host?")
+    published = quoted(f"{ports.advertise}:{ports.listen}/udp")
+    fix = f"if nobody outside is heard: docker run -p {published}; is "
+    return note(RANGE, RANGE, text, f"{fix}--advertise-host {quoted(host)} this host?")

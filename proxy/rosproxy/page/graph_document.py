@@ -37,6 +37,7 @@ from rosproxy.page.page_document import (
     shown_text,
 )
 from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.telemetry.text import quoted
 
 MASTER, PROXY = "master", "rosproxy"
 """Keys of what is no node: names of those begin with a slash."""
@@ -259,11 +260,11 @@ class _Ros1Links:
         )
         _, port = self._way(key)
         host = self._status.settings.advertise_host
-        fix = f"look at the network of {subscriber}"
+        fix = f"look at the network of {quoted(subscriber)}"
         if subscriber in self._inside:
-            fix = f"restart {subscriber}"
+            fix = f"restart {quoted(subscriber)}"
         elif port:
-            fix = f"on the machine of {subscriber}: nc -vz {host} {port}; "
+            fix = f"on the machine of {quoted(subscriber)}: nc -vz {quoted(host)} {port}; "
             fix += "a firewall or a broken network"
         return error("pair", f"{topic} from {publisher} to {subscriber}", text, fix)
 

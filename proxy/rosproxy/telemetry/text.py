@@ -5,12 +5,16 @@ and `rosproxy.cli.terminal` prints them. Names of nodes and topics are whatever 
 are, so that `clean` comes before everything else.
 """
 
+import shlex
 import textwrap
 from collections.abc import Iterable
 from itertools import pairwise
 
 from rich.cells import cell_len
 
+LONGEST_QUOTED = 120
+"""Characters of a name in a cure. Five of them fit where a cure is shortened (`brief`), which would
+otherwise take a closing quote."""
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 
@@ -36,6 +40,15 @@ def brief(text: object, most: int) -> str:
         shown = _without_middle(shown, most)
     shown = clean(shown)
     return shown if len(shown) <= most else _without_middle(shown, most)
+
+
+def quoted(name: str) -> str:
+    """A name as one word of a shell: an engineer pastes commands that nodes have chosen names in.
+
+    Names of real nodes and topics stay as they are. NAME stands for one that is too long.
+    """
+    word = shlex.quote(clean(name))
+    return word if len(word) <= LONGEST_QUOTED else "NAME"
 
 
 def width(text: str) -> int:

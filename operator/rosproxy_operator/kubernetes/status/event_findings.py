@@ -10,7 +10,7 @@ from datetime import datetime
 import msgspec
 
 from rosproxy.admin.doctor_finding import DoctorFinding, note, warning
-from rosproxy.telemetry.text import brief, duration
+from rosproxy.telemetry.text import brief, duration, quoted
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import KIND
@@ -73,7 +73,9 @@ def event_findings(
         elif event.uid in ready:
             yield note(_CHECK, subject, f"{text} (it is ready now)")
         else:
-            fix = f"kubectl -n {event.id.namespace} describe pod {event.id.name}"
+            # The name in an Event is any text that the author of the Event has chosen.
+            namespace = quoted(event.id.namespace)
+            fix = f"kubectl -n {namespace} describe pod {quoted(event.id.name)}"
             yield warning(_CHECK, subject, text, fix)
 
 

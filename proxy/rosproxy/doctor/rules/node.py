@@ -12,7 +12,7 @@ from rosproxy.doctor.facts import DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
-from rosproxy.telemetry.text import plural
+from rosproxy.telemetry.text import plural, quoted
 
 INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
 TWO_PROXIES = "two proxies"
@@ -87,7 +87,7 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
     if state in ("refused", "silent", "failing", "ok") and _only_on_loopback(node):
         text = f"calls itself {node.uri} and so listens on loopback only: nobody can reach it"
         host = address.rpartition(":")[0]
-        fix = f"where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP={host}; then restart it"
+        fix = f"where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP={quoted(host)}; then restart it"
         yield error(INSIDE, name, text, fix)
     elif state == "refused":
         after = facts.proxy.settings.cleanup_after
@@ -99,7 +99,8 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
         yield warning(INSIDE, name, text, "look again in some seconds")
     elif state == "silent":
         text = f"does not answer at {address}: it hangs, or something drops the packets"
-        fix = f"restart it; from the proxy: nc -vz {address.replace(':', ' ')}"
+        host, _, port = address.rpartition(":")
+        fix = f"restart it; from the proxy: nc -vz {quoted(host)} {quoted(port)}"
         yield error(INSIDE, name, text, fix)
     elif state == "unverified":
         text = f"was found at the master when the proxy started; {address} has not answered yet"
@@ -181,7 +182,7 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
         yield _unresolvable(facts, node, slave)
     elif reach is ReachOutcome.SILENT:
         text = f"no answer at {node.uri}: it hangs, or its machine is off or cut off"
-        fix = f"from here: nc -vz {slave.host} {slave.port}; if it is gone: {CLEANUP}"
+        fix = f"from here: nc -vz {quoted(slave.host)} {slave.port}; if it is gone: {CLEANUP}"
         yield error(OUTSIDE, node.name, text, fix)
     elif node.attempt.failed:
         reason = f" ({node.attempt.reason})" if node.attempt.reason else ""
@@ -200,25 +201,28 @@ def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> Docto
     if _CONTAINER_ID.fullmatch(slave.host):
         text += ". It looks like a container that uses the real master instead of the proxy"
         return error(OUTSIDE, node.name, text, _start_inside(facts))
+    host = quoted(slave.host)
     fix = (
-        f"where it runs: ROS_IP=ADDRESS, then restart it; or make {slave.host} known to proxy and "
-        f"inside nodes: docker run --add-host {slave.host}:ADDRESS"
+        f"where it runs: ROS_IP=ADDRESS, then restart it; or make {host} known to proxy and "
+        f"inside nodes: docker run --add-host {host}:ADDRESS"
     )
     return error(OUTSIDE, node.name, text, fix)
 
 
 def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
     """Cleaning up would lose nodes that a proxy takes back when it starts again."""
+    host = quoted(slave.host)
     if node.attempt.reach is ReachOutcome.UNRESOLVABLE:
-        return f"start its proxy with --advertise-host ADDRESS instead of the name {slave.host}"
+        return f"start its proxy with --advertise-host ADDRESS instead of the name {host}"
     if facts.status is None:
         return (
-            f"on {slave.host}: rosproxy doctor. Does the proxy run there, does the firewall let "
+            f"on {host}: rosproxy doctor. Does the proxy run there, does the firewall let "
             "its ports through? Started again with the same ports it takes its nodes back"
         )
     return (
-        f"if this proxy had {slave} before, start it with its old --advertise-host and "
-        f"--port-range, or restart the node; if it is of another proxy, look there; else {CLEANUP}"
+        f"if this proxy had {quoted(str(slave))} before, start it with its old --advertise-host "
+        "and --port-range, or restart the node; if it is of another proxy, look there; else "
+        f"{CLEANUP}"
     )
 
 

@@ -7,7 +7,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
-from rosproxy.telemetry.text import listed, size
+from rosproxy.telemetry.text import listed, quoted, size
 
 PAIR, ANY = "pair", "*"
 
@@ -28,7 +28,8 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
     if scope.named_nodes and len(together) > 1 and not scope.pairs:
         text = "none publishes what another of them subscribes to"
-        fix = f"compare: rosnode info {' '.join(together)}; look for namespaces and remappings"
+        nodes = " ".join(map(quoted, together))
+        fix = f"compare: rosnode info {nodes}; look for namespaces and remappings"
         yield error(PAIR, " and ".join(together), text, fix)
 
 
@@ -51,8 +52,8 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
     text = f"{verb} by {listed(graph.sides(topic))}; nobody {lacks} it"
     topics = sorted(graph.topics - {topic})
     alike = [t for t in topics if t.rpartition("/")[2] == topic.rpartition("/")[2]]
-    fix = f"there is also {listed(alike)}: a namespace or remapping? " if alike else ""
-    fix += f"rostopic info {topic}; after a restart of roscore, restart the nodes outside"
+    fix = f"there is also {listed(map(quoted, alike))}: a namespace or remapping? " if alike else ""
+    fix += f"rostopic info {quoted(topic)}; after a restart of roscore, restart the nodes outside"
     return (error if topic in facts.names else note)(PAIR, topic, text, fix)
 
 
@@ -94,17 +95,23 @@ def _why(
     """Why a pair is not connected, the most certain reason first, and what mends it."""
     for node in (publisher, subscriber):
         if _unreachable(facts, node):
-            return f"{node.name} can't be reached from here", f"see the finding about {node.name}"
+            return (
+                f"{node.name} can't be reached from here",
+                f"see the finding about {quoted(node.name)}",
+            )
     # A node that could not be asked is taken to fit. A subscriber to any type has * as its
     # type (rospy.AnyMsg).
     offered = publisher.report.publishes.get(topic) if publisher.report else ANY
     wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY
     if offered is None:
-        return f"{publisher.name} says that it does not publish it", f"restart {publisher.name}"
+        return (
+            f"{publisher.name} says that it does not publish it",
+            f"restart {quoted(publisher.name)}",
+        )
     if wanted is None:
         return (
             f"{subscriber.name} says that it is not subscribed to it",
-            f"restart {subscriber.name}",
+            f"restart {quoted(subscriber.name)}",
         )
     if ANY not in (offered, wanted) and offered != wanted:
         return f"types differ, {offered} and {wanted}", "use the same message type on both sides"
@@ -123,29 +130,30 @@ def _why_no_transport(
 ) -> tuple[str, str]:
     address, attempt = facts.data_ports.get((publisher.name, topic), ("", Attempt()))
     target = parse_host_port(address)
-    restart = f"restart {subscriber.name}"
+    restart = f"restart {quoted(subscriber.name)}"
     if attempt.failed:
         description = (
             f"{publisher.name} gives {address or 'nothing'} as its data port, {attempt.reach.value}"
         )
-        set_ip = f"where {publisher.name} runs: ROS_IP=ADDRESS and no firewall, then restart it"
+        set_ip = "ROS_IP=ADDRESS and no firewall, then restart it"
+        set_ip = f"where {quoted(publisher.name)} runs: {set_ip}"
         return f"{description} ({attempt.reason})" if attempt.reason else description, set_ip
     elsewhere = not facts.is_ours(publisher.slave) and not local_master(facts)
     if target and is_loopback(target.host) and elsewhere:
         text = f"{publisher.name} gives {address} as its data port, which is loopback"
-        return text, f"where {publisher.name} runs: ROS_IP=ADDRESS, then restart it"
+        return text, f"where {quoted(publisher.name)} runs: ROS_IP=ADDRESS, then restart it"
     if facts.is_ours(publisher.slave) and not facts.is_ours(subscriber.slave) and publisher.slave:
         slave = publisher.slave
         return (
             f"{publisher.name} is behind the proxy and fine; "
             f"{subscriber.name} has not connected to {slave}",
-            f"on the machine of {subscriber.name}: "
-            f"nc -vz {slave.host} {slave.port}; then {restart}",
+            f"on the machine of {quoted(subscriber.name)}: "
+            f"nc -vz {quoted(slave.host)} {slave.port}; then {restart}",
         )
     if facts.is_ours(subscriber.slave) and not facts.is_ours(publisher.slave):
         return _why_not_from_inside(facts, address, publisher, subscriber)
     text = "both answer and their types fit; perhaps their message definitions differ (md5sum)"
-    return text, f"look into the log of {subscriber.name}; {restart}"
+    return text, f"look into the log of {quoted(subscriber.name)}; {restart}"
 
 
 def _why_not_from_inside(
@@ -154,20 +162,22 @@ def _why_not_from_inside(
     """Why a subscriber behind the proxy has not connected to a publisher that is well."""
     text = f"{publisher.name} is fine; {subscriber.name}, behind the proxy, has not connected to"
     differ = "or their message definitions differ (md5sum)"
-    log = f"look into the log of {subscriber.name}"
+    log = f"look into the log of {quoted(subscriber.name)}"
     if facts.proxy.settings.direction == "both":
         text = f"{text} the proxy's port for {publisher.uri}, {differ}"
-        fix = f"{log} and of the proxy; restart {subscriber.name}"
+        fix = f"{log} and of the proxy; restart {quoted(subscriber.name)}"
         if not facts.proxy.settings.udp:
             fix += "; if it wants UDP alone: --udp (label rosproxy.udp=true, spec.udp: true)"
         return text, fix
     target = parse_host_port(address)
-    test = f"nc -vz {target.host} {target.port}" if target else f"a connection to {publisher.uri}"
+    test = f"a connection to {quoted(publisher.uri)}"
+    if target:
+        test = f"nc -vz {quoted(target.host)} {target.port}"
     return (
         f"{text} {address or publisher.uri} by itself, {differ}",
-        f"where {subscriber.name} runs: {test}; if there is no route outwards, the proxy can be "
-        "the way: --direction both (label rosproxy.direction=both, spec.direction: Both); else "
-        f"{log}",
+        f"where {quoted(subscriber.name)} runs: {test}; if there is no route outwards, the proxy "
+        "can be the way: --direction both (label rosproxy.direction=both, spec.direction: Both); "
+        f"else {log}",
     )
 
 
@@ -177,7 +187,8 @@ def _service(facts: DoctorFacts, service: str) -> DoctorFinding:
     text = f"{providers} provides it at {uri}: {attempt.reach.value}"
     if not attempt.failed:
         return ok(PAIR, service, text)
-    fix = f"restart {providers}; if it is gone: rosnode cleanup"
+    shown = listed(map(quoted, facts.system.services.get(service, ())))
+    fix = f"restart {shown}; if it is gone: rosnode cleanup"
     if attempt.reach is ReachOutcome.UNRESOLVABLE:
-        fix = f"where {providers} runs: ROS_IP=ADDRESS, then restart it"
+        fix = f"where {shown} runs: ROS_IP=ADDRESS, then restart it"
     return error(PAIR, service, text, fix)

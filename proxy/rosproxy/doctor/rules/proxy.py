@@ -8,7 +8,7 @@ from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, 
 from rosproxy.admin.status_bounds import left_out
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
 from rosproxy.net.addresses import is_loopback
-from rosproxy.telemetry.text import duration
+from rosproxy.telemetry.text import duration, quoted
 
 _OTHER_URI = "give the real master's address: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
 
@@ -79,13 +79,13 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
     match master.attempt.reach:
         case ReachOutcome.UNRESOLVABLE:
             text = f"{uri}: the host name {host} can't be resolved here"
-            add_host = f"docker run --add-host {host}:ADDRESS, in Kubernetes hostAliases"
+            add_host = f"docker run --add-host {quoted(host)}:ADDRESS, in Kubernetes hostAliases"
             return text, f"{add_host}; or {by_address}"
         case ReachOutcome.STRANGER if master.at_root:
             text = f"a master answers there, but not at the path {split_uri.path}"
             return (
                 f"{uri}: {text} (it knows only / and /RPC2)",
-                f"--master-uri http://{split_uri.netloc}/",
+                f"--master-uri {quoted(f'http://{split_uri.netloc}/')}",
             )
         case ReachOutcome.STRANGER:
             text = f"{uri}: what answers there is no ROS master ({master.attempt.reason})"
@@ -95,9 +95,9 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
             return text, f"{by_address} with an address of the master's machine"
         case ReachOutcome.REFUSED:
             text = f"{uri} refuses connections: no roscore runs there"
-            return text, f"on {host}: roscore -p {port}; or {_OTHER_URI}"
+            return text, f"on {quoted(host)}: roscore -p {port}; or {_OTHER_URI}"
     text = "its machine is down or cut off, a firewall drops it, or the address is wrong"
-    fix = f"from here: nc -vz {host} {port}; on {host}: rosnode list"
+    fix = f"from here: nc -vz {quoted(host)} {port}; on {quoted(host)}: rosnode list"
     return f"{uri} does not answer: {text}", fix
 
 
@@ -155,5 +155,6 @@ def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         yield error(check, check, text, f"docker run -p {port}:{port}")
     else:
         text += ". From here that proves little: no port of this host was reached"
-        fix = f"docker run -p {port}:{port}; to try outside: nc -vz {facts.advertise_host} {port}"
+        host = quoted(facts.advertise_host)
+        fix = f"docker run -p {port}:{port}; to try outside: nc -vz {host} {port}"
         yield warning(check, check, text, fix)

@@ -11,7 +11,13 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
-from rosproxy_operator.kubernetes.status.event_findings import MOST, event_findings, recent_events
+from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.status.event_findings import (
+    MOST,
+    RecentEvent,
+    event_findings,
+    recent_events,
+)
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, proxy_obj, rosproxy_obj
@@ -225,3 +231,19 @@ async def test_of_pods_that_are_gone_nothing_is_told(server: ApiServer, api: Api
     forbid(server, "events", "")
     assert await in_thread(facts.events, [of], [proxy]) == []
     assert "list events -A" in facts.refused[0].text
+
+
+def test_the_name_in_an_event_is_no_command() -> None:
+    """Who may make Events can write any text there."""
+    evil = RecentEvent(
+        kind="Pod",
+        id=Name("robots;reboot", "talker;reboot"),
+        uid="u",
+        reason="R",
+        message="m",
+        age=1.0,
+        count=1,
+        own=False,
+    )
+    (finding,) = event_findings([evil], ())
+    assert finding.fix == "kubectl -n 'robots;reboot' describe pod 'talker;reboot'"
