@@ -5,31 +5,45 @@ nodes appear once, and a link between two nodes does; and what is outside for on
 inside for another. A master on loopback is another one on each host. Participants of ROS 2 are the
 same wherever they have one name, which is made to be nobody else's. A proxy that can't be asked is
 a node that says why.
+
+A proxy may be in hostile hands. So each one has a fair share of the nodes, links and findings that
+are shown, and its texts are shortened as those of a proxy of this release are.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from itertools import islice
+from operator import itemgetter
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec.structs import replace
 
+from rosproxy.admin.status_bounds import fair_choice, fair_shares
 from rosproxy.net.addresses import is_loopback, parse_authority
 from rosproxy.page.page_document import (
     BROKEN,
     CONTAINER,
     HOST,
     MOST_FINDINGS,
+    MOST_LINKS,
+    MOST_NODES,
     OK,
     WARNING,
     Document,
     PageFinding,
     PageLink,
     PageNode,
+    PageProxy,
+    shown_name,
+    shown_text,
     within_bounds,
 )
 
 Json = dict[str, Any]
 PROXY, PARTICIPANT = "proxy", "participant"
+_LONG_TEXTS = ("text", "fix")
+_MOST_LEFT_OUT = 10**9
+Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)
 _RANKS = {WARNING: 1, BROKEN: 2}
 """How bad a state is; others are not."""
 
@@ -37,9 +51,10 @@ _RANKS = {WARNING: 1, BROKEN: 2}
 def read_document(text: str) -> Document:
     """The document in a proxy's answer. Raises ValueError."""
     try:
-        return msgspec.json.decode(text, type=Document)
+        document = msgspec.json.decode(text, type=Document)
     except msgspec.DecodeError as error:
         raise ValueError(str(error)) from None
+    return _shortened(document)
 
 
 def merged(
@@ -51,8 +66,10 @@ def merged(
     """
     nodes: dict[str, PageNode] = {}
     links: dict[str, PageLink] = {}
-    findings: list[PageFinding] = []
-    left_out = 0
+    findings: list[tuple[str, PageFinding]] = []
+    shares = _shares(documents)
+    left_out = sum(_size(whole) - _size(shares[name]) for name, whole in documents.items())
+    documents = shares
     inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
@@ -75,16 +92,59 @@ def merged(
                 target = names.get(link.target, "")
                 named = replace(link, source=names[link.source], target=target)
                 links[named.key] = max(links.get(named.key, named), named, key=_telling)
-        findings += (replace(f, subject=f"{name}: {f.subject}") for f in document.findings)
+        findings += ((name, replace(f, subject=f"{name}: {f.subject}")) for f in document.findings)
         left_out += document.left_out
     shown, kept = within_bounds(nodes, links)
+    shown_findings = fair_choice(findings, itemgetter(0), MOST_FINDINGS)
     return {
         "proxy": {"host": f"{len(documents)} proxies", "version": version},
         "nodes": msgspec.to_builtins(shown),
         "links": msgspec.to_builtins(kept),
-        "findings": msgspec.to_builtins(findings[:MOST_FINDINGS]),
+        "findings": msgspec.to_builtins([f for _, f in shown_findings]),
         "left_out": left_out + len(nodes) - len(shown) + len(links) - len(kept),
     }
+
+
+def _shortened(document: Document) -> Document:
+    """A document whose texts and numbers are as a proxy of this release makes them."""
+    nodes = islice(document.nodes.items(), 2 * MOST_NODES)
+    links = islice(document.links.items(), 2 * MOST_LINKS)
+    proxy = document.proxy
+    return replace(
+        document,
+        nodes={shown_name(key): _brief(node) for key, node in nodes},
+        links={shown_name(key): _brief(link) for key, link in links},
+        findings=tuple(_brief(finding) for finding in document.findings[:MOST_FINDINGS]),
+        proxy=_brief(proxy),
+        left_out=min(max(document.left_out, 0), _MOST_LEFT_OUT),
+    )
+
+
+def _brief(row: Row) -> Row:
+    """A row with shortened texts."""
+    texts = {
+        name: (shown_text if name in _LONG_TEXTS else shown_name)(text)
+        for name in row.__struct_fields__
+        if isinstance(text := getattr(row, name), str)
+    }
+    return replace(row, **texts)
+
+
+def _shares(documents: Mapping[str, Document | str]) -> dict[str, Document | str]:
+    """The documents with as many nodes and links as the share of each proxy has."""
+    read = {name: d for name, d in documents.items() if not isinstance(d, str)}
+    nodes = fair_shares([len(document.nodes) for document in read.values()], MOST_NODES)
+    links = fair_shares([len(document.links) for document in read.values()], MOST_LINKS)
+    shares: dict[str, Document | str] = {**documents}
+    for (name, document), *share in zip(read.items(), nodes, links, strict=True):
+        kept_nodes, kept_links = within_bounds(document.nodes, document.links, *share)
+        shares[name] = replace(document, nodes=kept_nodes, links=kept_links)
+    return shares
+
+
+def _size(document: Document | str) -> int:
+    """How many nodes and links a document has."""
+    return 0 if isinstance(document, str) else len(document.nodes) + len(document.links)
 
 
 def _telling(link: PageLink) -> tuple[int, bool, bool]:

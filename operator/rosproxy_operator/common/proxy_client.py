@@ -25,6 +25,8 @@ PAGES_AT_ONCE = 8
 LONGEST = 16 * 1024 * 1024
 """Bytes of an answer at most. A proxy in hostile hands can't mislead its operator: no redirect is
 followed, and nothing is decompressed."""
+LONGEST_STATUS = 4 * 1024 * 1024
+"""The same of a status, which has 1 MiB at most: reading one keeps all other proxies waiting."""
 WITHIN_PAGE = 12.0
 """The same where it makes the page's document first, for which it may take ten."""
 WITHIN_MASTER = 40.0
@@ -38,12 +40,16 @@ class ProxyError(Exception):
 
     ``is_unreachable`` if nothing at all is there: no route, or no answer. ``lacks_master`` if it is
     well, but needs its master, which can't be asked now. ``status`` is that of an HTTP answer, 0
-    without one.
+    without one. ``is_unreadable`` if it answers with more than the operator reads: then the process
+    is still the one that the operator knows.
     """
 
-    def __init__(self, message: str, away: bool = False, status: int = 0) -> None:
+    def __init__(
+        self, message: str, away: bool = False, status: int = 0, unreadable: bool = False
+    ) -> None:
         super().__init__(message)
         self.is_unreachable, self.status = away, status
+        self.is_unreadable = unreadable
         self.lacks_master = status == 503
 
 
@@ -59,7 +65,7 @@ class ProxyClient:
 
     async def status(self, admin: HostPort) -> ProxyStatus:
         """What a proxy's ``/status`` says."""
-        text = await self._ask("GET", admin, "/status")
+        text = await self._ask("GET", admin, "/status", longest=LONGEST_STATUS)
         try:
             return parse_status(text)
         except NotAStatus:
@@ -73,7 +79,9 @@ class ProxyClient:
         After ``within`` seconds in any case. A proxy of a former release does not know this (404).
         """
         path = f"/status/changes?since={quote(since)}&within={within:g}"
-        answer = _read(await self._ask("GET", admin, path, token, within=within + WITHIN), admin)
+        within += WITHIN
+        text = await self._ask("GET", admin, path, token, within=within, longest=LONGEST_STATUS)
+        answer = _read(text, admin)
         version, status = answer.get("version"), answer.get("status")
         if not isinstance(version, str):
             raise _no_rosproxy(admin)
@@ -180,8 +188,9 @@ class ProxyClient:
         token: str = "",
         body: Mapping[str, Any] | None = None,
         within: float = WITHIN,
+        longest: int = LONGEST,
     ) -> str:
-        """The body of the answer, if that is HTTP 200."""
+        """The body of the answer, if that is HTTP 200 and has ``longest`` bytes at most."""
         if self._session is None:
             # No limit: each proxy that is waited for takes one; the callers bound the others.
             connector = aiohttp.TCPConnector(limit=0, socket_factory=_kept_alive)
@@ -196,7 +205,7 @@ class ProxyClient:
             async with self._session.request(
                 method, url, json=body, headers=headers, timeout=limits, allow_redirects=False
             ) as reply:
-                text = (await read_bounded(reply.content, LONGEST)).decode(errors="replace")
+                text = (await read_bounded(reply.content, longest)).decode(errors="replace")
                 if reply.status == 200:
                     return text
                 message = f"{method} {url} answers HTTP {reply.status}: {text.strip()[:200]}"
@@ -204,7 +213,9 @@ class ProxyClient:
         except TimeoutError:
             raise ProxyError(f"{admin} does not answer", away=True) from None
         except TooLong:
-            raise _no_rosproxy(admin) from None
+            what = f"{method} {path.partition('?')[0]} with more than {longest} bytes"
+            text = f"{admin} answers {what}: the proxy is of another version, or taken over"
+            raise ProxyError(text, unreadable=True) from None
         except (OSError, aiohttp.ClientError) as error:
             raise _no_answer(admin, error) from None
 

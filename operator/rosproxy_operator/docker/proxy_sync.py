@@ -60,6 +60,7 @@ class ProxyUpdater:
         self._name, self._answered = name, answered
         self._session = ProxySession(proxies, access.admin, access.token)
         self._news = ProxyNews()
+        self._status = ProxyStatus()
         self._looked, self._selecting = asyncio.Event(), asyncio.Event()
 
     def update(self, network_facts: NetworkFacts) -> None:
@@ -117,8 +118,14 @@ class ProxyUpdater:
 
     async def _tell(self) -> None:
         self._looked.clear()
-        refusal = await self._policy_refusal()
-        status = await self._session.status()
+        refusal: ProxyError | None = await self._policy_refusal()
+        try:
+            self._status = await self._session.status()
+        except ProxyError as error:
+            if not error.is_unreadable:
+                raise
+            refusal = refusal or error  # the proxy is told what is new, by its last status
+        status = self._status
         self.leases = leases(status)
         # The facts are not older than need be: its nodes may have come since the last look.
         address = self._news.facts.master_address
@@ -128,7 +135,7 @@ class ProxyUpdater:
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
         body = self._news.body(inside_addresses(status), now)
-        if refusal:
+        if isinstance(refusal, PolicyRefused):
             body.pop("arrived", None)  # adopted nodes would not be kept to the policy
         if body:
             log.debug("%s is told %s", self._name, body)

@@ -101,7 +101,10 @@ def document(
 
 
 def within_bounds(
-    nodes: Mapping[str, PageNode], links: Mapping[str, PageLink]
+    nodes: Mapping[str, PageNode],
+    links: Mapping[str, PageLink],
+    most_nodes: int = MOST_NODES,
+    most_links: int = MOST_LINKS,
 ) -> tuple[dict[str, PageNode], dict[str, PageLink]]:
     """As many nodes and links as are shown: first what is broken, then what is not quiet."""
     order = sorted(links, key=lambda key: (links[key].state != BROKEN, links[key].quiet, key))
@@ -109,14 +112,14 @@ def within_bounds(
     important = {end for link in broken for end in (link.source, link.target)}
     important |= {key for key, node in nodes.items() if node.state == BROKEN}
     first = (
-        sorted(nodes, key=lambda key: key not in important) if len(nodes) > MOST_NODES else nodes
+        sorted(nodes, key=lambda key: key not in important) if len(nodes) > most_nodes else nodes
     )
-    shown_nodes = {key: nodes[key] for key in islice(first, MOST_NODES)}
+    shown_nodes = {key: nodes[key] for key in islice(first, most_nodes)}
     targets = {"", *shown_nodes}
     complete = (
         key for key in order if links[key].source in shown_nodes and links[key].target in targets
     )
-    return shown_nodes, {key: links[key] for key in islice(complete, MOST_LINKS)}
+    return shown_nodes, {key: links[key] for key in islice(complete, most_links)}
 
 
 class PageFinding(msgspec.Struct, frozen=True):

@@ -7,7 +7,10 @@ import pytest
 
 from rosproxy.page.page_document import (
     BROKEN,
+    LONGEST_TEXT,
+    MOST_FINDINGS,
     MOST_LINKS,
+    MOST_NODES,
     Document,
     PageFinding,
     PageLink,
@@ -175,3 +178,52 @@ def test_what_is_broken_stays_where_not_all_fits() -> None:
 def test_what_is_no_document_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r".+"):
         read_document(text)
+
+
+HUGE = "x;reboot\x1b" * 10_000
+
+
+def hostile(nodes: int = 10_000, links: int = 20_000) -> Document:
+    """What a proxy in hostile hands may send within the bytes that are read."""
+    document = {
+        "proxy": {"master": MASTER, "host": HUGE},
+        "nodes": {f"/n{n}": {"lane": "container", "state": "broken"} for n in range(nodes)},
+        "links": {
+            f"{n}": {"kind": "topic", "name": f"/t{n}", "source": "/n1", "state": "broken"}
+            for n in range(links)
+        },
+        "findings": [{"severity": "error", "subject": "s", "text": f"{n}"} for n in range(5000)],
+        "left_out": -7,
+    }
+    return read_document(json.dumps(document))
+
+
+def test_texts_and_cures_of_a_proxy_are_shortened() -> None:
+    node = {"lane": "container", "kind": HUGE, "label": HUGE, "text": HUGE, "fix": HUGE}
+    link = {"kind": HUGE, "name": HUGE, "source": HUGE, "text": HUGE, "fix": HUGE}
+    finding = dict.fromkeys(("severity", "subject", "text", "fix"), HUGE)
+    evil = {"nodes": {HUGE: node}, "links": {HUGE: link}, "findings": [finding] * 99}
+    document = merged({"evil": read_document(json.dumps(evil))}, "1.0", LOGS)
+    text = json.dumps(document)
+    assert len(document["nodes"]) == len(document["links"]) == 1
+    assert len(document["findings"]) == MOST_FINDINGS
+    assert len(text) < (MOST_FINDINGS + 2) * 4 * LONGEST_TEXT
+    assert "\x1b" not in json.loads(text)["findings"][0]["fix"]
+
+
+def test_no_proxy_hides_what_another_one_has() -> None:
+    documents = {"evil": hostile(), "good": shown("a", 20), "worse": hostile()}
+    document = merged(documents, "1.0", LOGS)
+    assert len(document["nodes"]) <= MOST_NODES
+    assert len(document["links"]) <= MOST_LINKS
+    assert document["nodes"]["good /talker"]["label"] == "/talker"
+    assert sum(link["source"] == "good /talker" for link in document["links"].values()) == 20
+    assert "good: ports" in [finding["subject"] for finding in document["findings"]]
+    assert len(document["findings"]) <= MOST_FINDINGS
+    assert document["left_out"] > 0
+
+
+@pytest.mark.parametrize("left_out", [-7, 10**30])
+def test_what_is_left_out_is_a_number_that_can_be(left_out: int) -> None:
+    document = merged({"one": shown("a", left_out=left_out)}, "1.0", LOGS)
+    assert 0 <= document["left_out"] <= 10**9

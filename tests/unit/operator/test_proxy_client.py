@@ -61,10 +61,21 @@ async def test_nothing_is_inflated(evil: Evil, client: ProxyClient) -> None:
 async def test_a_long_answer_is_not_read(
     evil: Evil, client: ProxyClient, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(proxy_client, "LONGEST", 1000)
+    """It was taken for one of another program; it is the proxy that the operator knows."""
+    monkeypatch.setattr(proxy_client, "LONGEST_STATUS", 1000)
     evil.answer = lambda: web.Response(status=status, body=b"[" * 1001)
-    with pytest.raises(ProxyError, match="as a rosproxy does"):
-        await client.status(evil.admin)
+    for asking, path in (
+        (client.status(evil.admin), "/status"),
+        (client.changes(evil.admin, "token", "", 0.0), "/status/changes"),
+    ):
+        with pytest.raises(ProxyError) as raised:
+            await asking
+        assert str(raised.value) == (
+            f"{evil.admin} answers GET {path} with more than 1000 bytes: the proxy is of another "
+            "version, or taken over"
+        )
+        assert raised.value.is_unreadable
+        assert not raised.value.is_unreachable
 
 
 async def test_what_is_no_text_is_no_answer(evil: Evil, client: ProxyClient) -> None:

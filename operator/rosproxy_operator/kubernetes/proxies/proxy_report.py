@@ -61,6 +61,11 @@ def no_answer(error: str) -> ProxyReport:
     return ProxyReport(answered=False, error=short(error))
 
 
+def unreadable(last: ProxyReport, error: str) -> ProxyReport:
+    """The report on a proxy that answers with more than is read: what it said last, and that."""
+    return replace(last, problems=(short(error),))
+
+
 def short(text: str) -> str:
     """A proxy's text, cleaned and cut so that it may be shown."""
     return bounded(clean(text), _LONGEST)

@@ -24,7 +24,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases
-from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer, report, short
+from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer, report, short, unreadable
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
 
@@ -34,6 +34,8 @@ EVERY = 3.0
 """Seconds between two polls of a proxy."""
 EVERY_STARTING = 0.5
 """The same until it has answered for the first time."""
+LEAST_INTERVAL = 0.5
+"""Seconds between two changes that are taken: a hostile proxy may report them for ever."""
 EVERY_FORMER = 15.0
 """The same for one that does not report changes (``/status/changes``)."""
 WAIT = 300.0
@@ -48,8 +50,6 @@ SLOW_AT_ONCE = 256
 """The same for calls that may wait for a proxy's master: so they hold up no other calls."""
 REPEATED = 30.0
 """Seconds after which a proxy that does not report changes is sent anew which pods may use it."""
-
-
 _KNOWS_NO_CHANGES = (403, 404, 405, 503)
 """HTTP answers of a proxy of a former release, or of one at which too many wait already."""
 
@@ -129,6 +129,7 @@ class ProxyPoller:
                     await self._wait_for_either(long_poll)
                     if long_poll.done():
                         long_poll = long_poll.result()  # None, or raises what it died of
+                        await self._wait_for_news(LEAST_INTERVAL)
                     continue
                 # Acting on that may take the proxy a moment: the next poll rechecks, not this one.
                 self._recheck = self._recheck and not told_gone
@@ -170,8 +171,12 @@ class ProxyPoller:
         pause = EVERY if answers or self._has_waited(EVERY * 20) else EVERY_STARTING
         if answers and not self._is_busy:
             pause = EVERY_FORMER
+        await self._wait_for_news(pause)
+
+    async def _wait_for_news(self, seconds: float) -> None:
+        """Wait for so long, or until there is something to send."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(pause):
+            async with asyncio.timeout(seconds):
                 await self._pending.wait()
 
     async def _tell(self) -> bool:
@@ -188,11 +193,14 @@ class ProxyPoller:
             new_report = report(status, self._refusal)
             self._failures = 0
         except ProxyError as error:
-            self._forget()  # the process that answers next may be a new one
             self._failures += 1
-            if self._failures < SILENT or not (self.report or self._has_waited(STARTING)):
-                return
-            new_report = no_answer(str(error))
+            if error.is_unreadable and self.report:
+                new_report = unreadable(self.report, str(error))
+            else:
+                self._forget()  # the process that answers next may be a new one
+                if self._failures < SILENT or not (self.report or self._has_waited(STARTING)):
+                    return
+                new_report = no_answer(str(error))
         starting = self.report is None and not self._has_waited(STARTING)
         if starting and new_report.answered and not new_report.master_up:
             return  # it may not have asked its master yet
@@ -382,10 +390,7 @@ def address_of(proxy: ProxyPod) -> HostPort:
 
 
 def token_for(proxy: ProxyPod, key: bytes) -> str:
-    """The token of a proxy's admin endpoint, by the operator's key.
-
-    A proxy that a former operator has made has the token in its pod.
-    """
+    """The token of a proxy's admin endpoint: by the key, or in the pod of a former operator's."""
     return proxy.token or token_of(key, proxy.pod.id, proxy.node)
 
 

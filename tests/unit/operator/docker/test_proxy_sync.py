@@ -46,13 +46,18 @@ class Proxies(ProxyClient):
         self.refuses: ProxyError | None = None
         self.heard = asyncio.Event()
         self.errors: list[ProxyError] = []
+        self.unreadable: ProxyError | None = None
+        self.bodies: list[Mapping[str, Any]] = []
 
     async def status(self, admin: HostPort) -> Any:
+        if self.unreadable:
+            raise self.unreadable
         if self.known_status is None:
             await asyncio.Event().wait()
         return self.known_status
 
     async def containers(self, admin: HostPort, token: str, body: Mapping[str, Any]) -> Any:
+        self.bodies.append(body)
         return {}
 
     async def policy(self, admin: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
@@ -154,6 +159,36 @@ async def test_a_proxy_that_had_to_leave_its_ports_is_told_who_had_some(
 
     await proxies.next()
     assert proxies.former == told
+
+
+async def test_a_proxy_that_says_too_much_is_told_what_is_new_by_what_it_said_last(
+    tasks: Tasks,
+) -> None:
+    proxies = Proxies()
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
+    participant = ParticipantStatus(
+        guid_prefix="01.0f", address="172.18.0.5", leases=(LocatorStatus(port=11401),)
+    )
+    proxies.known_status = ProxyStatus(domains=(DomainStatus(inside=(participant,)),))
+    seen, members = look("172.18.0.5")
+    name = seen.state.proxies[0].container.name
+    sync.update(seen, members)
+    await proxies.next()
+    while not sync.answers(name):
+        await asyncio.sleep(0)
+
+    proxies.unreadable = ProxyError("answers GET /status with more than", unreadable=True)
+    proxies.bodies.clear()
+    sync.update(*look("172.18.0.5", "172.18.0.6"))
+    await proxies.next()
+    while sync.answers(name):
+        await asyncio.sleep(0)
+
+    updater, _ = sync._running[name]
+    assert updater.leases == {"01.0f": (11401,)}
+    assert updater.error is proxies.unreadable
+    arrived = {row["address"] for body in proxies.bodies for row in body.get("arrived", ())}
+    assert "172.18.0.6" in arrived
 
 
 async def test_what_was_not_heard_is_told_again(

@@ -43,9 +43,12 @@ class Told(ProxyClient):
         self.waited: list[tuple[str, float]] = []
         self.policies: list[Any] = []
         self.refuses: ProxyError | None = None
+        self.unreadable: ProxyError | None = None
 
     async def status(self, admin: HostPort) -> ProxyStatus:
         self.asked += 1
+        if self.unreadable:
+            raise self.unreadable
         self.failing -= 1
         if self.says is None or self.failing >= 0:
             raise ProxyError(f"{admin} refuses connections")
@@ -131,6 +134,62 @@ async def test_an_answer(talk: Talk) -> None:
     await talk.asked()
     assert talk.all.reports[UID].master_up
     assert talk.changes == 1  # the same answer is no news
+
+
+async def test_one_that_says_too_much_keeps_what_is_known_of_it(talk: Talk) -> None:
+    """It counted as one that does not answer, and was told all anew each time."""
+    node = {"nodes": ["/talker"], "address": "10.244.1.9:40001", "state": "ok"}
+    talk.proxies.says = {**UP, "nodes": [node]}
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_callers({UID: ("10.244.1.9",)}, {}, {})
+    await talk.asked()
+    await until(lambda: bool(talk.proxies.callers))
+    talk.proxies.unreadable = ProxyError("it answers with more", unreadable=True)
+    told = len(talk.proxies.callers)
+    await talk.asked(5)
+    report = talk.all.reports[UID]
+    assert report.answered
+    assert report.nodes == {"10.244.1.9": ("/talker",)}
+    assert report.problems == ("it answers with more",)
+    assert len(talk.proxies.callers) == told
+    talk.proxies.unreadable = None
+    await talk.asked(2)
+    assert talk.all.reports[UID].problems == ()
+
+
+async def test_one_that_says_too_much_from_the_start_does_not_answer(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(proxy_sync, "STARTING", 0.0)
+    talk.proxies.unreadable = ProxyError("it answers with more", unreadable=True)
+    talk.all.follow([proxy()])
+    await talk.asked()
+    assert not talk.all.reports[UID].answered
+    assert talk.all.reports[UID].error == "it answers with more"
+
+
+async def test_one_that_reports_changes_without_an_end_keeps_no_other_waiting(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was asked again at once, as often as the operator could."""
+    waits: list[float] = []
+    wait = proxy_sync.ProxyPoller._wait_for_news
+
+    async def noted(poller: proxy_sync.ProxyPoller, seconds: float) -> None:
+        waits.append(seconds)
+        await wait(poller, 0.0)
+
+    monkeypatch.setattr(proxy_sync.ProxyPoller, "_wait_for_news", noted)
+    talk.proxies.former = False
+
+    async def changes(*_: Any) -> tuple[str, ProxyStatus]:
+        talk.proxies.asked += 1
+        return str(talk.proxies.asked), read_status(UP)
+
+    monkeypatch.setattr(talk.proxies, "changes", changes)
+    talk.all.follow([proxy()])
+    await talk.asked(20)
+    assert waits.count(proxy_sync.LEAST_INTERVAL) >= 15
 
 
 async def test_one_that_is_just_starting_is_no_news(talk: Talk) -> None:
