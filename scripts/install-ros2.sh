@@ -7,7 +7,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/debian.sh
 
-(need install-ros2 iproute2 nftables procps util-linux hostname && install_missing)
+(need install-ros2 iproute2 nftables conntrack procps util-linux hostname && install_missing)
 
 environments=${XDG_CACHE_HOME:-$HOME/.cache}/rosproxy/ros2
 [[ $# -gt 0 ]] || set -- jazzy kilted cyclone

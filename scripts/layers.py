@@ -33,7 +33,8 @@ ROS, CLIENTS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNE
     "install-kubernetes",
     "build-images",
 )
-COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
+ABUSE_TOOLS = "install-abuse"
+COMMANDS = {name: [f"scripts/{name}.sh"] for name in (*PREPARATIONS, ABUSE_TOOLS)} | {
     JAZZY: ["scripts/install-ros2.sh", "jazzy"],
     NODES: [sys.executable, "-m", "tests.ros.cpp"],
     IMAGES: [sys.executable, "-m", "tests.docker.images"],
@@ -126,7 +127,7 @@ def effective_capabilities() -> int:
 
 UNIT = Layer("unit", smoke=ALL, workers=2, second_look=False)
 INTEGRATION = Layer("integration", smoke=ALL, workers=2)
-ABUSE = Layer("abuse", obstacle=abuse_obstacle)
+ABUSE = Layer("abuse", setup=(ABUSE_TOOLS,), obstacle=abuse_obstacle)
 CHART = Layer(
     "chart", setup=(PROMETHEUS, KUBERNETES), obstacle=debian_root_obstacle, second_look=False
 )

@@ -8,8 +8,11 @@ import pytest
 from rosproxy.forwarding.kernel import plane, syncer
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
+from rosproxy.net.addresses import Route
 
-PAIRS = ("marks", "hosts4", "hosts6", "ports")
+PAIRS = ("marks", "hosts4", "hosts6", "ports", "sources4", "sources6")
+OWN = "192.0.2.1"
+"""The proxy's address towards all nodes."""
 
 
 def clear_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,6 +23,7 @@ def clear_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(plane, "find_obstacle", nothing)
     monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
+    monkeypatch.setattr(syncer, "route_towards", lambda address: Route(OWN, 1500))
 
 
 class FakeTools(Tools):
@@ -50,12 +54,12 @@ class FakeTools(Tools):
             self._apply(line.split(maxsplit=5))
         return ""
 
-    async def list_flows(self, transport: str, ipv6: bool, *which: str) -> str:
+    async def list_flows(self, ipv6: bool, *which: str) -> str:
         """What conntrack prints."""
         self._maybe_fail()
         return "" if ipv6 else self.flows
 
-    async def forget_flows(self, transport: str, ipv6: bool, *which: str) -> None:
+    async def forget_flows(self, ipv6: bool, *which: str) -> None:
         """Note what is to be forgotten."""
         self._maybe_fail()
         self.forgotten.append((ipv6, which))
@@ -81,7 +85,7 @@ class FakeTools(Tools):
                 self.table = None
             case ["map" | "set", name, *_] if self.table is not None:
                 self.table[name] = []
-            case ["flush", "set", _, _, name] if self.table is not None:
+            case ["flush", "set" | "map", _, _, name] if self.table is not None:
                 self.table[name] = []
             case ["add" | "delete" as verb, "element", _, _, name, elements]:
                 if self.table is None:
@@ -109,7 +113,8 @@ def _element(text: str) -> Any:
     key, _, value = text.partition(" : ")
     if not value:
         return int(key) if key.isdigit() else key
-    return [int(key), int(value) if value.isdigit() else value]
+    numbers = (int(part) if part.isdigit() else part for part in (key, value))
+    return list(numbers)
 
 
 def _counter(mark: int, size: int) -> Any:

@@ -25,7 +25,11 @@ SMOKE = ("jazzy",)
 
 def missing(environments: Iterable[str]) -> str | None:
     """What stops this layer from running and the command that mends it, or nothing."""
-    gone = [name for name in ("ip", "nft", "unshare", "sysctl") if shutil.which(name) is None]
+    gone = [
+        name
+        for name in ("ip", "nft", "conntrack", "unshare", "sysctl")
+        if shutil.which(name) is None
+    ]
     gone += [name for name in environments if not (ENVIRONMENTS / name / "pins").exists()]
     if gone:
         return f"this layer needs ROS 2: run `scripts/install-ros2.sh` as root (missing: {gone})"

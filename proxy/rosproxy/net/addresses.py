@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 from urllib.parse import urlsplit
 
 Network = IPv4Network | IPv6Network
@@ -40,6 +40,13 @@ class HostPort:
     def __str__(self) -> str:
         """``host:port``, with brackets around an IPv6 address."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+class Route(NamedTuple):
+    """How packets go to an address: from which own address, and of how many bytes at most."""
+
+    source: str
+    mtu: int
 
 
 def parse_host_port(text: str) -> HostPort | None:

@@ -5,21 +5,35 @@ import socket
 from ipaddress import ip_address, ip_network
 from pathlib import Path
 
-from rosproxy.net.addresses import Network, is_loopback, plain_address
+from rosproxy.net.addresses import Network, Route, is_loopback, plain_address
+
+_IP_MTU = 14
+_IPV6_MTU = 24
+"""Options of a connected socket (ip(7), ipv6(7)), which Python's module lacks."""
+_LOOPBACK_MTU = 65_536
 
 
 def address_towards(address: str) -> str:
-    """The address of this machine that connections to ``address`` come from.
+    """The address of this machine that connections to ``address`` come from."""
+    return route_towards(address).source
+
+
+def route_towards(address: str) -> Route:
+    """How packets go to ``address``; by loopback if there is no way.
 
     Connecting a UDP socket only looks up the route; nothing is sent.
     """
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+    is_ipv6 = ":" in address
+    with socket.socket(socket.AF_INET6 if is_ipv6 else socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((address, 9))
+            if is_ipv6:
+                mtu = probe.getsockopt(socket.IPPROTO_IPV6, _IPV6_MTU)
+            else:
+                mtu = probe.getsockopt(socket.IPPROTO_IP, _IP_MTU)
         except OSError:
-            return "::1" if family == socket.AF_INET6 else "127.0.0.1"
-        return plain_address(probe.getsockname()[0])
+            return Route("::1" if is_ipv6 else "127.0.0.1", _LOOPBACK_MTU)
+        return Route(plain_address(probe.getsockname()[0]), mtu)
 
 
 def address_into(network: Network) -> str:

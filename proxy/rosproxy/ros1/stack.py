@@ -22,9 +22,9 @@ from rosproxy.admin.requests import (
 )
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.binding import report_taken_ports, setting_error_if_taken
-from rosproxy.forwarding.kernel.nft import Table
+from rosproxy.forwarding.kernel.connection_table import ConnectionTable
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.kernel.table import KernelTable
+from rosproxy.forwarding.kernel.table import TrackedTable
 from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases.fast_ports import BothSides
 from rosproxy.leases.leases import RANGE_OPTION, Leases
@@ -80,7 +80,7 @@ class Ros1:
         )
         self.tcpros = TcprosServer(context)
         holders = BothSides(context.registry, context.stand_ins.by_port)
-        table = KernelTable(Table(settings.master_port, settings.ports.listen), Tools())
+        table = TrackedTable(ConnectionTable(settings.master_port, settings.ports.listen), Tools())
         networks = context.client_networks
         self.plane = plane = KernelPlane(
             settings, holders, context.tasks, context.problems, context.now, table, networks

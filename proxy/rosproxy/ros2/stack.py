@@ -21,7 +21,7 @@ from rosproxy.admin.requests import (
 )
 from rosproxy.admin.status_document import PortsStatus, ProxyStatus
 from rosproxy.binding import report_taken_ports, setting_error_if_taken
-from rosproxy.forwarding.kernel.nft import Table, Transport
+from rosproxy.forwarding.kernel.datagram_table import DatagramTable
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import Tools
@@ -63,7 +63,7 @@ class Ros2:
         self._hosts: tuple[str, ...] = ()
         ports = runtime.settings.ports.listen
         self._leases = leases = DataLeases(PortPool(ports))
-        table = KernelTable(Table(ports.first, ports, Transport.UDP), Tools())
+        table = KernelTable(DatagramTable(ports), Tools())
         self.plane = plane = KernelPlane(
             runtime.settings, leases, runtime.tasks, runtime.problems, runtime.now, table
         )

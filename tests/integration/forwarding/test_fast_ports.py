@@ -9,6 +9,7 @@ from rosproxy.forwarding.kernel import decisions, syncer
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
+from rosproxy.net.addresses import Route
 from rosproxy.ros1 import stack
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
@@ -37,7 +38,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
     monkeypatch.setattr(stack, "Tools", lambda: made)
     monkeypatch.setattr(kernel_plane, "find_obstacle", nothing)
     monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
-    monkeypatch.setattr(syncer, "address_towards", lambda address: "192.0.2.1")
+    monkeypatch.setattr(syncer, "route_towards", lambda address: Route("192.0.2.1", 1500))
     monkeypatch.setattr(decisions, "is_loopback", lambda address: False)
     return made
 

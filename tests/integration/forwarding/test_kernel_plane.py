@@ -8,9 +8,9 @@ import pytest
 
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import syncer
-from rosproxy.forwarding.kernel.nft import Marks, Table
+from rosproxy.forwarding.kernel.connection_table import ConnectionTable, Marks
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.kernel.table import KernelTable
+from rosproxy.forwarding.kernel.table import TrackedTable
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import BothSides
 from rosproxy.net.addresses import HostPort
@@ -62,7 +62,7 @@ class Bench:
             self.context.tasks,
             self.context.problems,
             lambda: self.context.now() + self.later,
-            KernelTable(Table(11311, self.context.settings.ports.listen), self.tools),
+            TrackedTable(ConnectionTable(11311, self.context.settings.ports.listen), self.tools),
             self.context.client_networks,
         )
 

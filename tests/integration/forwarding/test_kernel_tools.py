@@ -1,6 +1,7 @@
 """What the kernel plane needs: conditions as files and firewalls tell them, and its programs."""
 
 import asyncio
+import shutil
 import stat
 from pathlib import Path
 
@@ -19,7 +20,9 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A container's view of /proc and /sys."""
     for name, text in (("ipv4", "1\n"), ("ipv6", "0\n"), ("tables", "")):
         (tmp_path / name).write_text(text)
-    (tmp_path / "net" / "eth0").mkdir(parents=True)
+    for interface, mtu in (("eth0", 1500), ("eth1", 1400), ("lo", 65_536)):
+        (tmp_path / "net" / interface).mkdir(parents=True)
+        (tmp_path / "net" / interface / "mtu").write_text(f"{mtu}\n")
     for attribute, name in (
         ("_IPV4", "ipv4"),
         ("_IPV6", "ipv6"),
@@ -44,7 +47,7 @@ class ChainTools(FakeTools):
 async def test_a_sound_container_has_nothing_in_the_way(place: Path) -> None:
     for mode in ("auto", "kernel"):
         assert await preflight.find_obstacle(mode, ChainTools()) is None
-    assert preflight.read_forwarding() == HostForwarding(ipv4=True, ipv6=False)
+    assert preflight.read_forwarding() == HostForwarding(True, False, longest_packet=1500)
 
 
 async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:
@@ -67,9 +70,9 @@ async def test_what_is_in_the_way(place: Path, name: str, text: str, said: str) 
 
 async def test_a_file_that_is_not_there_is_not_in_the_way(place: Path) -> None:
     (place / "tables").unlink()
-    (place / "net" / "eth0").rmdir()
-    (place / "net").rmdir()
+    shutil.rmtree(place / "net")
     assert await preflight.find_obstacle("auto", ChainTools()) is None
+    assert preflight.read_forwarding().longest_packet == 0
 
 
 async def test_a_firewall_that_drops_is_in_the_way(place: Path) -> None:
@@ -99,9 +102,9 @@ async def test_programs_get_their_words_and_document(programs: Path) -> None:
     program(programs, "nft", 'echo "$@"; /bin/cat')
     program(programs, "conntrack", 'echo "$@"')
     assert await Tools().nft("-f", "-", document="{}") == "-f -\n{}"
-    listed = await Tools().list_flows("udp", True, "--mark", "1/2")
-    assert listed == "-L -f ipv6 -p udp --mark 1/2\n"
-    await Tools().forget_flows("tcp", False, "--state", "SYN_SENT")
+    listed = await Tools().list_flows(True, "--mark", "1/2")
+    assert listed == "-L -f ipv6 -p tcp --mark 1/2\n"
+    await Tools().forget_flows(False, "--state", "SYN_SENT")
 
 
 @pytest.mark.parametrize(
@@ -120,10 +123,10 @@ async def test_complaints_say_what_to_do(programs: Path, script: str, said: str)
 
 async def test_deleting_nothing_is_no_failure(programs: Path) -> None:
     program(programs, "conntrack", "echo 0 flow entries have been deleted. >&2; exit 1")
-    await Tools().forget_flows("tcp", False)
+    await Tools().forget_flows(False)
     program(programs, "conntrack", "echo something else >&2; exit 1")
     with pytest.raises(ToolError, match="something else"):
-        await Tools().forget_flows("tcp", False)
+        await Tools().forget_flows(False)
 
 
 async def test_a_program_that_hangs_is_ended(

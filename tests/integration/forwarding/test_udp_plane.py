@@ -1,14 +1,17 @@
-"""The kernel plane of ROS 2 with a kernel made up: what is forwarded, and what goes astray."""
+"""The kernel plane of ROS 2 with a kernel made up: what is forwarded, and what is counted."""
 
 from collections.abc import AsyncIterator
 
 import pytest
 
-from rosproxy.forwarding.kernel.nft import Marks, Table, Transport
+from rosproxy.forwarding.kernel import syncer
+from rosproxy.forwarding.kernel.datagram_table import DatagramTable
+from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import KernelTable
+from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Refused
@@ -16,21 +19,12 @@ from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
 from rosproxy.runtime import Runtime
-from tests.integration.kernel_fake import FakeTools, clear_the_way
+from tests.integration.kernel_fake import OWN, FakeTools, clear_the_way
 from tests.integration.net import until
 from tests.run_options import parse_settings
 
 RANGE = PortRange(45000, 45015)
-MARKS = Marks(RANGE.first)
 LOCATOR, OTHER = HostPort("192.0.2.5", 7411), HostPort("192.0.2.6", 7411)
-UNLED = (
-    "udp 17 29 src=198.51.100.2 dst={at} sport=5555 dport=45001 [UNREPLIED] "
-    "src={at} dst=198.51.100.2 sport=45001 dport=5555 mark=0 use=1\n"
-)
-LED = (
-    "udp 17 29 src=198.51.100.2 dst=192.0.2.1 sport=5555 dport=45001 [UNREPLIED] "
-    "src=192.0.2.5 dst=192.0.2.1 sport=7411 dport=5555 mark={mark} use=1\n"
-)
 
 
 class Bench:
@@ -40,6 +34,7 @@ class Bench:
         told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": str(RANGE)}
         self.runtime = runtime = Runtime(parse_settings(told))
         self.tools = tools or FakeTools()
+        self.later = 0.0
         ports, pool = PortMap(RANGE, RANGE), PortPool(RANGE)
         domain = DomainSettings(
             number=0,
@@ -55,9 +50,14 @@ class Bench:
         self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs)
         self.leases = DataLeases(pool)
         self.leases.domains.append(self.inside)
-        table = KernelTable(Table(RANGE.first, RANGE, Transport.UDP), self.tools)
+        table = KernelTable(DatagramTable(RANGE), self.tools)
         self.plane = KernelPlane(
-            runtime.settings, self.leases, runtime.tasks, runtime.problems, runtime.now, table
+            runtime.settings,
+            self.leases,
+            runtime.tasks,
+            runtime.problems,
+            lambda: runtime.now() + self.later,
+            table,
         )
 
     async def start(self) -> None:
@@ -82,8 +82,14 @@ class Bench:
         wanted = {port: (locator.host, locator.port) for port, locator in forwards.items()}
         await until(lambda: self.tools.forwards == wanted, f"{forwards} are forwarded")
 
-    def forgotten(self, *which: str) -> bool:
-        return (False, which) in self.tools.forgotten
+    @property
+    def sources(self) -> dict[tuple[str, int], str]:
+        """The source of what goes to each address and port."""
+        return {
+            (host, int(port)): source
+            for target, source in (self.tools.table or {})["sources4"]
+            for host, port in [target.split(" . ")]
+        }
 
     async def close(self) -> None:
         await self.runtime.tasks.cancel()
@@ -109,34 +115,64 @@ async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
     await bench.forwarding({45001: LOCATOR})
     (lease,) = bench.leases
     await until(lambda: bench.plane.status_of(lease)["plane"] == "kernel", "it is told")
-    bench.tools.flows = LED.format(mark=MARKS.of(45001))
+    assert bench.sources == {(LOCATOR.host, LOCATOR.port): OWN}
     bench.end(participant)
     await bench.forwarding({})
-    await until(
-        lambda: bench.forgotten("--mark", MARKS.port_selector(45001)), "its senders are forgotten"
-    )
+    assert bench.sources == {}
 
 
-async def test_senders_follow_to_another_locator(bench: Bench) -> None:
+async def test_a_port_follows_to_another_locator(bench: Bench) -> None:
     participant = bench.lend()
     await bench.forwarding({45001: LOCATOR})
-    bench.tools.flows = LED.format(mark=MARKS.of(45001))
-    await bench.plane.look()
-    assert bench.tools.forgotten == []
     bench.end(participant)
     bench.lend(OTHER)
     await bench.forwarding({45001: OTHER})
-    await until(
-        lambda: bench.forgotten("--mark", MARKS.port_selector(45001)), "its senders are forgotten"
-    )
+    assert bench.sources == {(OTHER.host, OTHER.port): OWN}
 
 
-async def test_who_had_begun_before_is_forgotten_at_the_proxy_alone(bench: Bench) -> None:
-    bench.tools.flows = UNLED.format(at="127.0.0.1") + UNLED.format(at="198.51.100.9")
+async def test_another_address_of_the_proxy_is_followed(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.lend()
-    words = "--orig-dst", "127.0.0.1", "--orig-port-dst", "45001", "--reply-port-src", "45001"
-    await until(lambda: bench.forgotten(*words), "who sends to the proxy is forgotten")
-    assert {which for _, which in bench.tools.forgotten} == {words}
+    await bench.forwarding({45001: LOCATOR})
+    monkeypatch.setattr(syncer, "route_towards", lambda address: Route("192.0.2.9", 1500))
+    bench.later = syncer.ROUTE_TTL
+    await bench.plane.look()
+    await until(lambda: set(bench.sources.values()) == {"192.0.2.9"}, "the source is replaced")
+
+
+async def test_a_locator_behind_a_shorter_mtu_stays_with_the_proxy(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(syncer, "read_forwarding", lambda: HostForwarding(longest_packet=9000))
+    bench.plane.syncer.look_around()
+    bench.lend()
+    (lease,) = bench.leases
+    assert "same MTU" in bench.plane.status_of(lease)["reason"]
+    assert bench.plane.status_of(lease)["plane"] == "copy"
+
+
+class NftAlone(FakeTools):
+    """A machine without conntrack."""
+
+    async def list_flows(self, ipv6: bool, *which: str) -> str:
+        """Fail."""
+        raise ToolError("conntrack is not installed")
+
+    async def forget_flows(self, ipv6: bool, *which: str) -> None:
+        """Fail."""
+        raise ToolError("conntrack is not installed")
+
+
+async def test_datagrams_need_no_conntrack(sound: None, caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench(NftAlone())
+    await bench.start()
+    bench.lend()
+    await bench.forwarding({45001: LOCATOR})
+    await bench.plane.look()
+    await bench.close()
+    assert bench.tools.table is None
+    assert "conntrack" not in caplog.text
 
 
 async def test_datagrams_are_counted_and_need_no_answer(bench: Bench) -> None:
@@ -159,7 +195,6 @@ async def test_a_graceful_stop_resets_nobody_and_leaves_nothing(bench: Bench) ->
     await bench.close()
     assert bench.tools.table is None
     assert not any("reset" in document for document in bench.tools.documents)
-    assert bench.forgotten("--mark", MARKS.table_selector)
 
 
 async def test_what_a_killed_process_left_goes_on_for_a_while(bench: Bench) -> None:

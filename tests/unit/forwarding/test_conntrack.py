@@ -1,12 +1,11 @@
 """What ``conntrack -L`` prints, as conntrack 1.4.7 printed it."""
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.forwarding.kernel import conntrack
+from rosproxy.forwarding.kernel.connection_table import Marks
 from rosproxy.forwarding.kernel.conntrack import Flow, Watch
-from rosproxy.forwarding.kernel.nft import Marks
 from rosproxy.net.addresses import HostPort
 
 MARKS = Marks(11311)
@@ -53,40 +52,9 @@ def test_what_is_of_others_or_makes_no_sense_is_left_out() -> None:
     assert conntrack.read("\n".join(lines), MARKS) == []
 
 
-UNLED = (
-    "udp      17 29 src=10.77.0.2 dst=172.30.1.2 sport=5555 dport=45050 [UNREPLIED] "
-    "src=172.30.1.2 dst=10.77.0.2 sport=45050 dport=5555 "
-)
-LED = (
-    "udp      17 29 src=10.77.0.2 dst=172.30.1.2 sport=5555 dport=45050 [UNREPLIED] "
-    "src=172.30.1.11 dst=172.30.1.2 sport=7411 dport=5555 "
-)
-LOCATOR = HostPort("172.30.1.11", 7411)
-
-
-@pytest.mark.parametrize(
-    ("line", "forwards", "unled", "misled"),
-    [
-        (marked(UNLED, 0), {45050: LOCATOR}, {HostPort("172.30.1.2", 45050)}, set()),
-        (marked(UNLED, 0), {45051: LOCATOR}, set(), set()),
-        (marked(LED), {45050: LOCATOR}, set(), set()),
-        (marked(LED), {}, set(), {45050}),
-        (marked(LED), {45050: HostPort("172.30.1.11", 7413)}, set(), {45050}),
-        (marked(LED, 0), {45050: HostPort("172.30.1.12", 7411)}, set(), set()),
-        (marked(UNLED, 0).replace("udp ", "tcp "), {45050: LOCATOR}, set(), set()),
-    ],
-    ids=["came-before", "not-forwarded", "right", "ended", "moved", "of-others", "of-tcp"],
-)
-def test_datagrams_that_go_elsewhere_are_found(
-    line: str, forwards: dict[int, HostPort], unled: set[HostPort], misled: set[int]
-) -> None:
-    assert conntrack.find_stray_datagrams(line, forwards, MARKS) == (unled, misled)
-
-
 @given(st.text())
 def test_nothing_breaks_it(text: str) -> None:
     assert conntrack.read(text, MARKS) == []
-    assert conntrack.find_stray_datagrams(text, {45050: LOCATOR}, MARKS) == (set(), set())
 
 
 @given(st.lists(st.sampled_from(marked(OPEN).split())))

@@ -15,11 +15,12 @@ from rosproxy.forwarding.kernel.decisions import (
     forwards_to_keep,
     unchanged_forwards,
 )
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import ProbeResult
 
 NODE = "10.0.0.5"
+ROUTE = Route("10.0.0.2", 1500)
 THERE, THERE_SIX = HostPort(NODE, 50000), HostPort("fd00::5", 50000)
 
 
@@ -32,16 +33,16 @@ def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
     return made
 
 
+BOTH = HostForwarding()
+
+
 @pytest.mark.parametrize(
     "named",
     [{}, {"topic_ports": {"/a": 50000, "/b": 50000}}],
 )
 def test_a_node_that_named_its_port_is_forwarded_to(named: dict[str, Any]) -> None:
-    assert destination(an_endpoint(**named), HostForwarding()) == THERE
-    assert destination(an_endpoint("fd00::5", **named), HostForwarding()) == THERE_SIX
-
-
-BOTH = HostForwarding()
+    assert destination(an_endpoint(**named), BOTH, ROUTE, True) == THERE
+    assert destination(an_endpoint("fd00::5", **named), BOTH, ROUTE, True) == THERE_SIX
 
 
 @pytest.mark.parametrize(
@@ -51,7 +52,6 @@ BOTH = HostForwarding()
         (an_endpoint(topic_ports={}), BOTH, "nobody has asked"),
         (an_endpoint(topic_ports={"/a": 1, "/b": 2}), BOTH, "several TCPROS ports"),
         (an_endpoint("127.0.0.1"), BOTH, "namespace of the proxy itself"),
-        (an_endpoint(), HostForwarding(own_addresses={NODE}), "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(ipv4=False), "net.ipv4.ip_forward"),
         (an_endpoint("fd00::5"), HostForwarding(ipv6=False), "net.ipv6.conf.all.forwarding"),
     ],
@@ -59,17 +59,45 @@ BOTH = HostForwarding()
 def test_what_keeps_a_node_in_user_space(
     endpoint: Endpoint, world: HostForwarding, why: str
 ) -> None:
-    said = destination(endpoint, world)
+    said = destination(endpoint, world, ROUTE, True)
     assert isinstance(said, str)
     assert why in said
+
+
+@pytest.mark.parametrize(
+    ("route", "why"),
+    [
+        (Route(NODE, 65_536), "namespace of the proxy itself"),
+        (Route("127.0.0.1", 65_536), "no route to 10.0.0.5: add the proxy"),
+    ],
+)
+def test_what_the_route_to_a_node_tells(route: Route, why: str) -> None:
+    said = destination(an_endpoint(), BOTH, route, True)
+    assert isinstance(said, str)
+    assert why in said
+
+
+@pytest.mark.parametrize(("mtu", "has_connections"), [(1500, False), (9000, False), (1400, True)])
+def test_datagrams_are_forwarded_where_the_way_inside_takes_them(
+    mtu: int, has_connections: bool
+) -> None:
+    host = HostForwarding(longest_packet=1500)
+    assert destination(an_endpoint(), host, Route("10.0.0.2", mtu), has_connections) == THERE
+
+
+def test_datagrams_stay_in_user_space_where_the_way_inside_takes_shorter_ones() -> None:
+    host = HostForwarding(longest_packet=1500)
+    said = destination(an_endpoint(), host, Route("10.0.0.2", 1400), False)
+    assert isinstance(said, str)
+    assert "takes packets of 1400 bytes, and packets of 1500 may arrive" in said
 
 
 def test_a_node_that_is_down_stays_in_user_space() -> None:
     endpoint = an_endpoint()
     for _ in range(2):
-        assert destination(endpoint, HostForwarding()) == THERE
+        assert destination(endpoint, BOTH, ROUTE, True) == THERE
         endpoint.health.note(ProbeResult.REFUSED, 1.0)
-    assert destination(endpoint, HostForwarding()) == "the node does not answer"
+    assert destination(endpoint, BOTH, ROUTE, True) == "the node does not answer"
 
 
 PORTS = st.integers(1, 9)

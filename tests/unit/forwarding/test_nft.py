@@ -10,21 +10,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.forwarding.kernel.connection_table import ConnectionTable, Marks
+from rosproxy.forwarding.kernel.datagram_table import DatagramTable
 from rosproxy.forwarding.kernel.decisions import Changes
 from rosproxy.forwarding.kernel.nft import (
     Counts,
-    Marks,
     NftError,
-    Table,
+    Surroundings,
     TableState,
-    Transport,
     dropping_chains,
 )
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 
-TABLE = Table(11311, PortRange(45000, 45999))
-UDP = Table(45000, PortRange(45000, 45999), Transport.UDP)
+TABLE = ConnectionTable(11311, PortRange(45000, 45999))
+NOTHING = Surroundings()
 FOUR, SIX = HostPort("10.0.0.5", 50000), HostPort("fd00::5", 50001)
 
 
@@ -60,7 +60,7 @@ def test_marks_name_their_proxy_and_port(master: int, other: int, port: int) -> 
 
 
 def test_the_whole_table_takes_the_place_of_an_old_one() -> None:
-    document = TABLE.made({})
+    document = TABLE.made({}, NOTHING)
     name = "table inet rosproxy-11311"
     assert document.splitlines()[:3] == [f"add {name}", f"delete {name}", f"{name} {{"]
     assert re.findall(r"chain (\w+) {\n *type (\w+) hook \1 priority (\S+);", document) == [
@@ -73,7 +73,7 @@ def test_the_whole_table_takes_the_place_of_an_old_one() -> None:
 
 
 def test_forwards_become_elements() -> None:
-    document = TABLE.made({45050: FOUR, 45051: SIX}, counted=[45052])
+    document = TABLE.made({45050: FOUR, 45051: SIX}, NOTHING, counted=[45052])
     marks = [str(TABLE.marks.of(port)) for port in (45050, 45051, 45052)]
     assert elements(document, "add") == {
         "marks": [f"45050 : {marks[0]}", f"45051 : {marks[1]}"],
@@ -87,7 +87,7 @@ def test_forwards_become_elements() -> None:
 
 def test_what_leads_outside_is_open_to_those_who_are_near_alone() -> None:
     near = [ip_network("172.30.0.0/16"), ip_network("fd30::/64")]
-    made = TABLE.made({45050: FOUR, 26400: SIX}, near=near)
+    made = TABLE.made({45050: FOUR, 26400: SIX}, Surroundings(near))
     assert elements(made, "add")["inward"] == ["26400"]
     rules = re.search(r"chain prerouting {(.*?)}", made, re.S)
     assert rules is not None
@@ -95,20 +95,20 @@ def test_what_leads_outside_is_open_to_those_who_are_near_alone() -> None:
     assert first.strip() == "tcp dport @inward ip saddr != @near4 return"
     assert second.strip() == "tcp dport @inward ip6 saddr != @near6 return"
     assert "tcp dport map @marks" in third
-    opened = TABLE.opened(near)
+    opened = TABLE.adapted({}, Surroundings(near))
     assert opened.count("flush set inet rosproxy-11311 near") == 2
     for document in (made, opened):
         assert elements(document, "add")["near4"] == ["172.30.0.0/16"]
         assert elements(document, "add")["near6"] == ["fd30::/64"]
     assert elements(TABLE.changed(Changes({26400: SIX}, {})), "delete")["inward"] == ["26400"]
-    assert "near4" not in elements(TABLE.opened([]), "add")
+    assert "near4" not in elements(TABLE.adapted({}, NOTHING), "add")
 
 
 @pytest.mark.parametrize("host", ["robot", "10.0.0.5 }; flush ruleset", "fe80::1%}\nflush ruleset"])
 def test_nothing_but_addresses_gets_into_a_document(host: str) -> None:
-    document = TABLE.made({45050: HostPort(host, 50000)})
+    document = TABLE.made({45050: HostPort(host, 50000)}, NOTHING)
     assert elements(document, "add")["hosts4"] == ["45050 : ?"]
-    assert "flush" not in document
+    assert "ruleset" not in document
 
 
 def test_a_change_takes_out_before_it_puts_in() -> None:
@@ -129,8 +129,7 @@ def test_what_is_no_longer_forwarded_is_still_counted() -> None:
 
 def test_connections_that_are_cut_are_reset_for_who_has_connected() -> None:
     reset = "ct direction original ct mark @cut reject with tcp reset"
-    assert reset in TABLE.made({})
-    assert "reset" not in UDP.made({})
+    assert reset in TABLE.made({}, NOTHING)
     marks = [str(TABLE.marks.of(port)) for port in (26400, 45050)]
     assert elements(TABLE.cut({45050, 26400}), "add") == {"cut": marks}
     assert elements(TABLE.cut({45050, 26400}, "delete"), "delete") == {"cut": marks}
@@ -144,21 +143,20 @@ def test_ending_forwards_nothing_new_and_resets_what_comes() -> None:
     assert rule.endswith(" reject with tcp reset")
 
 
-@pytest.mark.parametrize(("table", "other"), [(TABLE, "udp"), (UDP, "tcp")])
-def test_a_table_leaves_the_other_transport_alone(table: Table, other: str) -> None:
-    made = table.made({45050: FOUR})
-    assert not re.search(rf"\b{other} dport|l4proto {other}", made)
+def test_a_table_leaves_udp_alone() -> None:
+    made = TABLE.made({45050: FOUR}, NOTHING)
+    assert not re.search(r"\budp dport|l4proto udp", made)
     chains = dict(re.findall(r"chain (\w+) {\n(.*?)\n  }", made, re.S))
     for name in ("postrouting", "forward"):
         rules = [line for line in chains[name].splitlines() if "ct status dnat" in line]
         assert rules
-        assert all(f"meta l4proto {table.transport} " in line for line in rules)
+        assert all("meta l4proto tcp " in line for line in rules)
     prerouting = chains["prerouting"].splitlines()[1:]
-    assert all(f"{table.transport} dport" in line for line in prerouting)
+    assert all("tcp dport" in line for line in prerouting)
 
 
 def test_tables_of_both_transports_have_names_of_their_own() -> None:
-    same = Table(11311, PortRange(11311, 11399), Transport.UDP)
+    same = DatagramTable(PortRange(11311, 11399))
     assert (TABLE.name, same.name) == ("rosproxy-11311", "rosproxy-udp-11311")
 
 
@@ -171,7 +169,7 @@ PORTS = st.integers(1, 65535)
 
 @given(st.dictionaries(PORTS, st.builds(HostPort, st.sampled_from(["10.0.0.5", "fd00::5"]), PORTS)))
 def test_what_is_made_is_read_back(forwards: dict[int, HostPort]) -> None:
-    read = TABLE.read(listing(TABLE.made(forwards)))
+    read = TABLE.read(listing(TABLE.made(forwards, NOTHING)))
     assert read == TableState(forwards, {})
 
 

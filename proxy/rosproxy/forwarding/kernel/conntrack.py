@@ -3,8 +3,7 @@
     tcp 6 431999 ESTABLISHED src=A dst=B sport=1 dport=2 src=C dst=D sport=3 dport=4 [ASSURED]
     mark=5 use=1
 
-The first four addresses are of the connection as it came, the others of what answers it. Lines of
-UDP have no state.
+The first four addresses are of the connection as it came, the others of what answers it.
 """
 
 from collections import Counter, defaultdict
@@ -13,8 +12,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from rosproxy.forwarding.kernel.decisions import Forwards
-from rosproxy.forwarding.kernel.nft import Marks, Transport
+from rosproxy.forwarding.kernel.connection_table import Marks
 from rosproxy.net.addresses import HostPort
 
 
@@ -35,37 +33,6 @@ def read(text: str, marks: Marks) -> list[Flow]:
     """The connections of one proxy, by its marks. Lines that make no sense are left out."""
     marked = ((e, marks.port(e.mark)) for e in _entries(text) if e.transport == "tcp")
     return [Flow(e.state, e.peer, port, e.reply_source) for e, port in marked if port is not None]
-
-
-class StrayDatagrams(NamedTuple):
-    """Where datagrams arrive that do not go where they ought to.
-
-    ``unforwarded``: at these ports somebody is not forwarded who had begun to send before; some may
-    be of another machine. ``misdirected`` are ports that still lead somebody where they led
-    formerly.
-    """
-
-    unforwarded: set[HostPort]
-    misdirected: set[int]
-
-
-def find_stray_datagrams(text: str, forwards: Forwards, marks: Marks) -> StrayDatagrams:
-    """The ports whose datagrams the kernel leads as it did when their first one came.
-
-    It notes where each sender's first datagram went, and asks no rule again, as long as no pause
-    between datagrams is longer than half a minute.
-    """
-    stray = StrayDatagrams(set(), set())
-    for entry in _entries(text):
-        port = marks.port(entry.mark)
-        if entry.transport != Transport.UDP:
-            continue
-        if port is not None and forwards.get(port) != entry.reply_source:
-            stray.misdirected.add(port)
-        # Answered by the address that it was sent to: no rule has led it elsewhere.
-        elif port is None and entry.target.port in forwards and entry.reply_source == entry.target:
-            stray.unforwarded.add(entry.target)
-    return stray
 
 
 def peers(flows: Iterable[Flow], address: str) -> dict[str, int]:

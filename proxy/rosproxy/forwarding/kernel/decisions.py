@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 import msgspec
 
 from rosproxy.leases.fast_ports import LeaseHolder
-from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.net.addresses import HostPort, Route, is_loopback
 
 Forwards = Mapping[int, HostPort]
 """Ports with the addresses of the nodes that they are forwarded to."""
@@ -22,34 +22,57 @@ longest time, it doubles from one to the other."""
 
 
 class HostForwarding(msgspec.Struct, frozen=True):
-    """What the kernel can do here: forward IPv4, forward IPv6; ``own_addresses`` are its own."""
+    """What the kernel can do here: forward IPv4, forward IPv6.
+
+    ``longest_packet`` is the largest MTU of this network namespace's interfaces, in bytes.
+    """
 
     ipv4: bool = True
     ipv6: bool = True
-    own_addresses: Collection[str] = ()
+    longest_packet: int = 0
 
 
-def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
+def destination(
+    endpoint: LeaseHolder, host: HostForwarding, route: Route, has_connections: bool
+) -> HostPort | str:
     """Where an endpoint's fast port may be forwarded to, or why it may not.
 
-    The address is the one that the proxy found the node at, the port the one that the node itself
-    named: a forged registration can't make the kernel forward to another host.
+    The address is the one that the proxy found the node at, and ``route`` leads there; the port is
+    the one that the node itself named: a forged registration can't make the kernel forward to
+    another host.
     """
-    ports, address = endpoint.node_ports, endpoint.address
+    ports = endpoint.node_ports
     if endpoint.is_down or not endpoint.trusted:
         return "the node does not answer"
     if not ports:
         return "nobody has asked for a topic of it yet"
     if len(ports) > 1:
         return "its topics are on several TCPROS ports"
-    # What is led to an own address passes no forward hook, so that the table's chain there would
-    # neither count it nor reset it.
-    if is_loopback(address) or address in host.own_addresses:
+    obstacle = _obstacle(endpoint.address, host, route, has_connections)
+    return obstacle or HostPort(endpoint.address, next(iter(ports)))
+
+
+def _obstacle(
+    address: str, host: HostForwarding, route: Route, has_connections: bool
+) -> str | None:
+    """What keeps the kernel from forwarding to an address; None if nothing does."""
+    # What is led to an own address passes no forward hook, where the table's chain would see it.
+    if is_loopback(address) or route.source == address:
         return "the node runs in the network namespace of the proxy itself"
     if not (host.ipv6 if ":" in address else host.ipv4):
         missing = "net.ipv6.conf.all.forwarding" if ":" in address else "net.ipv4.ip_forward"
         return f"{missing} is not 1 in the proxy's network namespace"
-    return HostPort(address, next(iter(ports)))
+    if is_loopback(route.source):
+        return f"the proxy has no route to {address}: add the proxy to the node's network"
+    # Linux tells the sender of a packet that is too long for the way inside (ICMP). Connection
+    # tracking translates such a message. Without tracking it names an address that is not known
+    # outside, and the sender goes on to send packets of that length.
+    if not has_connections and route.mtu < host.longest_packet:
+        return (
+            f"the way to {address} takes packets of {route.mtu} bytes, and packets of "
+            f"{host.longest_packet} may arrive: give the proxy's networks the same MTU"
+        )
+    return None
 
 
 def forwards_to_keep(

@@ -62,8 +62,8 @@ class KernelPlane:
         self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
         self.traffic, self.total = Traffic(), Counts()
         self._is_wanted = settings.data_plane in ("auto", "kernel")
-        has_connections = table.table.has_connections
-        copies = settings.data_plane == "copy" or not hasattr(os, "splice") or not has_connections
+        splices = table.has_connections and hasattr(os, "splice")
+        copies = settings.data_plane == "copy" or not splices
         self.user_plane = "copy" if copies else "splice"
 
     async def start(self) -> None:
@@ -161,7 +161,7 @@ class KernelPlane:
         for name, delta in self._accounts.count(counters, self._clock()):
             self.traffic.add("node", name, delta.sent, delta.received)
             self.total = Counts(*map(sum, zip(self.total, delta, strict=True)))
-        if not self._table.table.has_connections:
+        if not self._table.has_connections:
             return
         self._accounts.note_peers(flows)
         unanswered = self._unanswered.look(flows, self._clock())

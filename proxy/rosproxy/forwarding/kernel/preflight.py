@@ -17,7 +17,9 @@ _IPV6 = Path("/proc/sys/net/ipv6/conf/all/forwarding")
 
 def read_forwarding() -> HostForwarding:
     """What this network namespace forwards."""
-    return HostForwarding(ipv4=_read(_IPV4) == "1", ipv6=_read(_IPV6) == "1")
+    return HostForwarding(
+        ipv4=_read(_IPV4) == "1", ipv6=_read(_IPV6) == "1", longest_packet=_longest_packet()
+    )
 
 
 async def find_obstacle(mode: DataPlane, tools: Tools) -> str | None:
@@ -65,11 +67,20 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
 
 def _hardware() -> str | None:
     """A network interface that is a device: containers have only virtual ones."""
+    return next((path.name for path in _interfaces() if (path / "device").exists()), None)
+
+
+def _longest_packet() -> int:
+    """Return the largest MTU of the interfaces but loopback, in bytes; 0 if there are none."""
+    texts = (_read(path / "mtu") for path in _interfaces() if path.name != "lo")
+    return max((int(text) for text in texts if text), default=0)
+
+
+def _interfaces() -> list[Path]:
     try:
-        interfaces = sorted(_INTERFACES.iterdir())
+        return sorted(_INTERFACES.iterdir())
     except OSError:
-        return None
-    return next((path.name for path in interfaces if (path / "device").exists()), None)
+        return []
 
 
 def _read(path: Path) -> str:

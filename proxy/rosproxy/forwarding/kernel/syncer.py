@@ -6,9 +6,9 @@ transaction. All endpoints are gone through every few seconds; in between only t
 so that a thousand that come one by one don't make a million.
 
 Where an endpoint may be forwarded to is decided in `decisions`. What that depends on is kept here:
-what this network namespace forwards, which addresses are the proxy's own, forwards that failed of
-late, and why the kernel may forward nothing at all (``why_not``). That is changed by `begin`, by a
-table that can't be made any more, by `plane` when it starts and stops, and by nobody else.
+what this network namespace forwards, the routes to nodes, forwards that failed of late, and why the
+kernel may forward nothing at all (``why_not``). That is changed by `begin`, by a table that can't
+be made any more, by `plane` when it starts and stops, and by nothing else.
 """
 
 import asyncio
@@ -17,20 +17,18 @@ import itertools
 import logging
 from collections.abc import Callable, Collection
 
-from msgspec.structs import replace
-
 from rosproxy.forwarding.kernel import decisions
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
-from rosproxy.forwarding.kernel.decisions import Changes, HostForwarding
-from rosproxy.forwarding.kernel.nft import Counters, Near, NftError
+from rosproxy.forwarding.kernel.decisions import Changes, Forwards, HostForwarding
+from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Surroundings
 from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
-from rosproxy.net.addresses import HostPort
-from rosproxy.net.interfaces import address_towards
+from rosproxy.net.addresses import HostPort, Route, is_loopback
+from rosproxy.net.interfaces import route_towards
 from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
@@ -43,8 +41,8 @@ RETRY_LOST = 30.0
 
 SYNC_PATIENCE = 1.0
 """Seconds that a subscriber's requestTopic waits at most for its forward."""
-OWN_TTL = 60.0
-"""Seconds for which it is remembered which addresses are the proxy's own."""
+ROUTE_TTL = 60.0
+"""Seconds for which the routes to nodes are remembered."""
 
 
 class ForwardSyncer:
@@ -71,13 +69,13 @@ class ForwardSyncer:
         self._changed: set[LeaseHolder] = set()
         self._all_changed = True
         self._host, self._pauses = HostForwarding(), decisions.Pauses()
-        self._own: dict[str, bool] = {}
+        self._routes: dict[str, Route] = {}
         # inf: what was not possible at the start is not tried again, only a table that was lost.
-        self._own_until, self._retry_at = 0.0, float("inf")
+        self._retry_at = float("inf")
+        self._routes_until = 0.0
         self._logged: dict[LeaseHolder, str] = {}
-        has_connections = table.table.has_connections
-        self.traffic = "topics" if has_connections else "datagrams"
-        self.subject = OPTION if has_connections else f"{OPTION} for UDP"
+        self.traffic = "topics" if table.has_connections else "datagrams"
+        self.subject = OPTION if table.has_connections else f"{OPTION} for UDP"
         self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
 
@@ -90,7 +88,7 @@ class ForwardSyncer:
         """Make the table; ``why_not`` tells if that is not possible."""
         async with self._lock:
             try:
-                await self._table.begin()
+                await self._table.begin(self._surroundings)
             except ToolError as error:
                 self.why_not = str(error)
             else:
@@ -105,12 +103,13 @@ class ForwardSyncer:
         return self.usable
 
     def look_around(self) -> None:
-        """Take in which endpoints there are, what is forwarded here, at times own addresses."""
+        """Take in which endpoints there are, what is forwarded here, and at times the routes."""
         endpoints = set(self._endpoints)
         self._logged = {e: why for e, why in self._logged.items() if e in endpoints}
         self._host = read_forwarding()
-        if self._clock() > self._own_until:
-            self._own, self._own_until = {}, self._clock() + OWN_TTL
+        if self._clock() > self._routes_until:
+            self._routes = {}
+            self._routes_until = self._clock() + ROUTE_TTL
 
     def note_change(self, endpoint: LeaseHolder | None = None) -> None:
         """Note that an endpoint has changed, or any."""
@@ -201,14 +200,23 @@ class ForwardSyncer:
         """Where an endpoint's topics may be forwarded to, or why they may not."""
         if self.why_not is not None:
             return self.why_not
-        address = endpoint.address
-        if address not in self._own:
-            self._own[address] = address_towards(address) == address
-        own = {address} if self._own[address] else ()
-        target = decisions.destination(endpoint, replace(self._host, own_addresses=own))
+        route = self._route(endpoint.address)
+        has_connections = self._table.has_connections
+        target = decisions.destination(endpoint, self._host, route, has_connections)
         if isinstance(target, str) or endpoint.fast_port is None:
             return target
         return self._pauses.why(endpoint.fast_port, target, self._clock()) or target
+
+    def _route(self, address: str) -> Route:
+        route = self._routes.get(address) or route_towards(address)
+        # The proxy may join the network of a node just after the node's first sign.
+        if not is_loopback(route.source):
+            self._routes[address] = route
+        return route
+
+    def _surroundings(self, forwards: Forwards) -> Surroundings:
+        hosts = {target.host for target in forwards.values()}
+        return Surroundings(self._near(), {host: self._route(host).source for host in hosts})
 
     async def _wait_until(self, condition: Callable[[], bool]) -> None:
         """Wait a moment for the worker to make a condition true."""
@@ -231,14 +239,14 @@ class ForwardSyncer:
     async def _change(self) -> None:
         wanted = self._wanted()
         try:
-            self._log(await self._table.change(wanted, self._near()))
+            self._log(await self._table.change(wanted, self._surroundings(wanted)))
         except ToolError as error:
             log.warning("%s; making the table again", error)
             await self._make(wanted)
 
     async def _make(self, wanted: dict[int, HostPort]) -> None:
         try:
-            await self._table.make(wanted)
+            await self._table.make(wanted, self._surroundings(wanted))
         except ToolError as error:
             self._all_changed, self.why_not = True, str(error)
             self._retry_at = self._clock() + RETRY_LOST

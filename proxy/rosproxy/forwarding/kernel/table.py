@@ -2,15 +2,14 @@
 
 import asyncio
 import logging
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable
 
 from rosproxy.forwarding.kernel import conntrack
+from rosproxy.forwarding.kernel.connection_table import ConnectionTable
 from rosproxy.forwarding.kernel.conntrack import Flow
 from rosproxy.forwarding.kernel.decisions import Changes, Forwards, changes
-from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Table, TableState
+from rosproxy.forwarding.kernel.nft import Counters, NftError, Surroundings, Table, TableState
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
-from rosproxy.net.interfaces import address_towards
 
 RESET_TIME = 0.3
 """Seconds for which connections are reset before the kernel forgets them."""
@@ -18,23 +17,23 @@ RESET_TIME = 0.3
 log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
 class KernelTable:
-    """What the kernel has, as far as is known: ``forwards``, and the ports that are ``counted``.
+    """What the kernel has, as far as is known: ``forwards``, and the ports that are ``counted``."""
 
-    ``near`` are those who may use the forwards that lead outside.
-    """
+    has_connections = False
+    """Whether the kernel tracks what it forwards: answered, and ended by a reset."""
 
-    table: Table
-    tools: Tools
-    forwards: Forwards = field(default_factory=dict)
-    counted: set[int] = field(default_factory=set)
-    near: Near = ()
+    def __init__(self, table: Table, tools: Tools) -> None:
+        self.table = table
+        self.tools = tools
+        self.forwards: Forwards = {}
+        self.counted: set[int] = set()
+        self._surroundings = Surroundings()
 
-    async def begin(self) -> None:
+    async def begin(self, surroundings: Callable[[Forwards], Surroundings]) -> None:
         """Make the table with what a former process left in it. Raises ToolError.
 
-        Connections under way go on: the kernel has noted for each of them where it leads.
+        ``surroundings`` tells those of forwards.
         """
         try:
             former = await self._read()
@@ -42,42 +41,89 @@ class KernelTable:
             log.debug("no table of a former process: %s", error)
             former = TableState()
         self.counted = set(former.counters)
-        # Only to see, before anything is forwarded, whether conntrack can be run.
-        await self._list_flows(False, "--mark", self.table.marks.table_selector)
-        await self.make(former.forwards)
+        await self.make(former.forwards, surroundings(former.forwards))
 
-    async def make(self, wanted: Forwards) -> None:
+    async def make(self, wanted: Forwards, surroundings: Surroundings) -> None:
         """Put the whole table in place of the one that may be there. Raises ToolError."""
-        await self._apply(self.table.made(wanted, self.counted, self.near), wanted)
+        self._surroundings = surroundings
+        await self._apply(self.table.made(wanted, surroundings, self.counted), wanted)
 
-    async def change(self, wanted: Forwards, near: Near) -> Changes:
+    async def change(self, wanted: Forwards, surroundings: Surroundings) -> Changes:
         """Have it forward what is wanted, and tell what that changed. Raises ToolError."""
         change = changes(self.forwards, wanted)
-        document = self.table.opened(near) if near != self.near else ""
-        self.near = near
-        if change or document:
-            await self._apply(document + self.table.changed(change), wanted)
+        if change or surroundings != self._surroundings:
+            self._surroundings = surroundings
+            document = self.table.changed(change) + self.table.adapted(wanted, surroundings)
+            await self._apply(document, wanted)
         return change
 
     async def look(self, ipv6: bool) -> tuple[Counters, list[Flow]]:
         """Take in what the kernel really has: what was counted by port, and connections.
 
-        Datagrams have no connections; those that go astray are put right. Raises ToolError,
-        NftError.
+        Raises ToolError, NftError.
         """
-        state, marks = await self._read(), self.table.marks
+        state = await self._read()
         self.forwards = state.forwards
-        if not self.table.has_connections:
-            await self._forget_stray(ipv6)
-            return state.counters, []
-        text = await self._list_flows(ipv6, "--mark", marks.table_selector)
-        return state.counters, conntrack.read(text, marks)
+        return state.counters, []
+
+    async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
+        """Do nothing: a datagram has no connection."""
+
+    async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
+        """Do nothing: a datagram has no connection."""
+
+    async def remove(self) -> None:
+        """Remove the table."""
+        try:
+            await self.tools.nft("-f", "-", document=self.table.removed())
+        except ToolError as error:
+            log.warning("table %s can't be removed: %s", self.table.name, error)
+        self.forwards = {}
+
+    async def _apply(self, document: str, forwards: Forwards) -> None:
+        await self.tools.nft("-f", "-", document=document)
+        self.forwards = dict(forwards)
+        self.counted |= set(forwards)
+
+    async def _read(self) -> TableState:
+        listed = await self.tools.nft("-j", "list", "table", "inet", self.table.name)
+        return self.table.read(listed)
+
+
+class TrackedTable(KernelTable):
+    """A table whose connections the kernel tracks."""
+
+    has_connections = True
+
+    def __init__(self, table: ConnectionTable, tools: Tools) -> None:
+        super().__init__(table, tools)
+        self._connections = table
+
+    async def begin(self, surroundings: Callable[[Forwards], Surroundings]) -> None:
+        """Make the table with what a former process left in it. Raises ToolError.
+
+        Connections under way go on: the kernel has noted for each of them where it leads.
+        """
+        # Only to see, before anything is forwarded, whether conntrack can be run.
+        await self._list_flows(False)
+        await super().begin(surroundings)
+
+    async def look(self, ipv6: bool) -> tuple[Counters, list[Flow]]:
+        """Take in what the kernel really has: what was counted by port, and connections.
+
+        Raises ToolError, NftError.
+        """
+        counters, _ = await super().look(ipv6)
+        families = (False, True) if ipv6 else (False,)
+        text = "".join([await self._list_flows(family) for family in families])
+        return counters, conntrack.read(text, self._connections.marks)
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
         """Forget connections through ports, each of IPv6 or not; those of one state if given."""
         state_options = ("--state", state) if state else ()
         for port, ipv6 in ports:
-            await self._forget(ipv6, "--mark", self.table.marks.port_selector(port), *state_options)
+            selector = self._connections.marks.port_selector(port)
+            await self._forget(ipv6, "--mark", selector, *state_options)
 
     async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
         """End the connections through ports, each of IPv6 or not, so that both ends learn of it.
@@ -88,59 +134,32 @@ class KernelTable:
         """
         numbers = {port for port, _ in ports}
         try:
-            await self.tools.nft("-f", "-", document=self.table.cut(numbers))
+            await self.tools.nft("-f", "-", document=self._connections.cut(numbers))
             await asyncio.sleep(RESET_TIME)
             await self.forget(ports)
-            await self.tools.nft("-f", "-", document=self.table.cut(numbers, "delete"))
+            await self.tools.nft("-f", "-", document=self._connections.cut(numbers, "delete"))
         except ToolError as error:
             log.warning("connections can't be ended: %s", error)
 
     async def remove(self) -> None:
         """End what goes through the table, remove it, and forget all connections through it."""
-        try:
-            if self.forwards and self.table.has_connections:
-                await self.tools.nft("-f", "-", document=self.table.ended())
+        if self.forwards:
+            try:
+                await self.tools.nft("-f", "-", document=self._connections.ended())
                 await asyncio.sleep(RESET_TIME)
-            await self.tools.nft("-f", "-", document=self.table.removed())
-        except ToolError as error:
-            log.warning("table %s can't be removed: %s", self.table.name, error)
+            except ToolError as error:
+                log.warning("connections can't be ended: %s", error)
+        await super().remove()
         for ipv6 in (False, True):
-            await self._forget(ipv6, "--mark", self.table.marks.table_selector)
-        self.forwards = {}
+            await self._forget(ipv6, "--mark", self._connections.marks.table_selector)
 
-    async def _apply(self, document: str, forwards: Forwards) -> None:
-        await self.tools.nft("-f", "-", document=document)
-        hosts = {target.host for target in (*self.forwards.values(), *forwards.values())}
-        self.forwards = dict(forwards)
-        self.counted |= set(forwards)
-        if not self.table.has_connections:
-            await self._forget_stray(any(":" in host for host in hosts))
-
-    async def _forget_stray(self, ipv6: bool) -> None:
-        """Forget where stray datagrams go, so that they go by the rules. Raises ToolError."""
-        text = await self._list_flows(ipv6)
-        unled, misled = conntrack.find_stray_datagrams(text, self.forwards, self.table.marks)
-        for dst in unled:
-            # Only what was sent to this machine itself, and what no rule has led elsewhere: of that
-            # the port that answers is the one that was asked.
-            if address_towards(dst.host) == dst.host:
-                port = str(dst.port)
-                args = "--orig-dst", dst.host, "--orig-port-dst", port, "--reply-port-src", port
-                await self._forget(":" in dst.host, *args)
-        await self.forget((port, six) for port in misled for six in {False, ipv6})
-
-    async def _list_flows(self, ipv6: bool, *options: str) -> str:
-        """The connections of IPv4 and maybe IPv6, as conntrack prints them. Raises ToolError."""
-        families, transport = (False, True) if ipv6 else (False,), self.table.transport
-        texts = [await self.tools.list_flows(transport, family, *options) for family in families]
-        return "".join(texts)
-
-    async def _read(self) -> TableState:
-        listed = await self.tools.nft("-j", "list", "table", "inet", self.table.name)
-        return self.table.read(listed)
+    async def _list_flows(self, ipv6: bool) -> str:
+        """The table's connections, as conntrack prints them. Raises ToolError."""
+        selector = self._connections.marks.table_selector
+        return await self.tools.list_flows(ipv6, "--mark", selector)
 
     async def _forget(self, ipv6: bool, *options: str) -> None:
         try:
-            await self.tools.forget_flows(self.table.transport, ipv6, *options)
+            await self.tools.forget_flows(ipv6, *options)
         except ToolError as error:
             log.warning("connections can't be ended: %s", error)

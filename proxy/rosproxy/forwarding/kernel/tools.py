@@ -42,14 +42,14 @@ class Tools:
         """Run nft, with a document on its standard input; what it prints. Raises ToolError."""
         return await self._run("nft", *arguments, document=document)
 
-    async def list_flows(self, transport: str, ipv6: bool, *options: str) -> str:
-        """The tracked connections of TCP or UDP: all, or as options select. Raises ToolError."""
-        return await self._run("conntrack", "-L", *_selection(transport, ipv6), *options)
+    async def list_flows(self, ipv6: bool, *options: str) -> str:
+        """Return the tracked TCP connections that options select. Raises ToolError."""
+        return await self._run("conntrack", "-L", *_selection(ipv6), *options)
 
-    async def forget_flows(self, transport: str, ipv6: bool, *options: str) -> None:
+    async def forget_flows(self, ipv6: bool, *options: str) -> None:
         """Delete the same. Raises ToolError."""
         try:
-            await self._run("conntrack", "-D", *_selection(transport, ipv6), *options)
+            await self._run("conntrack", "-D", *_selection(ipv6), *options)
         except ToolError as error:
             # conntrack fails if there was nothing to delete; kube-proxy looks for the same text
             # (pkg/proxy/conntrack, noConnectionToDelete).
@@ -72,8 +72,8 @@ class Tools:
             run.exception()
 
 
-def _selection(transport: str, ipv6: bool) -> list[str]:
-    return ["-f", "ipv6" if ipv6 else "ipv4", "-p", transport]
+def _selection(ipv6: bool) -> list[str]:
+    return ["-f", "ipv6" if ipv6 else "ipv4", "-p", "tcp"]
 
 
 def _find(name: str) -> str:

@@ -2,7 +2,7 @@
 
 from rosproxy.forwarding.kernel.decisions import HostForwarding, destination
 from rosproxy.leases.ports import PortPool
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.registry.participants import LeaseKind
@@ -30,8 +30,8 @@ def test_only_user_data_is_forwarded() -> None:
     assert target == LOCATOR
     assert domain.inside.leases[port][1].kind is LeaseKind.DATA
     (lease,) = leases
-    assert destination(lease, HostForwarding()) == LOCATOR
-    assert destination(lease, HostForwarding(own_addresses=(INSIDE,))) != LOCATOR
+    assert destination(lease, HostForwarding(), Route("172.30.0.2", 1500), False) == LOCATOR
+    assert destination(lease, HostForwarding(), Route(INSIDE, 1500), False) != LOCATOR
 
 
 def test_a_locator_that_turns_out_to_be_of_metatraffic_is_not_forwarded() -> None:
