@@ -1,6 +1,7 @@
 """nft and conntrack of a test: they keep one table as the kernel would, and fail when told to."""
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -54,10 +55,10 @@ class FakeTools(Tools):
             self._apply(line.split(maxsplit=5))
         return ""
 
-    async def list_flows(self, ipv6: bool, *which: str) -> str:
+    async def list_flows(self, take: Callable[[str], None], ipv6: bool, *which: str) -> None:
         """What conntrack prints."""
         self._maybe_fail()
-        return "" if ipv6 else self.flows
+        take("" if ipv6 else self.flows)
 
     async def forget_flows(self, ipv6: bool, *which: str) -> None:
         """Note what is to be forgotten."""

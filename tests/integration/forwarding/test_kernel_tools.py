@@ -102,8 +102,9 @@ async def test_programs_get_their_words_and_document(programs: Path) -> None:
     program(programs, "nft", 'echo "$@"; /bin/cat')
     program(programs, "conntrack", 'echo "$@"')
     assert await Tools().nft("-f", "-", document="{}") == "-f -\n{}"
-    listed = await Tools().list_flows(True, "--mark", "1/2")
-    assert listed == "-L -f ipv6 -p tcp --mark 1/2\n"
+    listed: list[str] = []
+    await Tools().list_flows(listed.append, True, "--mark", "1/2")
+    assert listed == ["-L -f ipv6 -p tcp --mark 1/2\n"]
     await Tools().forget_flows(False, "--state", "SYN_SENT")
 
 
@@ -119,6 +120,59 @@ async def test_complaints_say_what_to_do(programs: Path, script: str, said: str)
     program(programs, "nft", script)
     with pytest.raises(ToolError, match=said):
         await Tools().nft("list", "chains")
+
+
+async def test_a_long_list_keeps_the_loop_for_one_piece_at_a_time(programs: Path) -> None:
+    count = 65_000
+    program(programs, "conntrack", f"/usr/bin/seq -f 'line %08g of a flood of connections' {count}")
+    pieces: list[str] = []
+    turns_before: list[int] = []
+    turns = 0
+
+    async def turn() -> None:
+        nonlocal turns
+        while True:
+            await asyncio.sleep(0)
+            turns += 1
+
+    def take(lines: str) -> None:
+        pieces.append(lines)
+        turns_before.append(turns)
+
+    others = asyncio.ensure_future(turn())
+    await Tools().list_flows(take, False)
+    others.cancel()
+    text = "".join(pieces)
+    assert text.splitlines()[-1] == f"line {count:08} of a flood of connections"
+    assert text.count("\n") == count
+    assert max(map(len, pieces)) < kernel_tools.PIECE + 100
+    assert all(piece.endswith("\n") for piece in pieces)
+    assert len(set(turns_before)) == len(turns_before), "others have a turn between two pieces"
+
+
+async def test_a_list_without_end_is_read_in_part(
+    programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_tools, "LONGEST_LIST", 100_000)
+    program(programs, "conntrack", "exec /usr/bin/yes connection")
+    pieces: list[str] = []
+    await Tools().list_flows(pieces.append, False)
+    assert 50_000 < sum(map(len, pieces)) <= 100_000
+
+
+async def test_a_list_that_fails_says_what_to_do(
+    programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program(programs, "conntrack", "echo Operation not permitted >&2; exit 1")
+    with pytest.raises(ToolError, match="NET_ADMIN"):
+        await Tools().list_flows(print, False)
+    (programs / "conntrack").write_text("#!/no/such/shell\n")
+    with pytest.raises(ToolError, match="can't run"):
+        await Tools().list_flows(print, False)
+    monkeypatch.setattr(kernel_tools, "TIMEOUT", 0.2)
+    program(programs, "conntrack", "exec /bin/sleep 30")
+    with pytest.raises(ToolError, match="did not end"):
+        await Tools().list_flows(print, False)
 
 
 async def test_deleting_nothing_is_no_failure(programs: Path) -> None:

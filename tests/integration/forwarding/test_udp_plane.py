@@ -1,6 +1,6 @@
 """The kernel plane of ROS 2 with a kernel made up: what is forwarded, and what is counted."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 
@@ -155,7 +155,7 @@ async def test_a_locator_behind_a_shorter_mtu_stays_with_the_proxy(
 class NftAlone(FakeTools):
     """A machine without conntrack."""
 
-    async def list_flows(self, ipv6: bool, *which: str) -> str:
+    async def list_flows(self, take: Callable[[str], None], ipv6: bool, *which: str) -> None:
         """Fail."""
         raise ToolError("conntrack is not installed")
 

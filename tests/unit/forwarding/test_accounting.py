@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from rosproxy.forwarding.kernel import accounting
 from rosproxy.forwarding.kernel.accounting import Account, CounterDeltas, KernelAccounts
-from rosproxy.forwarding.kernel.conntrack import Flow
 from rosproxy.forwarding.kernel.nft import Counts
 from rosproxy.leases import fast_ports
 from rosproxy.leases.ports import PortRange
@@ -32,8 +31,10 @@ def a_book(holders: int) -> tuple[Registry, KernelAccounts, list[Endpoint]]:
     return registry, book, endpoints
 
 
-def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
-    return Flow("ESTABLISHED", HostPort(peer, 1), port, HostPort(endpoint.location.address, 50000))
+def connection(
+    endpoint: Endpoint, port: int, peer: str = "192.0.2.1"
+) -> tuple[tuple[int, str], dict[str, int]]:
+    return (port, endpoint.location.address), {peer: 1}
 
 
 STEPS = st.tuples(st.integers(0, 1000), st.integers(0, 1000), st.integers(0, 10))
@@ -79,7 +80,7 @@ def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> Non
     fast_ports.give_back(registry.pool, first)
     book.note_owners(registry)
     assert book.ports_of(first) == [1002]
-    book.note_peers([open_flow(first, 1002)])
+    book.note_peers(dict([connection(first, 1002)]))
     assert first.fast_peers == {"192.0.2.1": 1}
     registry.remove(first)
     book.note_owners(registry)
@@ -89,15 +90,17 @@ def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> Non
 
 def test_peers_are_those_of_the_nodes_own_address() -> None:
     _, book, (first, second) = a_book(2)
-    flows = [open_flow(first, 1002), open_flow(first, 1003), open_flow(second, 1003, "192.0.2.2")]
-    book.note_peers(flows)
+    connections = dict(
+        [connection(first, 1002), connection(first, 1003), connection(second, 1003, "192.0.2.2")]
+    )
+    book.note_peers(connections)
     assert first.fast_peers == {"192.0.2.1": 1}
     assert second.fast_peers == {"192.0.2.2": 1}
     second.health.end(1.0)
-    book.note_peers(flows)
+    book.note_peers(connections)
     assert second.fast_peers == {}
     assert first.fast_peers == {"192.0.2.1": 1}
-    book.note_peers([])
+    book.note_peers({})
     assert first.fast_peers == second.fast_peers == {}
 
 

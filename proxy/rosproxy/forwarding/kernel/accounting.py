@@ -1,10 +1,10 @@
 """What the kernel has forwarded and forwards, by endpoint: bytes, and open connections."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rosproxy.forwarding.kernel import conntrack
-from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.conntrack import OpenConnections
 from rosproxy.forwarding.kernel.nft import Counters, Counts
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
@@ -113,19 +113,19 @@ class KernelAccounts:
             by_name.append((names[0] if names else "unnamed", delta))
         return by_name
 
-    def note_peers(self, flows: Sequence[Flow]) -> None:
-        """Take in all connections that the kernel tracks now.
+    def note_peers(self, connections: OpenConnections) -> None:
+        """Take in all open connections that the kernel tracks now.
 
         Those to a node that is down don't count: if its host vanished without a word, the kernel
         takes them for open for days.
         """
-        by_owner: dict[LeaseHolder, list[Flow]] = {e: [] for e in self.owners.values()}
-        for flow in flows:
-            owner = self.owners.get(flow.port)
-            if owner is not None and not owner.is_down:
-                by_owner[owner].append(flow)
-        for endpoint, own_flows in by_owner.items():
-            endpoint.fast_peers = conntrack.peers(own_flows, endpoint.address)
+        by_owner: dict[LeaseHolder, Counter[str]] = {e: Counter() for e in self.owners.values()}
+        for (port, node), counts in connections.items():
+            owner = self.owners.get(port)
+            if owner is not None and not owner.is_down and owner.address in ("", node):
+                by_owner[owner].update(counts)
+        for endpoint, counts in by_owner.items():
+            endpoint.fast_peers = dict(counts)
 
     def account(self, endpoint: LeaseHolder) -> Account:
         """What went through an endpoint's fast ports so far."""

@@ -1,87 +1,100 @@
-"""What ``conntrack -L`` prints: one connection a line, as the kernel tracks it.
+"""The connections of a proxy, counted from what ``conntrack -L`` prints: one connection a line.
 
     tcp 6 431999 ESTABLISHED src=A dst=B sport=1 dport=2 src=C dst=D sport=3 dport=4 [ASSURED]
     mark=5 use=1
 
-The first four addresses are of the connection as it came, the others of what answers it.
+The first four addresses are of the connection as it came, the others of its answers. A flood makes
+tens of thousands of lines. So a `Survey` takes the list piece by piece, and keeps little of it.
 """
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+import re
+from collections.abc import Iterable, Mapping
 
 import msgspec
 
 from rosproxy.forwarding.kernel.connection_table import Marks
 from rosproxy.net.addresses import HostPort
 
+MOST_PEERS = 256
+"""Addresses of peers that are told apart for one port; connections of all others are added up."""
+OTHERS = "others"
+"""The name of all other peers."""
+MOST_WAITING = 64
+"""Connections of one port that are watched until the node answers; one is enough to judge by."""
+
+# All other states are of a connection that begins or ends. The numbers have the digits of a port,
+# and of 32 bits.
+_LINE = re.compile(
+    r"^tcp +6 [0-9]+ (ESTABLISHED|SYN_SENT) src=(\S+) dst=\S+ sport=([0-9]{1,5}) "
+    r".*?src=(\S+) dst=\S+ sport=([0-9]{1,5}) .*?mark=([0-9]{1,10})",
+    re.MULTILINE,
+)
+
+OpenConnections = Mapping[tuple[int, str], Mapping[str, int]]
+"""How many connections each peer has, by the peer's address, for each port and node address."""
+
 
 class Flow(msgspec.Struct, frozen=True):
-    """A TCP connection that the kernel forwards: from ``peer`` through ``port`` to ``node``.
+    """A TCP connection that the kernel forwards: from ``peer`` through ``port`` to ``node``."""
 
-    Its ``state`` is ESTABLISHED while both sides have said yes and none has ended it, and SYN_SENT
-    while the node has not answered yet.
-    """
-
-    state: str
     peer: HostPort
     port: int
     node: HostPort
 
 
-def read(text: str, marks: Marks) -> list[Flow]:
-    """The connections of one proxy, by its marks. Lines that make no sense are left out."""
-    marked = ((e, marks.port(e.mark)) for e in _entries(text) if e.transport == "tcp")
-    return [Flow(e.state, e.peer, port, e.reply_source) for e, port in marked if port is not None]
+class Survey:
+    """The connections of one proxy, by its marks.
 
+    ``open`` counts those that both sides have agreed to. ``waiting`` are those that the node has
+    not answered yet, at most `MOST_WAITING` of each port.
+    """
 
-def peers(flows: Iterable[Flow], address: str) -> dict[str, int]:
-    """How many open connections each peer has with the node at an address; empty: at any."""
-    matching = (flow for flow in flows if address in ("", flow.node.host))
-    return dict(Counter(flow.peer.host for flow in matching if flow.state == "ESTABLISHED"))
+    def __init__(self, marks: Marks) -> None:
+        self._marks = marks
+        self._waiting: dict[int, list[Flow]] = {}
+        self._open: dict[tuple[int, str], dict[str, int]] = {}
+
+    @property
+    def open(self) -> OpenConnections:
+        """The open connections."""
+        return self._open
+
+    @property
+    def waiting(self) -> list[Flow]:
+        """The unanswered connections."""
+        return [flow for flows in self._waiting.values() for flow in flows]
+
+    def add(self, lines: str) -> None:
+        """Add whole lines of the list. A malformed line is left out."""
+        for state, peer, peer_port, node, node_port, mark in _LINE.findall(lines):
+            port = self._marks.port(int(mark))
+            if port is None:
+                continue
+            if state == "ESTABLISHED":
+                self._count(port, node, peer)
+            else:
+                flow = Flow(HostPort(peer, int(peer_port)), port, HostPort(node, int(node_port)))
+                self._watch(flow)
+
+    def _count(self, port: int, node: str, peer: str) -> None:
+        counts = self._open.setdefault((port, node), {})
+        name = peer if peer in counts or len(counts) < MOST_PEERS else OTHERS
+        counts[name] = counts.get(name, 0) + 1
+
+    def _watch(self, flow: Flow) -> None:
+        flows = self._waiting.setdefault(flow.port, [])
+        if len(flows) < MOST_WAITING:
+            flows.append(flow)
 
 
 class Watch:
-    """Which connections nobody has answered for ``patience`` seconds."""
+    """Finds connections that the node has not answered for ``patience`` seconds."""
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
         self._since: dict[Flow, float] = {}
 
-    def look(self, flows: Sequence[Flow], now: float) -> list[Flow]:
-        """Those among the connections that there are at a time."""
-        waiting = (flow for flow in flows if flow.state == "SYN_SENT")
+    def look(self, waiting: Iterable[Flow], now: float) -> list[Flow]:
+        """Return them, of the unanswered connections at a time."""
         self._since = {flow: self._since.get(flow, now) for flow in waiting}
         return [flow for flow, since in self._since.items() if now - since >= self._patience]
-
-
-class _Entry(NamedTuple):
-    """A line: ``peer`` sends to ``target``, and ``reply_source`` answers."""
-
-    transport: str
-    state: str
-    peer: HostPort
-    target: HostPort
-    reply_source: HostPort
-    mark: int
-
-
-def _entries(text: str) -> Iterator[_Entry]:
-    """The lines that make sense."""
-    return filter(None, (_entry(line.split()) for line in text.splitlines()))
-
-
-def _entry(fields: list[str]) -> _Entry | None:
-    values: defaultdict[str, list[str]] = defaultdict(list)
-    for key, equals, value in (field.partition("=") for field in fields):
-        if equals:
-            values[key].append(value)
-    # Not a mark such as [ASSURED] or [UNREPLIED], which lines of UDP have as well.
-    state = next((field for field in fields[1:] if field.isupper() and field[0].isalpha()), "")
-    try:
-        mark = int(values["mark"][0])
-        peer, reply_source = (HostPort(values["src"][i], int(values["sport"][i])) for i in range(2))
-        target = HostPort(values["dst"][0], int(values["dport"][0]))
-    except (IndexError, ValueError):
-        return None
-    return _Entry(fields[0], state, peer, target, reply_source, mark)

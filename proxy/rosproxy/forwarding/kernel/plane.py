@@ -157,14 +157,14 @@ class KernelPlane:
         reading = await self.syncer.read_kernel()
         if reading is None:
             return
-        counters, flows = reading
+        counters, survey = reading
         for name, delta in self._accounts.count(counters, self._clock()):
             self.traffic.add("node", name, delta.sent, delta.received)
             self.total = Counts(*map(sum, zip(self.total, delta, strict=True)))
-        if not self._table.has_connections:
+        if survey is None:
             return
-        self._accounts.note_peers(flows)
-        unanswered = self._unanswered.look(flows, self._clock())
+        self._accounts.note_peers(survey.open)
+        unanswered = self._unanswered.look(survey.waiting, self._clock())
         await self.syncer.take_back(
             {*self._accounts.unanswered, *(flow.port for flow in unanswered)}
         )

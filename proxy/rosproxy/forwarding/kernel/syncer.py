@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection
 
 from rosproxy.forwarding.kernel import decisions
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
-from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.conntrack import Survey
 from rosproxy.forwarding.kernel.decisions import Changes, Forwards, HostForwarding
 from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Surroundings
 from rosproxy.forwarding.kernel.preflight import read_forwarding
@@ -163,7 +163,7 @@ class ForwardSyncer:
         """Wait a moment until a port is not forwarded any more."""
         await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 
-    async def read_kernel(self) -> tuple[Counters, list[Flow]] | None:
+    async def read_kernel(self) -> tuple[Counters, Survey | None] | None:
         """The kernel's counters and connections; None if the table had to be made again."""
         async with self._lock:
             self._accounts.note_owners(self._endpoints)
@@ -250,7 +250,7 @@ class ForwardSyncer:
         except ToolError as error:
             self._all_changed, self.why_not = True, str(error)
             self._retry_at = self._clock() + RETRY_LOST
-            self._accounts.note_peers([])
+            self._accounts.note_peers({})
             text = f"{self.traffic} are no longer forwarded by the kernel: {error}"
             log.error("%s", text)
             self._problems.add(self.subject, text)

@@ -4,9 +4,8 @@ import asyncio
 import logging
 from collections.abc import Callable, Collection, Iterable
 
-from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.connection_table import ConnectionTable
-from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.conntrack import Survey
 from rosproxy.forwarding.kernel.decisions import Changes, Forwards, changes
 from rosproxy.forwarding.kernel.nft import Counters, NftError, Surroundings, Table, TableState
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
@@ -57,14 +56,14 @@ class KernelTable:
             await self._apply(document, wanted)
         return change
 
-    async def look(self, ipv6: bool) -> tuple[Counters, list[Flow]]:
+    async def look(self, ipv6: bool) -> tuple[Counters, Survey | None]:
         """Take in what the kernel really has: what was counted by port, and connections.
 
         Raises ToolError, NftError.
         """
         state = await self._read()
         self.forwards = state.forwards
-        return state.counters, []
+        return state.counters, None
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
         """Do nothing: a datagram has no connection."""
@@ -105,18 +104,19 @@ class TrackedTable(KernelTable):
         Connections under way go on: the kernel has noted for each of them where it leads.
         """
         # Only to see, before anything is forwarded, whether conntrack can be run.
-        await self._list_flows(False)
+        await self._list_flows(lambda lines: None, False)
         await super().begin(surroundings)
 
-    async def look(self, ipv6: bool) -> tuple[Counters, list[Flow]]:
+    async def look(self, ipv6: bool) -> tuple[Counters, Survey | None]:
         """Take in what the kernel really has: what was counted by port, and connections.
 
         Raises ToolError, NftError.
         """
         counters, _ = await super().look(ipv6)
-        families = (False, True) if ipv6 else (False,)
-        text = "".join([await self._list_flows(family) for family in families])
-        return counters, conntrack.read(text, self._connections.marks)
+        survey = Survey(self._connections.marks)
+        for family in (False, True) if ipv6 else (False,):
+            await self._list_flows(survey.add, family)
+        return counters, survey
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
         """Forget connections through ports, each of IPv6 or not; those of one state if given."""
@@ -153,10 +153,10 @@ class TrackedTable(KernelTable):
         for ipv6 in (False, True):
             await self._forget(ipv6, "--mark", self._connections.marks.table_selector)
 
-    async def _list_flows(self, ipv6: bool) -> str:
-        """The table's connections, as conntrack prints them. Raises ToolError."""
+    async def _list_flows(self, take: Callable[[str], None], ipv6: bool) -> None:
+        """Pass the table's connections to ``take``, as conntrack prints them. Raises ToolError."""
         selector = self._connections.marks.table_selector
-        return await self.tools.list_flows(ipv6, "--mark", selector)
+        await self.tools.list_flows(take, ipv6, "--mark", selector)
 
     async def _forget(self, ipv6: bool, *options: str) -> None:
         try:

@@ -5,10 +5,13 @@ who is not root.
 """
 
 import asyncio
+import contextlib
 import os
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
 """Where the image has them; searched before the PATH."""
@@ -16,6 +19,12 @@ SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
 """Where they are outside of an unprivileged user's PATH."""
 TIMEOUT = 5.0
 """Seconds that one of them may take."""
+LONGEST_LIST = 16 * 1024 * 1024
+"""Bytes of a list of connections that are read, some 95,000 lines."""
+PIECE = 16 * 1024
+"""Bytes of a list that are read at once, some hundred lines."""
+ENVIRONMENT = {"LC_ALL": "C"}
+"""The proxy looks into messages of the programs, in English."""
 REMEDY = (
     "give the proxy's container the capability NET_ADMIN (cap_add: NET_ADMIN) and run it without "
     "no-new-privileges"
@@ -42,9 +51,33 @@ class Tools:
         """Run nft, with a document on its standard input; what it prints. Raises ToolError."""
         return await self._run("nft", *arguments, document=document)
 
-    async def list_flows(self, ipv6: bool, *options: str) -> str:
-        """Return the tracked TCP connections that options select. Raises ToolError."""
-        return await self._run("conntrack", "-L", *_selection(ipv6), *options)
+    async def list_flows(self, take: Callable[[str], None], ipv6: bool, *options: str) -> None:
+        """Pass the tracked TCP connections that options select to ``take``. Raises ToolError.
+
+        ``take`` gets whole lines, in pieces that keep the event loop for a moment only, and no more
+        than `LONGEST_LIST` bytes in all. The run ends with the task that called.
+        """
+        command = [_find("conntrack"), "-L", *_selection(ipv6), *options]
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=ENVIRONMENT
+            )
+        except OSError as error:
+            raise _start_error(command[0], error) from None
+        try:
+            async with asyncio.timeout(TIMEOUT):
+                if not await _pass_lines(cast(asyncio.StreamReader, process.stdout), take):
+                    return
+                _, complaint = await process.communicate()
+        except TimeoutError:
+            raise _timeout_error(command[0]) from None
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            # `wait` alone hangs while a pipe is full (asyncio.base_subprocess, _try_finish).
+            await process.communicate()
+        if process.returncode != 0:
+            raise _failure(command[0], complaint.decode("utf-8", "replace"))
 
     async def forget_flows(self, ipv6: bool, *options: str) -> None:
         """Delete the same. Raises ToolError."""
@@ -95,16 +128,43 @@ def _run(command: list[str], document: str) -> str:
             errors="replace",
             timeout=TIMEOUT,
             check=False,
-            env={"LC_ALL": "C"},  # messages are looked into here, in English
+            env=ENVIRONMENT,
         )
     except subprocess.TimeoutExpired:
-        raise ToolError(f"{command[0]} did not end in {TIMEOUT:g} s") from None
-    except PermissionError as error:
-        raise ToolError(f"{command[0]} may not run ({error.strerror}): {REMEDY}") from None
+        raise _timeout_error(command[0]) from None
     except OSError as error:
-        raise ToolError(f"{command[0]} can't run: {error.strerror}") from None
+        raise _start_error(command[0], error) from None
     if completed.returncode != 0:
-        message = " ".join(completed.stderr.split())[:300]
-        is_refused = "not permitted" in message or "you must be root" in message
-        raise ToolError(f"{command[0]}: {message}" + (f": {REMEDY}" if is_refused else ""))
+        raise _failure(command[0], completed.stderr)
     return completed.stdout
+
+
+async def _pass_lines(stream: asyncio.StreamReader, take: Callable[[str], None]) -> bool:
+    """Pass lines to ``take`` as they come; whether the list ended within `LONGEST_LIST`."""
+    rest = b""
+    count = 0
+    while piece := await stream.read(PIECE):
+        count += len(piece)
+        if count > LONGEST_LIST:
+            return False
+        lines, newline, rest = (rest + piece).rpartition(b"\n")
+        take((lines + newline).decode("utf-8", "replace"))
+        # `read` returns at once while bytes are buffered.
+        await asyncio.sleep(0)
+    return True
+
+
+def _timeout_error(program: str) -> ToolError:
+    return ToolError(f"{program} did not end in {TIMEOUT:g} s")
+
+
+def _start_error(program: str, error: OSError) -> ToolError:
+    if isinstance(error, PermissionError):
+        return ToolError(f"{program} may not run ({error.strerror}): {REMEDY}")
+    return ToolError(f"{program} can't run: {error.strerror}")
+
+
+def _failure(program: str, complaint: str) -> ToolError:
+    message = " ".join(complaint.split())[:300]
+    is_refused = "not permitted" in message or "you must be root" in message
+    return ToolError(f"{program}: {message}" + (f": {REMEDY}" if is_refused else ""))
