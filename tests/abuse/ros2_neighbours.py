@@ -23,6 +23,8 @@ WELL_KNOWN = 7410
 AGAIN = 0.1
 """Seconds after which an announcement is repeated that may be lost."""
 PATIENCE = 60.0
+PADDING = 200
+"""Bytes by which an announcement is as long as a real one: no address is sent more than came."""
 
 Address = tuple[str, int]
 
@@ -51,7 +53,8 @@ class Participant:
     def announce(self, *to: Address) -> None:
         """Announce itself."""
         for target in to:
-            self.meta.sendto(spdp(self.prefix, self.address, self.port), target)
+            announcement = spdp(self.prefix, self.address, self.port, padding=PADDING)
+            self.meta.sendto(announcement, target)
 
     def proves_to_receive(self, asked: Callable[[], object]) -> None:
         """Answer the question that the proxy sends to this address; ``asked`` is done meanwhile."""
@@ -120,15 +123,20 @@ class Flood:
     """Sends datagrams over and over while the context lasts; ``sent`` counts them.
 
     Each comes with where it is from, an address of this machine's, and where it goes. ``via`` is
-    the address on whose network forged ones go to a group.
+    the address on whose network forged ones go to a group; ``per_second`` is how many are sent.
     """
 
     def __init__(
-        self, datagrams: Iterable[tuple[str, Address, bytes]], is_forged: bool, via: str = "0.0.0.0"
+        self,
+        datagrams: Iterable[tuple[str, Address, bytes]],
+        is_forged: bool,
+        via: str = "0.0.0.0",
+        per_second: float = float("inf"),
     ) -> None:
         self._datagrams = list(datagrams)
         self._is_forged = is_forged
         self._via = via
+        self._pause = 1 / per_second
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self.sent = 0
@@ -167,6 +175,8 @@ class Flood:
             else:
                 own[source].sendto(datagram, to)
             self.sent += 1
+            if self._pause:
+                self._ended.wait(self._pause)
         for sock in (raw, *own.values()):
             sock.close()
 

@@ -50,11 +50,15 @@ def text(value: bytes) -> bytes:
     return struct.pack("<I", len(value) + 1) + value + b"\0" * (4 - len(value) % 4)
 
 
+def prefix(address: str, number: int) -> bytes:
+    """The GUID prefix of a hostile participant at an address."""
+    return bytes([1, 15, 9]) + bytes(map(int, address.split("."))) + number.to_bytes(5, "big")
+
+
 def writers(address: str, number: int) -> Iterator[tuple[str, Address, bytes]]:
     """The announcements of a participant and of its writers, whose names are long."""
-    own = bytes([1, 15, 9]) + bytes(map(int, address.split("."))) + number.to_bytes(5, "big")
-    announcement = spdp(own, address, 9000 + number)
-    yield address, ANNOUNCED, announcement
+    own = prefix(address, number)
+    yield address, ANNOUNCED, spdp(own, address, 9000 + number)
     described = [
         payload(
             [
@@ -71,7 +75,7 @@ def writers(address: str, number: int) -> Iterator[tuple[str, Address, bytes]]:
             data(content, writer=SEDP_WRITERS, sequence=start + offset + 1)
             for offset, content in enumerate(described[start : start + 8])
         ]
-        yield address, ANNOUNCED, message(announcement[20:], *submessages, prefix=own)
+        yield address, ANNOUNCED, message(*submessages, prefix=own)
 
 
 def told_writers(abused: Abused) -> int:
@@ -85,7 +89,10 @@ def told_writers(abused: Abused) -> int:
 
 
 async def announce_many(abused: Abused) -> None:
-    """Have the proxy remember as many writers as it does of five addresses."""
+    """Have the proxy remember as many writers as it does of five addresses that all answer it."""
+    for address in EVIL:
+        with closing(Participant(prefix(address, 0), address, 9000)) as evil:
+            evil.proves_to_receive(partial(evil.announce, ANNOUNCED))
     said = [
         datagram
         for address in EVIL

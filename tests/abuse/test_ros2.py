@@ -41,6 +41,8 @@ SECRET = "0123456789abcdef"
 PORTS = 64
 MORE = 20_000_000
 """Bytes that a second flood may take more than the first."""
+PER_SECOND = 5000
+"""Announcements that a forger sends to a LAN in a second."""
 AMONG = 20_000
 """Datagrams of a flood in which everybody else is served."""
 ANNOUNCED = APART, WELL_KNOWN
@@ -335,17 +337,24 @@ async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot,
     laptop = Participant(LAPTOP, STRANGERS[2], WELL_KNOWN)
     newcomer = Participant(NEWCOMER, STRANGERS[0], 7440)
     with closing(laptop), closing(newcomer), abused.watched():
-        with Flood(said, is_forged=True, via=STRANGERS[4]) as flood:
-            flood.wait(AMONG)
+        flood = Flood(said, is_forged=True, via=STRANGERS[4], per_second=PER_SECOND)
+        with flood:
+            flood.wait(len(said))
             unproven = abused.metric(
                 'rosproxy_ros2_unproven_participants{domain="0",side="outside"}'
             )
             assert 200 < unproven <= MOST_OUTSIDE_UNPROVEN + 1
-            laptop.proves_to_receive(lambda: laptop.announce(GROUP))
-            good.hears(LAPTOP, lambda: laptop.announce(GROUP))
-            good.hears(NEWCOMER, lambda: newcomer.announce(GROUP))
+
+            def all_announce() -> None:
+                good.announce(ANNOUNCED)
+                laptop.announce(GROUP)
+                newcomer.announce(GROUP)
+
+            laptop.proves_to_receive(all_announce)
+            good.hears(LAPTOP, all_announce)
+            good.hears(NEWCOMER, all_announce)
             served(good, robot, b"amid")
-            flood.wait(2 * AMONG)
+            flood.wait(flood.sent + len(said))
         served(good, robot, b"after")
         known = {p["guid_prefix"] for p in abused.status()["domains"][0]["outside"]}
         assert {LAPTOP.hex("."), ROBOT.hex(".")} <= known

@@ -4,7 +4,9 @@ import asyncio
 from collections.abc import Callable, Sequence
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_rates import Standing
 from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.discovery.fair_queue import MOST_OF_SOURCE, OVERHEAD
 from rosproxy.ros2.servers.discovery_reader import ROUND, DiscoveryReader
 
 
@@ -27,7 +29,7 @@ async def test_something_else_runs_between_two_long_datagrams() -> None:
     reader = DiscoveryReader()
     names = list[str]()
     for _ in range(3):
-        reader.put("robot", True, ROUND, reading(names, "robot"))
+        reader.put("robot", Standing.PROVEN, ROUND, reading(names, "robot"))
     for count in (1, 2, 3):
         asyncio.get_running_loop().call_soon(names.append, f"else {count}")
         await until_read(names, 2 * count)
@@ -39,8 +41,8 @@ async def test_what_a_datagram_leads_to_counts_as_well() -> None:
     names = list[str]()
     copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 32
     for _ in range(3):
-        reader.put("announces", True, 0, reading(names, "announces", copies))
-        reader.put("other", True, 0, reading(names, "other"))
+        reader.put("announces", Standing.PROVEN, 0, reading(names, "announces", copies))
+        reader.put("other", Standing.PROVEN, 0, reading(names, "other"))
     await until_read(names, 6)
     assert names == ["announces", "other", "other", "other", "announces", "announces"]
 
@@ -49,7 +51,7 @@ async def test_short_datagrams_share_a_round() -> None:
     reader = DiscoveryReader()
     names = list[str]()
     for _ in range(20):
-        reader.put("robot", True, 0, reading(names, "robot"))
+        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     await asyncio.sleep(0)
     assert len(names) == 20
 
@@ -65,8 +67,8 @@ async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
     def fail() -> Sequence[Outgoing]:
         raise RuntimeError("evil broke it")
 
-    reader.put("evil", True, 0, fail)
-    reader.put("robot", True, 0, reading(names, "robot"))
+    reader.put("evil", Standing.PROVEN, 0, fail)
+    reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     await until_read(names, 1)
     assert failures == ["evil broke it"]
 
@@ -74,7 +76,7 @@ async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
 async def test_nothing_is_read_after_the_end() -> None:
     reader = DiscoveryReader()
     names = list[str]()
-    reader.put("robot", True, 0, reading(names, "robot"))
+    reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     reader.close()
     for _ in range(3):
         await asyncio.sleep(0)
@@ -82,8 +84,11 @@ async def test_nothing_is_read_after_the_end() -> None:
 
 
 async def test_what_has_no_room_is_told() -> None:
+    count = MOST_OF_SOURCE // (ROUND + OVERHEAD)
     reader = DiscoveryReader()
     names = list[str]()
-    has_room = [reader.put("many", True, ROUND, reading(names, "many")) for _ in range(80)]
-    assert has_room == [True] * 63 + [False] * 17
-    await until_read(names, 63)
+    has_room = [
+        reader.put("many", Standing.PROVEN, ROUND, reading(names, "many")) for _ in range(200)
+    ]
+    assert has_room == [True] * count + [False] * (200 - count)
+    await until_read(names, count)

@@ -23,6 +23,8 @@ LEASE_DURATION = 12.0
 each 8 s and is asked again then."""
 KEPT = 60.0
 """Seconds for which an address has proved to receive, after its last participant has gone."""
+MOST_ADDRESSES = 4096
+"""Addresses that count as proven; of more, the one goes that has proved it first."""
 LONGEST_ANSWER = 256
 """Bytes of an answer that is known without reading it; one of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
@@ -66,6 +68,8 @@ class AddressProofs:
         """Take in a datagram; return whether the address proves by it to receive. RtpsError."""
         if not is_destination(datagram, self._prefix(address)):
             return False
+        if address not in self._until and len(self._until) >= MOST_ADDRESSES:
+            del self._until[next(iter(self._until))]
         self._until[address] = now + KEPT
         return True
 

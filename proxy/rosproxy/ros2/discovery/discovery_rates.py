@@ -10,6 +10,7 @@ lack.
 """
 
 from dataclasses import dataclass, field
+from enum import Enum, auto
 
 PER_SECOND = 10_000.0
 BURST = 50_000.0
@@ -19,6 +20,14 @@ STEP = 256
 """Bytes of a datagram for each unit of its charge. An announcement takes two or three."""
 MOST_SOURCES = 4096
 """Sources that are remembered. Of more, the source is forgotten that was remembered first."""
+
+
+class Standing(Enum):
+    """What is known of a source. PROVEN: its address has proved to receive, or is a peer's."""
+
+    PROVEN = auto()
+    INSIDE = auto()
+    OUTSIDE = auto()
 
 
 def cost(size: int) -> int:
@@ -43,7 +52,7 @@ class _Allowance:
 
 @dataclass(slots=True)
 class DiscoveryRates:
-    """The allowance of each source, and one for all sources together that are not known.
+    """The allowance of each source, and one for all unproven sources of a side together.
 
     A forger has as many sources as it likes; they share one allowance.
     """
@@ -51,29 +60,32 @@ class DiscoveryRates:
     per_second: float = PER_SECOND
     burst: float = BURST
     _by_source: dict[str, _Allowance] = field(default_factory=dict)
-    _of_unknown: _Allowance = field(init=False)
+    _of_unproven: dict[Standing, _Allowance] = field(init=False)
 
     def __post_init__(self) -> None:
         """Nothing has been used yet."""
-        self._of_unknown = _Allowance(self.burst, 0.0)
+        sides = (Standing.INSIDE, Standing.OUTSIDE)
+        self._of_unproven = {side: _Allowance(self.burst, 0.0) for side in sides}
 
-    def take(self, source: str, size: int, now: float, is_known: bool = True) -> bool:
+    def take(
+        self, source: str, size: int, now: float, standing: Standing = Standing.PROVEN
+    ) -> bool:
         """Charge a source for a datagram of so many bytes. Return False if it may not be read."""
         allowances = [self._allowance(source, now)]
-        if not is_known:
-            allowances.append(self._of_unknown)
+        if standing in self._of_unproven:
+            allowances.append(self._of_unproven[standing])
         if any(a.refill(self.per_second, self.burst, now) < 1.0 for a in allowances):
             return False
         for allowance in allowances:
             allowance.remaining -= cost(size)
         return True
 
-    def charge(self, source: str, total: int, is_known: bool = True) -> None:
+    def charge(self, source: str, total: int, standing: Standing = Standing.PROVEN) -> None:
         """Charge a source with what its datagrams have led to, as `cost`; it may go into debt."""
         if allowance := self._by_source.get(source):
             allowance.remaining -= total
-        if not is_known:
-            self._of_unknown.remaining -= total
+        if standing in self._of_unproven:
+            self._of_unproven[standing].remaining -= total
 
     def _allowance(self, source: str, now: float) -> _Allowance:
         allowance = self._by_source.get(source)

@@ -29,7 +29,7 @@ from functools import partial
 
 from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.claimed_addresses import claim_fault
-from rosproxy.ros2.discovery.discovery_rates import cost
+from rosproxy.ros2.discovery.discovery_rates import Standing, cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import LanRelay, Outgoing, sent_to
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
@@ -102,7 +102,8 @@ class Domain(DomainParticipants):
         # Other programs have the relay's address, too. What they send has no proof.
         if relay and source == relay.address.host and not datagram.startswith(MAGIC):
             return self._heard_by_relay(relay, datagram, now)
-        if self.outside.is_strange(source):
+        # An answer counts also where a flood has taken the place of its participant meanwhile.
+        if not self.proofs.is_answer(source, datagram) and self.outside.is_strange(source):
             return []
         return self._heard_at_discovery(datagram, source, False, now)
 
@@ -148,9 +149,11 @@ class Domain(DomainParticipants):
         self._charge(source, sent)
         return sent
 
-    def is_known(self, source: str) -> bool:
-        """Whether an address has proved to receive, or it is a peer's."""
-        return self.proofs.has(source) or self.settings.is_peer(source)
+    def standing(self, source: str) -> Standing:
+        """What is known of an address."""
+        if self.proofs.has(source) or self.settings.is_peer(source):
+            return Standing.PROVEN
+        return Standing.INSIDE if self.settings.is_inside(source) else Standing.OUTSIDE
 
     def is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
         """Whether `heard_outside` reads a datagram, which takes long."""
@@ -511,11 +514,11 @@ class Domain(DomainParticipants):
     def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
         """Charge a source with the datagrams that its own have led to."""
         total = sum(cost(len(out.datagram)) for out in sent)
-        self.rates.charge(source, total, self.is_known(source))
+        self.rates.charge(source, total, self.standing(source))
 
     def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
         """Whether a source makes more discovery than it may; what is not is charged to it."""
-        if self.rates.take(source, len(datagram), now, self.is_known(source)):
+        if self.rates.take(source, len(datagram), now, self.standing(source)):
             return False
         self.refused("rate", source, "more discovery than one source may send in a second")
         return True

@@ -2,8 +2,8 @@
 
 Reading discovery takes long, and any neighbour may send it. So datagrams wait, and the source goes
 first that has had least of the reading (start-time fair queueing; Goyal, Vin, Cheng: SIGCOMM 1996).
-A forged source costs its sender nothing. So sources where participants are known share one half of
-the reading, and all other sources share the other half.
+A forged source costs its sender nothing. So the reading has three parts: for sources that have
+proved to receive and for peers, for other sources inside, and for other sources outside.
 """
 
 import heapq
@@ -11,12 +11,15 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
+from rosproxy.ros2.discovery.discovery_rates import Standing
+
 MOST_OF_SOURCE = 1024 * 1024
 MOST_OF_ALL = 4 * 1024 * 1024
-"""Bytes of one source that wait, and bytes that wait in a half."""
+"""Bytes of one source that wait, and bytes that wait of one standing."""
 MOST_KNOWN = 2048
 MOST_UNKNOWN = 256
-"""Sources in each half of which datagrams wait. A few thousand datagrams are read in a second."""
+"""Sources of which datagrams wait, of proven and of any other standing. The proxy reads a few
+thousand datagrams in a second."""
 OVERHEAD = 256
 """Bytes that a datagram counts for beside its own."""
 
@@ -128,34 +131,41 @@ class FairQueue(Generic[Item]):
 
 
 class DiscoveryQueue(Generic[Item]):
-    """Datagrams that wait in two halves: those of known sources, and those of all others."""
+    """Datagrams that wait, by the standing of their sources: each standing has the same share."""
 
     def __init__(self) -> None:
-        self._known = FairQueue[Item](MOST_KNOWN)
-        self._unknown = FairQueue[Item](MOST_UNKNOWN)
-        self._lead = 0
-        """Bytes by which the reading of unknown sources is ahead of that of known ones."""
+        self._queues = {
+            standing: FairQueue[Item](
+                MOST_KNOWN if standing is Standing.PROVEN else MOST_UNKNOWN,
+            )
+            for standing in Standing
+        }
+        self._used = dict.fromkeys(Standing, 0)
+        self._last = Standing.PROVEN
 
     def __bool__(self) -> bool:
         """Whether a datagram waits."""
-        return bool(self._known or self._unknown)
+        return any(self._queues.values())
 
-    def put(self, source: str, is_known: bool, item: Item, size: int) -> bool:
+    def put(self, source: str, standing: Standing, item: Item, size: int) -> bool:
         """Add a datagram of so many bytes. Return False if there is no room for the datagram."""
-        return (self._known if is_known else self._unknown).put(source, item, size)
+        if not self._queues[standing]:
+            busy = [self._used[other] for other, queue in self._queues.items() if queue]
+            # A pause saves nothing.
+            self._used[standing] = max(self._used[standing], min(busy, default=0))
+        return self._queues[standing].put(source, item, size)
 
     def pop(self) -> Waiting[Item] | None:
         """Take the next datagram; None if no datagram waits."""
-        if not (self._known and self._unknown):
-            self._lead = 0
-            return self._known.pop() or self._unknown.pop()
-        is_known = self._lead >= 0
-        waiting = (self._known if is_known else self._unknown).pop()
-        if waiting:
-            self._lead += -waiting.size if is_known else waiting.size
+        busy = [standing for standing, queue in self._queues.items() if queue]
+        if not busy:
+            return None
+        self._last = min(busy, key=self._used.__getitem__)
+        waiting = self._queues[self._last].pop()
+        self._used[self._last] += waiting.size if waiting else 0
         return waiting
 
     def charge(self, source: str, size: int) -> None:
-        """Count bytes that the last datagram of a source has led to as its own."""
-        self._known.charge(source, size)
-        self._unknown.charge(source, size)
+        """Count bytes that the datagram taken last, of a source, has led to."""
+        self._queues[self._last].charge(source, size)
+        self._used[self._last] += size

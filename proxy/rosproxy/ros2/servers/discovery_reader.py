@@ -7,10 +7,11 @@ User data and the admin endpoint come first: sockets are read at once, and what 
 import asyncio
 from collections.abc import Callable, Sequence
 
+from rosproxy.ros2.discovery.discovery_rates import Standing
 from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue
 
-ROUND = 16 * 1024
+ROUND = 8 * 1024
 """Bytes that are read and sent in a round. The longest datagram has a round of its own, of 5 ms."""
 
 Read = Callable[[], Sequence[Outgoing]]
@@ -25,12 +26,12 @@ class DiscoveryReader:
         self._loop = asyncio.get_running_loop()
         self._round: asyncio.Handle | None = None
 
-    def put(self, source: str, is_known: bool, size: int, read: Read) -> bool:
+    def put(self, source: str, standing: Standing, size: int, read: Read) -> bool:
         """Have a datagram of so many bytes read when the turn of its source comes.
 
         Return False if it is lost.
         """
-        has_room = self._queue.put(source, is_known, read, size)
+        has_room = self._queue.put(source, standing, read, size)
         self._schedule()
         return has_room
 

@@ -43,7 +43,10 @@ log = logging.getLogger(__name__)
 
 EXPIRY_INTERVAL = 0.5
 PER_TURN = 16
-"""Datagrams of one socket before the others have their turn."""
+"""Datagrams that one socket passes on before the others have their turn."""
+QUEUED_FOR_PASSED = 8
+"""Datagrams that can be received to be read later, in the time in which one is passed on. What the
+kernel drops meanwhile is not shared fairly by source."""
 
 Take = Callable[[bytes, str, float], list[Outgoing]]
 """Takes a datagram, the address it came from and the time; gives what is to be sent."""
@@ -251,8 +254,8 @@ class DomainServer:
                 return []
             if self._selected.admits(source, now):
                 return take(datagram, source, now)
-            is_known = self.domain.is_known(source)
-            if not self.domain.rates.take(source, len(datagram), now, is_known):
+            standing = self.domain.standing(source)
+            if not self.domain.rates.take(source, len(datagram), now, standing):
                 return []
             with contextlib.suppress(RtpsError):
                 for message in map(read_discovery, by_source(datagram)):
@@ -279,27 +282,30 @@ class DomainServer:
 
         At most `PER_TURN` datagrams, or one of the longest, before others have their turn.
         """
-        byte_count = count = 0
+        spent_bytes = spent = 0.0
         with contextlib.suppress(BlockingIOError):
-            while count < PER_TURN and byte_count < LARGEST_DATAGRAM // 2:
-                count += 1
+            while spent < PER_TURN and spent_bytes < LARGEST_DATAGRAM // 2:
                 try:
                     datagram, sender = sock.recvfrom(LARGEST_DATAGRAM)
                 except ConnectionRefusedError:
+                    spent += 1
                     continue
-                byte_count += len(datagram)
                 source = plain_address(sender[0])
                 if must_read(datagram, source):
+                    weight = 1 / QUEUED_FOR_PASSED
                     self._queue(take, datagram, source)
                 else:
+                    weight = 1.0
                     self._carry_out(take, datagram, source)
+                spent += weight
+                spent_bytes += weight * len(datagram)
 
     def _queue(self, take: Take, datagram: bytes, source: str) -> None:
         """Have discovery read when the turn of its source comes."""
         heard_at = self.domain.source_of(datagram, source)
-        is_known = self.domain.is_known(heard_at)
+        standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
-        if not self._reader.put(heard_at, is_known, len(datagram), read):
+        if not self._reader.put(heard_at, standing, len(datagram), read):
             text = "more discovery waits to be read than has room"
             self.domain.refused("rate", heard_at, text)
 

@@ -5,6 +5,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.ros2.discovery.discovery_rates import Standing
 from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue, FairQueue
 
 SIZES = st.integers(0, 60_000)
@@ -102,21 +103,37 @@ def test_what_was_put_is_taken_in_its_order(steps: list[tuple[str, int, bool, in
     assert not queue
 
 
-def test_a_thousand_forged_sources_get_half_of_the_reading() -> None:
+def test_a_thousand_forged_sources_get_their_share_alone() -> None:
     queue = DiscoveryQueue[int]()
     for number in range(1000):
-        queue.put(f"forged {number}", False, number, 500)
-        queue.put("robot", True, number, 500)
-    assert Counter(taken(queue, 200))["robot"] == 100
+        queue.put(f"forged {number}", Standing.OUTSIDE, number, 500)
+        queue.put("robot", Standing.PROVEN, number, 500)
+        queue.put("node", Standing.INSIDE, number, 500)
+    counts = Counter(source.partition(" ")[0] for source in taken(queue, 300))
+    assert counts == {"robot": 100, "forged": 100, "node": 100}
 
 
-def test_a_half_that_has_nothing_to_read_leaves_its_time() -> None:
+def test_a_standing_that_has_nothing_to_read_leaves_its_time() -> None:
     queue = DiscoveryQueue[int]()
     for number in range(100):
-        queue.put("forged", False, number, 500)
+        queue.put("forged", Standing.OUTSIDE, number, 500)
     assert len(taken(queue, 50)) == 50
     for number in range(100):
-        queue.put("robot", True, number, 500)
+        queue.put("robot", Standing.PROVEN, number, 500)
     assert Counter(taken(queue, 40)) == {"robot": 20, "forged": 20}
     assert len(taken(queue, 200)) == 110
     assert not queue
+
+
+def test_a_standing_pays_for_what_its_datagrams_lead_to() -> None:
+    queue = DiscoveryQueue[int]()
+    for number in range(50):
+        queue.put("announces", Standing.OUTSIDE, number, 0)
+        queue.put("other", Standing.INSIDE, number, 0)
+    sources = []
+    for _ in range(22):
+        (source,) = taken(queue, 1)
+        sources.append(source)
+        if source == "announces":
+            queue.charge(source, 9 * OVERHEAD)
+    assert Counter(sources) == {"announces": 2, "other": 20}

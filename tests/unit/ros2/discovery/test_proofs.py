@@ -6,7 +6,7 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.address_proofs import KEPT, AddressProofs
-from rosproxy.ros2.discovery.discovery_rates import BURST
+from rosproxy.ros2.discovery.discovery_rates import BURST, Standing
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import (
     MOST_INSIDE_UNPROVEN,
@@ -289,16 +289,17 @@ def test_forged_sources_keep_nobody_from_waiting_after_a_start() -> None:
 def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
     domain = make_domain()
     meet(domain)
-    assert domain.is_known(ROBOT)  # a peer
-    assert not domain.is_known(INSIDE)
+    assert domain.standing(ROBOT) is Standing.PROVEN  # a peer
+    assert domain.standing(INSIDE) is Standing.INSIDE
+    assert domain.standing(LAPTOP) is Standing.OUTSIDE
     asked = questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE)
     domain.heard_inside(answer(asked[0], A), INSIDE, NOW)
-    assert domain.is_known(INSIDE)
+    assert domain.standing(INSIDE) is Standing.PROVEN
     domain.expire(NOW + 10)
-    assert domain.is_known(INSIDE)
+    assert domain.standing(INSIDE) is Standing.PROVEN
     domain.expire(NOW + 21)
     domain.expire(NOW + 22 + KEPT)
-    assert not domain.is_known(INSIDE)
+    assert domain.standing(INSIDE) is Standing.INSIDE
 
 
 def test_a_process_has_questions_of_its_own() -> None:
@@ -313,7 +314,7 @@ def test_a_flood_of_forged_sources_holds_up_no_answer() -> None:
     meet(domain)
     (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
     forge(domain, 0, 1)
-    domain.rates.charge("10.1.0.1", int(BURST), is_known=False)
+    domain.rates.charge("10.1.0.1", int(BURST), Standing.OUTSIDE)
     said = answer(asked, B)
     assert not domain.is_read_at_discovery(said, LAPTOP)
     domain.heard_outside(said, LAPTOP, NOW)
@@ -325,9 +326,20 @@ def test_a_flood_of_forged_sources_holds_up_no_answer() -> None:
 def test_an_answer_inside_is_not_held_up_either() -> None:
     domain = make_domain()
     (asked,) = questions(meet(domain), INSIDE)[-1:]
-    domain.rates.charge(INSIDE, int(BURST), is_known=False)
+    domain.rates.charge(INSIDE, int(BURST), Standing.INSIDE)
     said = [answer(q, A) for q in questions(meet(make_domain()), INSIDE)]
     assert asked
     for datagram in said:
         domain.heard_inside(datagram, INSIDE, NOW)
     assert domain.proofs.has(INSIDE)
+
+
+def test_an_answer_counts_though_its_participant_has_lost_its_place() -> None:
+    domain = make_domain(peers=())
+    meet(domain)
+    (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
+    forge(domain, 0, MOST_OUTSIDE_UNPROVEN)
+    assert B not in domain.outside.by_prefix
+    domain.heard_outside(answer(asked, B), LAPTOP, NOW)
+    assert to(hear(domain, B, LAPTOP), INSIDE)
+    assert domain.outside.by_prefix[B].proven

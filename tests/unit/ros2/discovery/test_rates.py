@@ -10,6 +10,7 @@ from rosproxy.ros2.discovery.discovery_rates import (
     PER_SECOND,
     STEP,
     DiscoveryRates,
+    Standing,
     cost,
 )
 
@@ -57,9 +58,10 @@ def test_a_long_datagram_is_charged_as_several() -> None:
 def test_forged_sources_have_one_allowance_together() -> None:
     """Each had one of its own, and the debt of a source was forgotten after 4,096 others."""
     rates = DiscoveryRates()
-    assert rates.take("evil", 100, 0.0, is_known=False)
-    rates.charge("evil", int(BURST), is_known=False)
-    taken = [rates.take(str(n), 100, 0.1, is_known=False) for n in range(2 * MOST_SOURCES)]
+    assert rates.take("evil", 100, 0.0, Standing.OUTSIDE)
+    rates.charge("evil", int(BURST), Standing.OUTSIDE)
+    taken = [rates.take(str(n), 100, 0.1, Standing.OUTSIDE) for n in range(2 * MOST_SOURCES)]
     assert sum(taken) <= 0.1 * PER_SECOND
-    assert not rates.take("evil", 100, 0.1, is_known=False)
+    assert not rates.take("evil", 100, 0.1, Standing.OUTSIDE)
     assert rates.take("robot", 100, 0.1)
+    assert rates.take("node", 100, 0.1, Standing.INSIDE)
