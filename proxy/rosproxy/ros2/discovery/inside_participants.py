@@ -95,6 +95,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
 
         Either there is room without, or the new one gets no place.
         """
+        if self.count_by_address[source] >= MOST_PER_ADDRESS:
+            return None
         if self.proofs.has(source):
             return fairer_place(self._at_proven(True), MOST_INSIDE, source)
         return oldest_unproven(self._at_proven(False), MOST_INSIDE_UNPROVEN)

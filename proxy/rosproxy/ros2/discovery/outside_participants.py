@@ -252,7 +252,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
         Either there is room without, or the new one gets no place.
         """
-        if self.settings.is_peer(source):
+        if self.settings.is_peer(source) or self._is_full(source):
             return None
         if self.proofs.has(source):
             return fairer_place(self._proven_strangers(), MOST_OUTSIDE, source)
@@ -260,18 +260,23 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
     def _why_no_place(self, source: str) -> str:
         """Why a new participant at an address gets no place; empty if it gets one."""
-        is_peer = self.settings.is_peer(source)
-        is_proven = self.proofs.has(source)
-        most_there = MOST_PER_HOST if is_peer or is_proven else MOST_PER_UNPROVEN
-        if self.count_by_address[source] >= most_there:
-            return f"the address has {most_there} participants already"
-        if is_peer:
-            count, most = sum(p.trusted for p in self.by_prefix.values()), MOST_AT_PEERS
-        elif is_proven:
-            count, most = len(self._proven_strangers()), MOST_OUTSIDE
+        if self._is_full(source):
+            return f"the address has {self.count_by_address[source]} participants already"
+        if self.settings.is_peer(source):
+            most = MOST_AT_PEERS
+            present = [p for p in self.by_prefix.values() if p.trusted]
+        elif self.proofs.has(source):
+            most = MOST_OUTSIDE
+            present = self._proven_strangers()
         else:
-            count, most = len(self._unproven_strangers()), MOST_OUTSIDE_UNPROVEN
-        return f"there are {most} participants outside already" if count >= most else ""
+            most = MOST_OUTSIDE_UNPROVEN
+            present = self._unproven_strangers()
+        return f"there are {most} participants outside already" if len(present) >= most else ""
+
+    def _is_full(self, source: str) -> bool:
+        """Whether an address has as many participants as it may."""
+        is_proven = self.settings.is_peer(source) or self.proofs.has(source)
+        return self.count_by_address[source] >= (MOST_PER_HOST if is_proven else MOST_PER_UNPROVEN)
 
     def _proven_strangers(self) -> list[OutsideParticipant]:
         return [p for p in self.by_prefix.values() if p.proven and not p.trusted]

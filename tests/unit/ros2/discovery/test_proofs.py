@@ -13,6 +13,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     MOST_INTRODUCED_UNPROVEN,
     MOST_OUTSIDE,
     MOST_OUTSIDE_UNPROVEN,
+    MOST_PER_ADDRESS,
     MOST_PER_HOST,
     MOST_PER_UNPROVEN,
     MOST_WAITING,
@@ -343,3 +344,23 @@ def test_an_answer_counts_though_its_participant_has_lost_its_place() -> None:
     domain.heard_outside(answer(asked, B), LAPTOP, NOW)
     assert to(hear(domain, B, LAPTOP), INSIDE)
     assert domain.outside.by_prefix[B].proven
+
+
+def test_an_address_that_is_full_pushes_out_no_other() -> None:
+    domain = make_domain()
+    forge(domain, 0, MOST_OUTSIDE_UNPROVEN - MOST_PER_UNPROVEN)
+    for number in range(3 * MOST_PER_UNPROVEN):
+        hear(domain, named(5000 + number), STRANGER)
+    assert domain.outside.count_by_address[STRANGER] == MOST_PER_UNPROVEN
+    assert len(domain.outside.by_prefix) == MOST_OUTSIDE_UNPROVEN
+    assert named(0) in domain.outside.by_prefix
+
+
+def test_an_address_inside_that_is_full_pushes_out_no_other() -> None:
+    domain = make_domain()
+    for number in range(MOST_INSIDE_UNPROVEN + 3 * MOST_PER_ADDRESS):
+        address = OTHER if number >= MOST_PER_ADDRESS else INSIDE
+        domain.inside.meet(read_discovery(spdp(named(number), address)), address, NOW)
+    assert domain.inside.count_by_address == {INSIDE: MOST_PER_ADDRESS, OTHER: MOST_PER_ADDRESS}
+    assert domain.inside.gives_place(OTHER) is None
+    assert domain.inside.gives_place("172.30.0.9") is domain.inside.by_prefix[named(0)]
