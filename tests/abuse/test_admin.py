@@ -26,6 +26,8 @@ PORTS = 64
 ANNOUNCED = APART, WELL_KNOWN
 PARTICIPANTS, WRITERS = 4, 2048
 """Participants at one address, and writers of each: as many as the proxy remembers."""
+PER_SECOND = 1000
+"""Datagrams that the addresses send in a second: less than the proxy reads of five."""
 READERS = 32
 MORE = 16 * 1024 * 1024
 """Bytes that readers may take which read nothing."""
@@ -99,7 +101,7 @@ async def announce_many(abused: Abused) -> None:
         for number in range(PARTICIPANTS)
         for datagram in writers(address, number)
     ]
-    with Flood(said, is_forged=False):
+    with Flood(said, is_forged=False, per_second=PER_SECOND):
         expected = len(EVIL) * PARTICIPANTS * WRITERS
         await until(lambda: told_writers(abused) > 0.95 * expected, "all are known", 120)
 
