@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.xmlrpc import passing
@@ -201,6 +201,16 @@ SOUP = st.lists(
 ).map("".join)
 
 
+@pytest.mark.parametrize("text", ["", "text"])
+def test_a_value_that_is_no_call_is_refused(text: str) -> None:
+    body = multicall([element("setParam", "/n", "/key", 1)])
+    odd = body.replace(b"</struct></value>", f"</struct></value><value>{text}</value>".encode())
+    assert odd != body
+    with pytest.raises(XmlRpcError, match="no struct"):
+        see(MulticallWatch(PLAIN.__contains__), odd)
+
+
+@example("</value><value>", "</struct>")
 @given(SOUP, st.sampled_from(["</value>", "</member>", "</struct>", "</data>", "<struct>"]))
 def test_what_passes_python_reads_as_it_was_judged(soup: str, place: str) -> None:
     body = multicall([element("setParam", "/n", "/key", 1)]).replace(b"\n", b"").decode()

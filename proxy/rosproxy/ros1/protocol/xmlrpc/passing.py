@@ -68,8 +68,16 @@ _LEVELS = (
     {"string", "array"},
 )
 """The elements of a multicall, from the root down to what a call's members hold."""
-_CALL_DEPTH, _MEMBER_DEPTH, _FIELD_DEPTH, _CONTENT_DEPTH = 8, 9, 10, 11
-"""How deep a call's struct lies, its members, their names and values, and what the values hold."""
+_VALUE_DEPTH = 7
+"""The depth of a value that holds a call."""
+_CALL_DEPTH = 8
+"""The depth of a call's struct."""
+_MEMBER_DEPTH = 9
+"""The depth of a call's members."""
+_FIELD_DEPTH = 10
+"""The depth of a member's name and value."""
+_CONTENT_DEPTH = 11
+"""The depth of what a member's value holds."""
 _METHOD, _PARAMS = ["name:methodName", "value"], ["name:params", "value", "array"]
 
 
@@ -144,6 +152,7 @@ class MulticallWatch(CallWatch):
         super().__init__()
         self._may_pass = may_pass
         self._depth = 0
+        self._has_call = False
         self._text = ""
         self._elements: list[str] = []
         self._members: list[str] = []
@@ -174,7 +183,10 @@ class MulticallWatch(CallWatch):
             return
         if name not in _LEVELS[self._depth - 1]:
             raise XmlRpcError(INVALID_REQUEST, f"misplaced <{name[:40]}> in a long {MULTICALL}")
-        if self._depth == _CALL_DEPTH:
+        if self._depth == _VALUE_DEPTH:
+            self._has_call = False
+        elif self._depth == _CALL_DEPTH:
+            self._has_call = True
             self._members = []
         elif self._depth == _MEMBER_DEPTH:
             self._elements = []
@@ -193,6 +205,8 @@ class MulticallWatch(CallWatch):
             raise XmlRpcError(
                 INVALID_REQUEST, f"a call in {MULTICALL} needs one methodName and params"
             )
+        elif self._depth == _VALUE_DEPTH and not self._has_call:
+            raise XmlRpcError(INVALID_REQUEST, f"a value in {MULTICALL} that is no struct")
         if self._depth in (_FIELD_DEPTH, _CONTENT_DEPTH):
             self._parser.CharacterDataHandler = None
         self._depth -= 1
