@@ -230,7 +230,9 @@ class Topology:
         self._forward("host", True)
         self._forward("px", self.plan.forwarding or os.environ.get("ROS_TESTS_KERNEL") == "1")
         if not self.plan.flat:
-            rules = _rules(self.plan, [self.places[role].address for role in self._leaving()])
+            rules = boundary_rules(
+                self.plan, [self.places[role].address for role in self._leaving()]
+            )
             run_command("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
 
     def _forward(self, role: str, forwards: bool) -> None:
@@ -267,7 +269,8 @@ class Topology:
         return next(addresses)
 
 
-def _rules(plan: Plan, proxies: list[str]) -> str:
+def boundary_rules(plan: Plan, proxies: list[str]) -> str:
+    """The rules of nft by which the host publishes ports to proxies, and lets nothing else in."""
     come = "" if plan.hairpin else 'iifname "out0"'
     master = (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)
     published = [[*plan.ports.pairs(), master], plan.second.ports.pairs() if plan.second else []]

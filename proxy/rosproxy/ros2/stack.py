@@ -4,7 +4,8 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 from msgspec.structs import replace
@@ -44,6 +45,7 @@ from rosproxy.ros2.udp_probe import try_ports, try_udp
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
+from rosproxy.telemetry.text import listed
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +74,7 @@ class Ros2:
         self._applied, self._awaiting = runtime.policy.version, bool(self._settings.await_policy)
         self.networks: tuple[Network, ...] = ()
         self._peers = self._settings.ros2_peer
+        self._addresses_of_peers: dict[HostPort, tuple[HostPort, ...]] = {}
         self._watch = DomainWatch(
             Ros2State(self.servers, self._domain_plane, with_names=False), runtime.problems
         )
@@ -79,7 +82,7 @@ class Ros2:
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if one is taken that has to be had."""
         tasks = self._runtime.tasks
-        self._hosts = await self._advertised_addresses()
+        self._hosts = await self._first_hosts()
         # Before any port is opened: the table of a former process tells whose its ports were.
         await self.plane.start()
         self._leases.note_former(self.plane.forwards)
@@ -281,30 +284,44 @@ class Ros2:
         self._awaiting = False
         await self.apply_policy()
 
-    async def _advertised_addresses(self) -> tuple[str, ...]:
-        """The advertised host's addresses, one of each family: locators have no names.
-
-        Of a family that the ports are not bound for only if there is no other. Raises SettingError.
-        """
-        host, bind = self._settings.advertise_host, self._settings.bind
-        resolved = await resolve(host)
-        if not resolved:
+    async def _first_hosts(self) -> tuple[str, ...]:
+        """The addresses of the advertised host at the start. Raises SettingError."""
+        host = self._settings.advertise_host
+        hosts = advertised_hosts(await resolve(host), self._settings.bind, ())
+        if not hosts:
             text = f"{host} can't be resolved; ROS 2 needs its address: give that instead"
             raise SettingError("--advertise-host", text)
-        served = [a for a in resolved if bind == "::" or (":" in a) == (":" in bind)]
-        # Reversed: the last that is put in stays, which is then the first of its family.
-        by_family = {":" in a: a for a in reversed(served or resolved)}
-        return tuple(sorted(by_family.values(), key=resolved.index))
+        return hosts
 
     async def _refresh(self) -> None:
-        """Take in the networks that there are now, and where the peers are."""
+        """Take in the present networks, and where the advertised host and the peers are."""
         self._look_at_networks()
+        await self._find_hosts()
         await self._find_peers()
 
-    async def _find_peers(self) -> None:
-        peers = await asyncio.gather(*(self._resolve_peer(peer) for peer in self._peers))
+    async def _find_hosts(self) -> None:
+        resolved = await resolve(self._settings.advertise_host)
+        hosts = advertised_hosts(resolved, self._settings.bind, self._hosts)
+        if hosts == self._hosts:
+            return
+        former = self._hosts
+        self._hosts = hosts
+        name = self._settings.advertise_host
+        log.info("advertised host %s moved: from %s to %s", name, listed(former), listed(hosts))
         for server in self.servers:
-            server.ask_outside(tuple(peer for resolved in peers for peer in resolved))
+            server.move_to(hosts)
+
+    async def _find_peers(self) -> None:
+        peers = self._peers
+        found = await asyncio.gather(*(self._resolve_peer(peer) for peer in peers))
+        # A name server that is away takes no peer away.
+        known = {peer: self._addresses_of_peers.get(peer, ()) for peer in peers}
+        self._addresses_of_peers = {
+            peer: tuple(addresses) or known[peer]
+            for peer, addresses in zip(peers, found, strict=True)
+        }
+        for server in self.servers:
+            server.ask_outside(tuple(chain.from_iterable(self._addresses_of_peers.values())))
 
     def _look_at_networks(self) -> None:
         self.networks = self._settings.inside_networks or interface_networks()
@@ -329,6 +346,23 @@ class Ros2:
             )
             self._runtime.problems.add(subject, text)
         return [HostPort(address, peer.port) for address in resolved]
+
+
+def advertised_hosts(
+    resolved: Sequence[str], bind: str, present: tuple[str, ...]
+) -> tuple[str, ...]:
+    """The addresses of the advertised host to announce, one of each family: locators have no names.
+
+    ``resolved`` are the addresses that its name has now, ``present`` those that are announced. The
+    present ones stay while the name has them, or can't be resolved: a name server may give several
+    in any order. An address of a family that is not bound counts only where there is no other.
+    """
+    if not resolved or (present and all(address in resolved for address in present)):
+        return present
+    served = [a for a in resolved if bind == "::" or (":" in a) == (":" in bind)]
+    # Reversed: the last that is put in stays, which is then the first of its family.
+    by_family = {":" in a: a for a in reversed(served or resolved)}
+    return tuple(sorted(by_family.values(), key=resolved.index))
 
 
 def _relay(settings: Settings) -> LanRelay | None:

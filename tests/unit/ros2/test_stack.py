@@ -1,12 +1,15 @@
-"""The part for ROS 2 as a whole: what it does with a change of policy."""
+"""The part for ROS 2 as a whole: a change of policy, and of where host and peers are."""
 
+from collections.abc import Iterable
 from typing import cast
 
 import pytest
 
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2 import stack
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.servers.domain_server import DomainServer
-from rosproxy.ros2.stack import Ros2
+from rosproxy.ros2.stack import Ros2, advertised_hosts
 from rosproxy.runtime import Runtime
 from tests.run_options import parse_settings
 
@@ -33,3 +36,65 @@ async def test_a_policy_that_could_not_be_applied_is_tried_again() -> None:
     await ros2._look_at_policy()
     await ros2._look_at_policy()
     assert server.calls == 2
+
+
+@pytest.mark.parametrize(
+    ("resolved", "bind", "present", "announced"),
+    [
+        (["192.0.2.1"], "0.0.0.0", (), ("192.0.2.1",)),
+        (["192.0.2.1", "192.0.2.2", "2001:db8::1"], "::", (), ("192.0.2.1", "2001:db8::1")),
+        (["192.0.2.1", "2001:db8::1"], "0.0.0.0", (), ("192.0.2.1",)),
+        (["2001:db8::1"], "0.0.0.0", (), ("2001:db8::1",)),
+        # A name server gives the addresses in any order.
+        (["192.0.2.2", "192.0.2.1"], "0.0.0.0", ("192.0.2.1",), ("192.0.2.1",)),
+        (["192.0.2.2"], "0.0.0.0", ("192.0.2.1",), ("192.0.2.2",)),
+        # The name server is away.
+        ([], "0.0.0.0", ("192.0.2.1",), ("192.0.2.1",)),
+    ],
+)
+def test_the_addresses_of_the_advertised_host(
+    resolved: list[str], bind: str, present: tuple[str, ...], announced: tuple[str, ...]
+) -> None:
+    assert advertised_hosts(resolved, bind, present) == announced
+
+
+class Listening:
+    """A domain's server that notes where it is told that the host and the peers are."""
+
+    hosts: tuple[str, ...] = ()
+    peers: tuple[HostPort, ...] = ()
+
+    def move_to(self, hosts: tuple[str, ...]) -> None:
+        self.hosts = hosts
+
+    def ask_outside(self, peers: tuple[HostPort, ...]) -> None:
+        self.peers = peers
+
+    def join(self, addresses: Iterable[str]) -> None:
+        """The networks do not matter here."""
+
+
+async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = {"base.example": ["192.0.2.1"], "robot.example": ["192.0.2.9"]}
+
+    async def resolve(host: str) -> list[str]:
+        return names.get(host, [])
+
+    monkeypatch.setattr(stack, "resolve", resolve)
+    told = {"ros": ("2",), "advertise_host": "base.example", "port_range": "45000-45015"}
+    ros2 = Ros2(Runtime(parse_settings({**told, "ros2_peer": ("robot.example:7410",)})))
+    server = Listening()
+    ros2.servers.append(cast(DomainServer, server))
+    await ros2._refresh()
+    assert server.hosts == ("192.0.2.1",)
+    assert server.peers == (HostPort("192.0.2.9", 7410),)
+    names.update({"base.example": ["192.0.2.2"], "robot.example": ["192.0.2.10"]})
+    await ros2._refresh()
+    assert server.hosts == ("192.0.2.2",)
+    assert server.peers == (HostPort("192.0.2.10", 7410),)
+    names.clear()
+    await ros2._refresh()
+    assert server.hosts == ("192.0.2.2",)
+    assert server.peers == (HostPort("192.0.2.10", 7410),)

@@ -27,6 +27,7 @@ Every datagram may be forged. So
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import Standing, cost
@@ -62,6 +63,7 @@ from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     read_discovery,
     require_rewritable,
+    rewritten,
 )
 
 ANNOUNCED_AGAIN = 0.5
@@ -236,6 +238,27 @@ class Domain(DomainParticipants):
             if has_changed(self.settings.judge, insider):
                 sent += self._unless_malformed(insider.address, partial(self._part, insider, now))
         return sent
+
+    def move_to(self, hosts: tuple[str, ...], now: float) -> list[Outgoing]:
+        """Announce the participants inside at other addresses of the advertised host.
+
+        Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp), so all
+        outside meet the participants and the observer anew.
+        """
+        sent = self.settings.to_outside(self.own.observer.farewell())
+        self.settings.hosts = hosts
+        for insider in self.inside.by_prefix.values():
+            sent += self._unless_malformed(insider.address, partial(self._move, insider, now))
+        return sent
+
+    def _move(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+        """Lead the locators of a participant's announcement to the present hosts. RtpsError."""
+        message = read_discovery(insider.announcement)
+        insider.announcement = rewritten(message, self._at_present_host, lambda _: False)
+        return self.rediscovery.separate(insider, now)
+
+    def _at_present_host(self, _: int, locator: HostPort) -> HostPort:
+        return HostPort(self.settings.host_for(locator.host), locator.port)
 
     def _part(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
         """Part one from all outside, of whom the policy is asked anew then. Raises RtpsError."""

@@ -77,7 +77,7 @@ class LanRelay:
 
 @dataclass(slots=True)
 class DomainSettings:
-    """The settings of a domain; ``peers`` may change.
+    """The settings of a domain; ``hosts`` and ``peers`` may change.
 
     ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
     each family; a participant is led to that of its own family, if there is one. ``peers`` are

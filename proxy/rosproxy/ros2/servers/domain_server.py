@@ -133,6 +133,11 @@ class DomainServer:
             self.domain.settings.peers = peers
             self._send(self.domain.own.announced_outside())
 
+    def move_to(self, hosts: tuple[str, ...]) -> None:
+        """Have outside reach the range at these addresses of the host from now on."""
+        self._open_and_send(self.domain.move_to(hosts, self._now()))
+        self._send(self.domain.own.announced_outside())
+
     def apply_policy(self) -> None:
         """Have participants meet anew of which the policy says something else than before."""
         self._open_and_send(self.domain.apply_policy(self._now()))

@@ -1,0 +1,66 @@
+"""The advertised host has another address: outside meets the participants inside anew."""
+
+from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN
+from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.protocol.rtps import source_prefix
+from tests.unit.ros2.discovery.domains import (
+    EAR,
+    HOST,
+    INSIDE,
+    NOW,
+    RANGE,
+    ROBOT,
+    A,
+    B,
+    carried,
+    make_domain,
+    meet,
+    reached_at,
+    spdp,
+    to,
+)
+
+MOVED = "10.0.0.2"
+MOVED_IPV6 = "fd77::2"
+
+
+def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
+    domain = make_domain()
+    meet(domain)
+    domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
+    moved = domain.move_to((MOVED,), NOW)
+    farewells = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
+    assert farewells == [domain.own.observer.prefix, A]
+    (again,) = to(domain.settle(NOW + APART_TIME), ROBOT)
+    assert {locator.host for locator in reached_at(again)} == {MOVED}
+    ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
+    assert {locator.port for locator in reached_at(again)} == ports
+    later = NOW + APART_TIME + ANNOUNCED_AGAIN
+    (repeated,) = to(domain.heard_inside(spdp(A, INSIDE), INSIDE, later), ROBOT)
+    assert repeated == again
+
+
+def test_the_observer_is_announced_where_the_host_is_now() -> None:
+    domain = make_domain()
+    domain.move_to((MOVED,), NOW)
+    (announced,) = to(domain.own.announced_outside(), ROBOT)
+    assert {locator.host for locator in reached_at(announced)} == {MOVED}
+
+
+def test_each_locator_keeps_its_family() -> None:
+    domain = make_domain()
+    domain.settings.hosts = (HOST, "fd77::1")
+    meet(domain, address="fd30::11")
+    domain.move_to((MOVED, MOVED_IPV6), NOW)
+    (again,) = to(domain.settle(NOW + APART_TIME), ROBOT)
+    assert {locator.host for locator in reached_at(again)} == {MOVED_IPV6}
+
+
+def test_a_participant_without_a_port_keeps_no_other_from_moving() -> None:
+    domain = make_domain()
+    meet(domain)
+    meet(domain, B, "172.30.0.7")
+    domain.inside.by_prefix[A].announcement = b""
+    domain.move_to((MOVED,), NOW)
+    (again,) = to(domain.settle(NOW + APART_TIME), ROBOT)
+    assert source_prefix(again) == B
