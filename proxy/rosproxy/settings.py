@@ -26,9 +26,10 @@ DEFAULT_RANGE = PortRange(11000, 11099)
 class Settings:
     """Everything that ``rosproxy run`` can be told. Times are in seconds.
 
-    ``inside_networks`` empty means: the networks of the proxy's own interfaces, with ``direction``
-    ``both`` without that of the default route if there are others. A ``ros2_peer`` with port 0 is
-    told at the well-known ports. Raises SettingError where two of them don't go together.
+    ``inside_networks`` empty means: the networks of the proxy's own interfaces. If there are
+    others, ROS 1 with ``direction`` ``both`` leaves out that of the default route, and ROS 2 leaves
+    out that of the advertised host. A ``ros2_peer`` with port 0 is told at the well-known ports.
+    Raises SettingError where two of them don't go together.
     """
 
     ros: Annotated[

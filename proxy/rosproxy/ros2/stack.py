@@ -4,7 +4,7 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
@@ -75,6 +75,7 @@ class Ros2:
         self.networks: tuple[Network, ...] = ()
         self._peers = self._settings.ros2_peer
         self._addresses_of_peers: dict[HostPort, tuple[HostPort, ...]] = {}
+        self._peer_addresses = frozenset[str]()
         self._watch = DomainWatch(
             Ros2State(self.servers, self._domain_plane, with_names=False), runtime.problems
         )
@@ -229,7 +230,8 @@ class Ros2:
         ]
 
     def _is_inside(self, address: str) -> bool:
-        return addresses.is_inside(address, self.networks)
+        is_peer = address in self._peer_addresses
+        return not is_peer and addresses.is_inside(address, self.networks)
 
     def _is_allowed(self, kind: RuleKind, name: str, address: str) -> bool:
         """Whether the policy allows something to a participant inside; nodes have no names here.
@@ -320,11 +322,14 @@ class Ros2:
             peer: tuple(addresses) or known[peer]
             for peer, addresses in zip(peers, found, strict=True)
         }
+        addresses_of_all = tuple(chain.from_iterable(self._addresses_of_peers.values()))
+        self._peer_addresses = frozenset(peer.host for peer in addresses_of_all)
         for server in self.servers:
-            server.ask_outside(tuple(chain.from_iterable(self._addresses_of_peers.values())))
+            server.ask_outside(addresses_of_all)
 
     def _look_at_networks(self) -> None:
-        self.networks = self._settings.inside_networks or interface_networks()
+        own_networks = {network: address_into(network) for network in interface_networks()}
+        self.networks = self._settings.inside_networks or networks_inside(own_networks, self._hosts)
         own_addresses = {address_into(network) for network in self.networks}
         for server in self.servers:
             # The way into a network that the proxy is not in begins at an address outside of it.
@@ -363,6 +368,18 @@ def advertised_hosts(
     # Reversed: the last that is put in stays, which is then the first of its family.
     by_family = {":" in a: a for a in reversed(served or resolved)}
     return tuple(sorted(by_family.values(), key=resolved.index))
+
+
+def networks_inside(
+    own_networks: Mapping[Network, str], hosts: Collection[str]
+) -> tuple[Network, ...]:
+    """The inside networks where no option names them: those of the proxy's interfaces.
+
+    ``own_networks`` are these networks, each with the proxy's own address there. Where that is an
+    address of the advertised host, in ``hosts``, the network is outside, if there are others.
+    """
+    inside = tuple(network for network, own in own_networks.items() if own not in hosts)
+    return inside or tuple(own_networks)
 
 
 def _relay(settings: Settings) -> LanRelay | None:

@@ -1,15 +1,16 @@
 """The part for ROS 2 as a whole: a change of policy, and of where host and peers are."""
 
 from collections.abc import Iterable
-from typing import cast
+from ipaddress import ip_network
+from typing import Any, cast
 
 import pytest
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, Network
 from rosproxy.ros2 import stack
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.servers.domain_server import DomainServer
-from rosproxy.ros2.stack import Ros2, advertised_hosts
+from rosproxy.ros2.stack import Ros2, advertised_hosts, networks_inside
 from rosproxy.runtime import Runtime
 from tests.run_options import parse_settings
 
@@ -83,13 +84,16 @@ async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
         return names.get(host, [])
 
     monkeypatch.setattr(stack, "resolve", resolve)
-    told = {"ros": ("2",), "advertise_host": "base.example", "port_range": "45000-45015"}
-    ros2 = Ros2(Runtime(parse_settings({**told, "ros2_peer": ("robot.example:7410",)})))
+    told: dict[str, Any] = {"ros": ("2",), "advertise_host": "base.example"}
+    told |= {"port_range": "45000-45015"}
+    told |= {"ros2_peer": ("robot.example:7410",), "inside_network": ("192.0.2.0/24",)}
+    ros2 = Ros2(Runtime(parse_settings(told)))
     server = Listening()
     ros2.servers.append(cast(DomainServer, server))
     await ros2._refresh()
     assert server.hosts == ("192.0.2.1",)
     assert server.peers == (HostPort("192.0.2.9", 7410),)
+    assert not ros2._is_inside("192.0.2.9")
     names.update({"base.example": ["192.0.2.2"], "robot.example": ["192.0.2.10"]})
     await ros2._refresh()
     assert server.hosts == ("192.0.2.2",)
@@ -98,3 +102,28 @@ async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
     await ros2._refresh()
     assert server.hosts == ("192.0.2.2",)
     assert server.peers == (HostPort("192.0.2.10", 7410),)
+    assert ros2._is_inside("192.0.2.9")
+
+
+LAN = ip_network("192.0.2.0/24")
+BRIDGE = ip_network("172.30.0.0/24")
+
+
+@pytest.mark.parametrize(
+    ("host", "inside"),
+    [
+        ("192.0.2.1", (BRIDGE,)),
+        ("172.30.0.1", (LAN,)),
+        # The address of another machine, as in a container.
+        ("198.51.100.1", (LAN, BRIDGE)),
+        ("192.0.2.7", (LAN, BRIDGE)),
+    ],
+)
+def test_the_network_of_the_advertised_host_is_outside(
+    host: str, inside: tuple[Network, ...]
+) -> None:
+    assert networks_inside({LAN: "192.0.2.1", BRIDGE: "172.30.0.1"}, (host,)) == inside
+
+
+def test_the_only_network_is_inside() -> None:
+    assert networks_inside({LAN: "192.0.2.1"}, ("192.0.2.1",)) == (LAN,)
