@@ -46,6 +46,8 @@ class Lab:
     def __init__(self, topology: Topology, folder: Path) -> None:
         self.topology, self.folder = topology, folder
         self.proxy_prefix: tuple[str, ...] = ()
+        self.proxy_role = "px"
+        self.port_range = PORTS.bound
         self.host = topology.plan.host
         self.gateway = "172.30.1.1"
         self.options: tuple[str, ...] = ("--ros2-peer", topology.plan.robot)
@@ -64,8 +66,8 @@ class Lab:
     def start_proxy(self) -> None:
         """Start the proxy and wait until it listens."""
         argv = [*self.proxy_prefix, sys.executable, "-m", "rosproxy", "run", "--ros", "2"]
-        argv += ["--advertise-host", self.host, "--port-range", PORTS.bound, *self.options]
-        self.proxy = self._spawn("rosproxy", "px", argv, self._own_environment())
+        argv += ["--advertise-host", self.host, "--port-range", self.port_range, *self.options]
+        self.proxy = self._spawn("rosproxy", self.proxy_role, argv, self._own_environment())
         self.proxy.wait_for("listening: ")
 
     def start_ear(self) -> None:
@@ -113,7 +115,7 @@ class Lab:
         return document
 
     def _get(self, path: str) -> bytes:
-        with self.place("px").entered():
+        with self.place(self.proxy_role).entered():
             asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
             with closing(asking):
                 asking.request("GET", path)
