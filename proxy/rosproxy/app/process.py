@@ -107,6 +107,7 @@ class App:
 
     def state(self) -> ProxyStatus:
         """The state, within the bound of the status."""
+        self.runtime.refusals.end_old()
         status = replace(common_status(self.runtime), range_probe=self._check.result)
         for stack in self.stacks:
             status = stack.add_to(status)

@@ -2,11 +2,13 @@
 
 A metric counts every refusal by its reason, a word of those in docs/reference/limits.md. The log
 gets one line for each reason and source, then none for a while, and so many for each reason;
-`rosproxy status` shows the last one of each reason.
+`rosproxy status` shows the last one of each reason, until the proxy has refused nothing more for
+that reason for some minutes.
 """
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
@@ -17,10 +19,38 @@ DENIED, WOULD_BE_DENIED = "policy", "policy_audit"
 """The reasons of what a policy denies, or only tells of."""
 QUIET = 60.0
 """Seconds in which a source is not logged again for the same reason."""
+OVER_AFTER = 300.0
+"""Seconds without a refusal after which the status shows the last one no longer."""
+OF_STARTS = frozenset({"not_a_peer", "unproven", "unknown_participant", "no_locator"})
+"""Reasons that nodes of ROS 2 give at each start, for a second or two: a datagram of a participant
+overtakes the announcement of that participant."""
+PATIENCE = 10.0
+"""Seconds that refusals for a reason of `OF_STARTS` go on before the log and the status tell it."""
+PAUSE = 15.0
+"""Seconds without a refusal after which these begin anew. Cyclone DDS announces itself each 8 s."""
 LINES = 20
 """Sources that are logged in that time for one reason: sources of datagrams may be forged."""
 MOST = 1000
 """Sources and reasons that are remembered for that."""
+
+
+@dataclass(slots=True)
+class _Span:
+    """A time in which something was refused for one reason again and again, in seconds."""
+
+    first: float
+    last: float
+
+    def extend(self, now: float) -> None:
+        """Take in a refusal; after a pause a new span begins."""
+        if now - self.last > PAUSE:
+            self.first = now
+        self.last = now
+
+    @property
+    def length(self) -> float:
+        """Seconds from the first refusal to the last."""
+        return self.last - self.first
 
 
 def problem_subject(reason: str) -> str:
@@ -35,11 +65,17 @@ class Refusals:
         self._metrics, self._problems, self._now = metrics, problems, now
         self._logged_at: dict[tuple[str, str], float] = {}
         self._lines: dict[str, tuple[float, int]] = {}
+        self._spans: dict[str, _Span] = {}
 
     def note(self, reason: str, source: str, text: str) -> None:
         """Tell that something from a source was refused, and why."""
         self._metrics.refused.labels(reason).inc()
-        now, key = self._now(), (reason, source)
+        now = self._now()
+        key = reason, source
+        span = self._spans.setdefault(reason, _Span(now, now))
+        span.extend(now)
+        if reason in OF_STARTS and span.length < PATIENCE:
+            return
         if now - self._logged_at.get(key, -QUIET) < QUIET:
             return
         since, lines = self._lines.get(reason, (now, 0))
@@ -56,3 +92,10 @@ class Refusals:
         log.warning("%s, from %s: %s", subject, source, text)
         self._problems.solved(subject)
         self._problems.add(subject, f"from {source}: {text}")
+
+    def end_old(self) -> None:
+        """End the problems that tell refusals which are over."""
+        now = self._now()
+        for reason in [r for r, span in self._spans.items() if now - span.last >= OVER_AFTER]:
+            del self._spans[reason]
+            self._problems.solved(problem_subject(reason))

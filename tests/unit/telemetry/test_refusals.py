@@ -4,7 +4,16 @@ import pytest
 
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
-from rosproxy.telemetry.refusals import LINES, MOST, QUIET, Refusals
+from rosproxy.telemetry.refusals import (
+    LINES,
+    MOST,
+    OF_STARTS,
+    OVER_AFTER,
+    PATIENCE,
+    PAUSE,
+    QUIET,
+    Refusals,
+)
 
 
 def test_each_refusal_counts_and_the_first_of_a_source_is_told(
@@ -45,3 +54,49 @@ def test_forged_sources_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) ->
     clock[0] = QUIET
     refusals.note("rate", "10.0.0.5", "x")
     assert len(caplog.records) == LINES + 2
+
+
+def test_a_refusal_that_is_over_is_not_shown() -> None:
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    refusals.note("rate", "10.0.0.5", "x")
+    clock[0] = QUIET / 2
+    refusals.note("rate", "10.0.0.5", "x")
+    clock[0] = OVER_AFTER
+    refusals.end_old()
+    assert problems.all(), "the last one was a while later"
+    clock[0] = QUIET / 2 + OVER_AFTER
+    refusals.end_old()
+    assert not problems.all()
+    refusals.note("rate", "10.0.0.5", "x")
+    assert problems.all(), "it is told when it comes again"
+
+
+@pytest.mark.parametrize("reason", sorted(OF_STARTS))
+def test_what_a_start_brings_for_a_moment_is_not_told(
+    reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for started in range(10):
+        clock[0] = started * 2 * PAUSE
+        refusals.note(reason, "10.0.0.5", "x")
+        clock[0] += PATIENCE / 2
+        refusals.note(reason, "10.0.0.5", "x")
+    assert not problems.all()
+    assert not caplog.records
+
+
+def test_what_goes_on_after_a_start_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    """Also where each datagram has another source, as forged ones have."""
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for number in range(3):
+        clock[0] = number * 8.0
+        refusals.note("not_a_peer", f"10.0.0.{number}", "x")
+    (problem,) = problems.all()
+    assert problem.text == "from 10.0.0.2: x"
+    assert len(caplog.records) == 1
