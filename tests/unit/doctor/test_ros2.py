@@ -191,3 +191,11 @@ def test_what_was_refused_lately_is_told() -> None:
 def test_nothing_is_heard_of_zenoh() -> None:
     told = diagnose_domain(DomainStatus(peers=("10.0.0.9",)))["inside", "domain 0"][1]
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in told
+
+
+def test_a_proxy_that_has_just_started_misses_no_participant_yet() -> None:
+    domain = DomainStatus(peers=("10.0.0.9",))
+    severity, text = diagnose_domain(domain, uptime=1.0)["inside", "domain 0"]
+    assert severity is Severity.INFO
+    assert "just started" in text
+    assert diagnose_domain(domain)["inside", "domain 0"][0] is Severity.WARNING

@@ -32,8 +32,9 @@ _REFUSED = {
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
     """What is to be said of the domains."""
     domains = facts.proxy.domains
-    findings = [finding for domain in domains for finding in _domain(domain)]
-    if facts.proxy.uptime >= SETTLED:
+    is_settled = facts.proxy.uptime >= SETTLED
+    findings = [finding for domain in domains for finding in _domain(domain, is_settled)]
+    if is_settled:
         findings += [
             finding for heard in facts.heard_participants for finding in _heard(heard, domains)
         ]
@@ -47,14 +48,17 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
     return findings
 
 
-def _domain(domain: DomainStatus) -> Iterator[DoctorFinding]:
+def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
     subject = f"domain {domain.domain}"
     if not domain.peers and not domain.ear:
         text = "participants inside are announced to nobody outside"
         yield error(
             "announcing", subject, text, "give --ros2-peer, or run rosproxy ear (--ros2-ear)"
         )
-    if not domain.inside:
+    if not domain.inside and not is_settled:
+        text = "no participant inside has been heard yet; the proxy has just started"
+        yield note("inside", subject, text, "wait some seconds")
+    elif not domain.inside:
         text = "no participant inside has been heard"
         fix = f"put the nodes on a network of the proxy's, with ROS_DOMAIN_ID={domain.domain} and "
         fix += (
