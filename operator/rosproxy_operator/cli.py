@@ -146,7 +146,7 @@ def _run(
     from rosproxy_operator.docker.controller import run, run_once
 
     if not once:
-        with setting_errors():
+        with setting_errors(), exit_on_error():
             run(settings, resync, admin, mistakes)
         return
     from rosproxy_operator.docker.errors import EngineError

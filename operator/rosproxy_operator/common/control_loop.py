@@ -42,6 +42,10 @@ class LookFailed(Exception):
         self.is_engine_away = away
 
 
+class LookImpossible(LookFailed):
+    """No later look of this process can succeed either: the process has to end."""
+
+
 @dataclass(frozen=True, slots=True)
 class Pace:
     """The times of a loop, in seconds.
@@ -72,11 +76,16 @@ class ControlLoop:
         self._awaiting_look: list[asyncio.Future[None]] = []
 
     async def run(self, look: Look) -> None:
-        """Look until cancelled, also after an unexpected error: a bug must not end the loop."""
+        """Look until cancelled, also after an unexpected error: a bug must not end the loop.
+
+        Raises LookImpossible.
+        """
         async with self._alive():
             while True:
                 try:
                     await self._try(look)
+                except LookImpossible:
+                    raise
                 except Exception as error:
                     if not self._failures:
                         log.exception("a look failed; going on")
@@ -150,7 +159,10 @@ class ControlLoop:
         return self._error
 
     async def _try(self, look: Look, patient: bool = True) -> bool:
-        """One look; whether it succeeded. Raises LookFailed only if the engine is away."""
+        """One look; whether it succeeded.
+
+        Raises LookImpossible, and LookFailed only if the engine is away.
+        """
         self._woken.clear()
         self._back.clear()
         awaiting, self._awaiting_look = self._awaiting_look, []
@@ -162,7 +174,8 @@ class ControlLoop:
             reason = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
             self._failed(LookFailed(reason, away=True))
         except LookFailed as error:
-            if error.is_engine_away and not patient:
+            is_final = isinstance(error, LookImpossible)
+            if is_final or (error.is_engine_away and not patient):
                 raise  # the caller reports it
             self._failed(error)
         else:

@@ -17,7 +17,12 @@ from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy.page.page_document import Document
-from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
+from rosproxy_operator.common.control_loop import (
+    ControlLoop,
+    LookFailed,
+    LookImpossible,
+    Pace,
+)
 from rosproxy_operator.common.health_server import HealthServer
 from rosproxy_operator.common.master_resolver import AGAIN_UNRESOLVED, MasterResolver
 from rosproxy_operator.common.operator_metrics import DockerMetrics
@@ -26,7 +31,7 @@ from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import Json, ProxyClient
 from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.engine_client import DockerClient, listen
-from rosproxy_operator.docker.errors import EngineError, Unavailable
+from rosproxy_operator.docker.errors import EngineError, FormerSocket, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
 from rosproxy_operator.docker.host_document import host_document
 from rosproxy_operator.docker.operator_sign import publish_sign
@@ -74,8 +79,9 @@ def uninstall(settings: PlanSettings, resync: float) -> list[Problem]:
 def run(
     settings: PlanSettings, resync: float, admin: HostPort, mistakes: Sequence[Problem]
 ) -> None:
-    """Run the operator until a signal ends it; its proxies go on. Raises SettingError.
+    """Run the operator until a signal ends it; its proxies go on.
 
+    Raises SettingError, and LookImpossible where only a new start of its container can help.
     ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
     serves its own health. ``mistakes`` are what is wrong with how it was started, to be told.
     """
@@ -180,10 +186,15 @@ class DockerController:
         return host_document(snapshot.state, planned, problems, answers, self._settings)
 
     async def look(self) -> float | None:
-        """One look and what follows from it; when to look again. Raises LookFailed."""
+        """One look and what follows from it; when to look again.
+
+        Raises LookFailed; LookImpossible where this container has the socket of a former engine.
+        """
         started = time.monotonic()
         try:
             snapshot = await self._observer.look()
+        except FormerSocket as error:
+            raise LookImpossible(str(error), away=True) from error
         except EngineError as error:
             raise LookFailed(str(error), away=isinstance(error, Unavailable)) from error
         planned = self._decide(

@@ -22,6 +22,10 @@ class Unavailable(EngineError):
     """The engine can't be reached, or does not answer."""
 
 
+class FormerSocket(Unavailable):
+    """The socket is that of an engine which has ended; its file was mounted into this container."""
+
+
 class Conflict(EngineError):
     """The name is taken, or another request is at work on it."""
 
@@ -81,9 +85,22 @@ def unreachable(url: str, error: BaseException) -> Unavailable:
             f"there is no Docker engine's socket {path}: start the engine, or in a container "
             f"mount it (-v {path}:{path}), or name the engine by DOCKER_HOST"
         )
+    if number == errno.ECONNREFUSED and _is_removed(path):
+        return FormerSocket(
+            f"the Docker engine has been started again and has a new socket; the mounted {path} is "
+            "the former one: start this container again (a restart policy does: --restart always)"
+        )
     if number == errno.ECONNREFUSED:
         return Unavailable(f"no Docker engine answers at {url}: is it running?")
     return Unavailable(f"the Docker engine at {url} can't be asked: {str(chain[-1])[:200]}")
+
+
+def _is_removed(path: str) -> bool:
+    """Whether a file was removed and is here only since it is mounted by itself."""
+    try:
+        return os.stat(path).st_nlink == 0
+    except OSError:
+        return False
 
 
 def _group(path: str) -> str:

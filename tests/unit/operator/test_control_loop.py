@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
+from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, LookImpossible, Pace
 from rosproxy_operator.common.operator_metrics import DockerMetrics
 
 PACE = Pace("engine", resync=30.0, debounce=0.1, longest=60.0)
@@ -98,6 +98,14 @@ async def test_it_looks_at_once_and_then_every_resync() -> None:
     async with looking() as looks:
         await asyncio.sleep(61)
         assert looks.times == [0.0, 30.0, 60.0]
+
+
+@in_jumping_time
+async def test_it_ends_where_no_look_can_succeed() -> None:
+    looks = Looks(AWAY, LookImpossible("a former engine", away=True))
+    with pytest.raises(LookImpossible):
+        await looks.loop.run(looks.look)
+    assert len(looks.times) == 2
 
 
 @in_jumping_time

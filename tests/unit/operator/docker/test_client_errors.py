@@ -1,6 +1,8 @@
 """What the engine says when it refuses, and what the user is told."""
 
 import errno
+import os
+from pathlib import Path
 
 import pytest
 import requests
@@ -9,6 +11,7 @@ import urllib3
 from rosproxy_operator.docker.errors import (
     Conflict,
     EngineError,
+    FormerSocket,
     NoSuchObject,
     PortTaken,
     refusal,
@@ -109,6 +112,20 @@ def test_an_engine_that_cannot_be_reached(number: int, words: str) -> None:
     told = str(unreachable(SOCKET, wrapped(OSError(number, "no"))))
     assert words in told
     assert "\n" not in told
+
+
+def test_the_mounted_socket_of_a_former_engine_is_told(tmp_path: Path) -> None:
+    """A file that was removed and is still open has no name left, as one that is mounted."""
+    file = tmp_path / "docker.sock"
+    file.touch()
+    with file.open() as held:
+        path = f"/proc/{os.getpid()}/fd/{held.fileno()}"
+        refused = wrapped(OSError(errno.ECONNREFUSED, "no"))
+        assert not isinstance(unreachable(f"unix://{path}", refused), FormerSocket)
+        file.unlink()
+        error = unreachable(f"unix://{path}", refused)
+    assert isinstance(error, FormerSocket)
+    assert f"the mounted {path} is the former one" in str(error)
 
 
 def test_a_cause_is_found_too() -> None:
