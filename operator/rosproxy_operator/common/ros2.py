@@ -20,8 +20,6 @@ ROS1_DISTROS = frozenset(
 """There will be no more of them, so any other is one of ROS 2."""
 EAR_COMMAND = ("rosproxy", "ear")
 """What the proxy's image does as an ear."""
-ALONE = {"ROS_LOCALHOST_ONLY": ("1",), "ROS_AUTOMATIC_DISCOVERY_RANGE": ("LOCALHOST", "OFF")}
-"""Variables that keep participants from being found by others, and their values for that."""
 
 
 def discovery_port(domain: int) -> int:

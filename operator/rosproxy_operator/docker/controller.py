@@ -183,7 +183,9 @@ class DockerController:
         snapshot, planned = self._last
         answers = await ask_proxies(self._proxies, snapshot, self._settings.uplink)
         problems = self._current(snapshot, planned)
-        return host_document(snapshot.state, planned, problems, answers, self._settings)
+        return host_document(
+            snapshot.state, planned, problems, answers, self._settings, time.time()
+        )
 
     async def look(self) -> float | None:
         """One look and what follows from it; when to look again.

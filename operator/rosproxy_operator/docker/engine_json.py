@@ -12,6 +12,7 @@ from typing import Any, TypedDict
 import msgspec
 
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.common.ros2_variables import OF_ROS2
 from rosproxy_operator.docker.engine_client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
 from rosproxy_operator.docker.planner.own_containers import CreationFacts
@@ -19,10 +20,7 @@ from rosproxy_operator.docker.planner.specs import FORMER_TOKEN, MANAGED, SECRET
 
 # Go's zero time, 0001-01-01T00:00:00Z.
 _NEVER_STARTED = "0001-"
-_VARIABLES = frozenset(
-    {"ROS_VERSION", "ROS_DISTRO", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY", "RMW_IMPLEMENTATION"}
-    | {"ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_IP", "ROS_HOSTNAME"}
-)
+_VARIABLES = OF_ROS2 | {"ROS_VERSION", "ROS_DISTRO", "ROS_IP", "ROS_HOSTNAME"}
 """Variables that tell the version of ROS in a container, and how its nodes find each other."""
 _KEPT_VARIABLES = _VARIABLES | {"ROS_MASTER_URI", FORMER_TOKEN}
 LONGEST_TEXT = 4096

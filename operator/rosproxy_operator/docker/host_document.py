@@ -4,14 +4,16 @@
 running operator answers with it.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
+from datetime import datetime
 
 from rosproxy import __version__
 from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json
 from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
+from rosproxy_operator.common.ros2_variables import why_unheard
 from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Member, OwnContainer
 from rosproxy_operator.docker.planner.plan import DockerPlan
@@ -21,6 +23,8 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 ProxyStatuses = Mapping[str, ProxyStatus]
 """The status of each proxy that answers, by the name of its container."""
+SETTLED = 15.0
+"""Seconds after the start of a container and of its proxy in which no participant is missed."""
 
 
 def host_document(
@@ -29,8 +33,11 @@ def host_document(
     problems: Iterable[Problem],
     answers: Mapping[str, ProxyStatus | Problem],
     settings: PlanSettings,
+    now: float,
 ) -> Json:
     """The document. ``answers`` are those of proxies, by name, or why one does not answer.
+
+    ``now`` is Unix time.
 
     Containers are those that have a proxy, are to have one, or whose labels are wrong; one with
     both versions of ROS is listed twice. Actions for what the engine is busy with, and tells
@@ -41,6 +48,7 @@ def host_document(
     subjects = {problem.subject for problem in problems}
     silent = [answer for answer in answers.values() if isinstance(answer, Problem)]
     problems += [problem for problem in silent if problem.subject not in subjects]
+    problems += _unheard(planned.members, observed, statuses, now)
     subjects = {problem.subject for problem in problems}
     redirects = _redirects(planned.members, observed)
     keys: dict[str, list[Key | None]] = {}
@@ -52,7 +60,7 @@ def host_document(
         "uplink": settings.uplink,
         "proxies": [_proxy(key, observed, statuses, settings) for key in sorted(observed.keys)],
         "containers": [
-            _container(container, key, statuses, redirects.get((container.id, key)))
+            _container(container, key, observed, statuses, redirects.get((container.id, key)))
             for container in observed.containers
             if container.id in keys or f"container {container.name}" in subjects
             for key in keys.get(container.id, [None])
@@ -142,11 +150,48 @@ def _redirects(
     }
 
 
+def _unheard(
+    members: Iterable[Member], observed: HostState, statuses: ProxyStatuses, now: float
+) -> Iterator[Problem]:
+    """Containers of ROS 2 without a participant, whose variables may be why."""
+    for member in members:
+        container = member.container
+        status = statuses.get(proxy_name(member.key))
+        if not member.key.is_ros2 or status is None or container.state != "running":
+            continue
+        settled = min(status.uptime, now - _unix_time(container.started_at)) >= SETTLED
+        addresses = _addresses(container, observed).values()
+        reason = why_unheard(container.variables)
+        if reason and settled and not participants_by_address(status).keys() & {*addresses}:
+            text = f"the proxy has heard no participant of it, perhaps by {reason}"
+            yield Problem(f"container {container.name}", text)
+
+
+def _unix_time(text: str) -> float:
+    """A time of the engine's as Unix time; 0 if it is none."""
+    try:
+        seconds = text.partition(".")[0].removesuffix("Z")
+        return datetime.fromisoformat(f"{seconds}+00:00").timestamp()
+    except ValueError:
+        return 0.0
+
+
+def _addresses(container: Container, observed: HostState) -> dict[str, str]:
+    """The addresses of a container by network; those of the container whose networks it shares."""
+    by_id = {other.id: other for other in observed.containers}
+    owner = network_owner(container, by_id)
+    return {a.network: a.address for a in owner.attachments if a.address}
+
+
 def _container(
-    container: Container, key: Key | None, statuses: ProxyStatuses, redirect: Json | None = None
+    container: Container,
+    key: Key | None,
+    observed: HostState,
+    statuses: ProxyStatuses,
+    redirect: Json | None = None,
 ) -> Json:
     proxy = proxy_name(key) if key else None
-    addresses = {a.network: a.address for a in container.attachments if a.address}
+    addresses = _addresses(container, observed)
     status = statuses.get(proxy or "")
     nodes = nodes_by_address(status) if status else {}
     participants = participants_by_address(status) if status else {}

@@ -162,4 +162,4 @@ async def survey(settings: PlanSettings) -> Json:
     finally:
         await proxies.close()
     planned = plan(snapshot.state, snapshot.labels, settings, DockerMemory(), time.monotonic())
-    return host_document(snapshot.state, planned, planned.problems, answers, settings)
+    return host_document(snapshot.state, planned, planned.problems, answers, settings, time.time())

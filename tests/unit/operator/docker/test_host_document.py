@@ -1,13 +1,14 @@
 """What a host's status says where a labelled container gets no proxy."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
 
-from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.admin.status_document import DomainStatus, ParticipantStatus, ProxyStatus
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.docker.host_document import host_document
-from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.docker.host_document import SETTLED, host_document
+from rosproxy_operator.docker.planner.model import Attachment, Key
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -30,7 +31,7 @@ def test_a_labelled_container_without_a_proxy_is_listed() -> None:
     state = observed(container(), listening=[11400])
     made = planned(state, TIGHT, DockerMemory(), 0.0)
     assert not made.actions
-    status = host_document(state, made, made.problems, {}, TIGHT)
+    status = host_document(state, made, made.problems, {}, TIGHT, 0.0)
     (row,) = status["containers"]
     assert (row["name"], row["proxy"]) == ("talker", None)
     text = render({**status, "operator": None}, 120)
@@ -42,7 +43,7 @@ def test_a_container_whose_master_is_refused_is_listed() -> None:
     settings = replace(SETTINGS, allow_master=("arm:*",))
     state = observed(container())
     made = planned(state, settings, DockerMemory(), 0.0)
-    (row,) = host_document(state, made, made.problems, {}, settings)["containers"]
+    (row,) = host_document(state, made, made.problems, {}, settings, 0.0)["containers"]
     assert (row["name"], row["proxy"]) == ("talker", None)
 
 
@@ -54,5 +55,89 @@ def test_only_a_proxy_for_ros_1_has_a_master(key: Key, up: bool | None) -> None:
     state = observed(proxies=[replace(running, key=key, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
     answers = {proxy_name(key): ProxyStatus()}
-    (row,) = host_document(state, made, (), answers, SETTINGS)["proxies"]
+    (row,) = host_document(state, made, (), answers, SETTINGS, 0.0)["proxies"]
     assert (row["reachable"], row["master_up"]) == (True, up)
+
+
+DOMAIN = Key("", HERE, 0)
+STARTED = 1_700_000_000.0
+STARTED_AT = "2023-11-14T22:13:20.123456789Z"
+TALKER = Attachment("app", "172.30.0.5")
+
+
+def told_of_talker(
+    variables: Mapping[str, str],
+    inside: Sequence[str] = (),
+    age: float = SETTLED,
+    uptime: float = SETTLED,
+) -> list[str]:
+    """What a host's status says of a labelled container of ROS 2.
+
+    ``inside`` are the addresses at which its proxy has heard participants.
+    """
+    labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
+    talker = container(labels=labels, networks=[TALKER], env="")
+    talker = replace(talker, variables=variables, started_at=STARTED_AT)
+    running = proxy(KEY)
+    own = replace(running.container, name=proxy_name(DOMAIN))
+    state = observed(talker, proxies=[replace(running, key=DOMAIN, container=own)])
+    made = planned(state, SETTINGS, DockerMemory(), 0.0)
+    participants = tuple(ParticipantStatus("01.0f.aa", address) for address in inside)
+    status = ProxyStatus(uptime=uptime, domains=(DomainStatus(inside=participants),))
+    document = host_document(
+        state, made, (), {proxy_name(DOMAIN): status}, SETTINGS, STARTED + age + 1
+    )
+    return [problem["text"] for problem in document["problems"]]
+
+
+@pytest.mark.parametrize(
+    ("variables", "cure"),
+    [
+        ({"ROS_DISCOVERY_SERVER": "10.0.0.9:11811"}, "unset it"),
+        ({"ROS_LOCALHOST_ONLY": "1"}, "unset it"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}, "or write SUBNET"),
+        ({"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}, "or write UDPv4"),
+        ({"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, "or write UDPv4"),
+        ({"CYCLONEDDS_URI": "file:///cyclone.xml"}, "try without it"),
+        ({"FASTRTPS_DEFAULT_PROFILES_FILE": "/profile.xml"}, "try without it"),
+    ],
+)
+def test_a_variable_is_named_where_no_participant_is_heard(
+    variables: dict[str, str], cure: str
+) -> None:
+    (text,) = told_of_talker(variables)
+    ((name, value),) = variables.items()
+    assert f"its variable {name}={value}: " in text
+    assert cure in text
+    assert not told_of_talker(variables, inside=[TALKER.address]), "all is well"
+    assert not told_of_talker(variables, age=1.0), "it has just started"
+    assert not told_of_talker(variables, uptime=1.0), "its proxy has just started"
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {},
+        {"ROS_DOMAIN_ID": "0", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
+        {"ROS_LOCALHOST_ONLY": "0"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
+    ],
+)
+def test_variables_that_keep_no_participant_apart(variables: dict[str, str]) -> None:
+    assert not told_of_talker(variables)
+
+
+def test_a_container_in_the_network_of_another_has_its_participants() -> None:
+    """The other one needs no label."""
+    pause = container("pause", labels={}, networks=[TALKER])
+    labels = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
+    talker = container(labels=labels, networks=(), env="", mode=f"container:{pause.id}")
+    running = proxy(KEY)
+    own = replace(running.container, name=proxy_name(DOMAIN))
+    state = observed(pause, talker, proxies=[replace(running, key=DOMAIN, container=own)])
+    made = planned(state, SETTINGS, DockerMemory(), 0.0)
+    domain = DomainStatus(inside=(ParticipantStatus("01.0f.aa", TALKER.address),))
+    answers = {proxy_name(DOMAIN): ProxyStatus(domains=(domain,))}
+    (row,) = host_document(state, made, (), answers, SETTINGS, STARTED)["containers"]
+    assert row["name"] == talker.name
+    assert [p["guid_prefix"] for p in row["participants"]] == ["01.0f.aa"]

@@ -111,7 +111,7 @@ def test_no_text_of_a_container_gets_further_than_its_place(
         assert line.encode()
     for problem in plan.problems:
         assert len(problem.text) < LONGEST_PROBLEM
-    document = {**host_document(seen, plan, plan.problems, {}, SETTINGS), "operator": None}
+    document = {**host_document(seen, plan, plan.problems, {}, SETTINGS, 0.0), "operator": None}
     assert json.dumps(document).isascii()
     assert all(line.isprintable() for line in render(document, 80).split("\n"))
     # What the engine is sent is UTF-8.

@@ -7,6 +7,7 @@ import pytest
 
 from rosproxy.access.rules import parse_rules
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.ros2_variables import OF_ROS2
 from rosproxy_operator.docker.option_values import read_host_pattern
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import Container, Key, Member, Network
@@ -99,6 +100,30 @@ def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
     assert read(labelled_container(env=ROBOT), settings)[1] == []
 
 
+@pytest.mark.parametrize("name", sorted(OF_ROS2))
+def test_a_variable_of_ros_2_alone_says_it(name: str) -> None:
+    variables = {name: "7"}
+    assert keys(labelled_container(variables=variables))[0].is_ros2
+    assert read(labelled_container(variables=variables))[1] == []
+    assert keys(labelled_container(variables=variables, env=ROBOT)) == [KEY]
+
+
+@pytest.mark.parametrize(
+    "labels", [{"rosproxy.domain": "0"}, {"rosproxy.peers": "robot"}], ids=["domain", "peers"]
+)
+def test_a_label_for_ros_2_alone_says_it(labels: Mapping[str, str]) -> None:
+    members, told = read(labelled_container({**ON, **labels}))
+    assert [member.key for member in members] == [DOMAIN]
+    assert not told
+
+
+def test_where_nothing_says_it_and_no_master_is_known_both_ways_are_told() -> None:
+    assert refusal(labelled_container()) == (
+        "nothing says which ROS it is: add the label rosproxy.ros=2 for ROS 2, or the label "
+        "rosproxy.master-uri=http://HOST:11311 for ROS 1"
+    )
+
+
 def test_the_domain_is_that_of_the_label_or_the_variable() -> None:
     variables = {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": "7"}
     assert keys(labelled_container(ON, variables)) == [Key("", HERE, 7)]
@@ -166,14 +191,6 @@ def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
     assert "is no DDS" in refusal(labelled_container(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
     text = refusal(labelled_container(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
     assert text.endswith("give an IPv4 address")
-
-
-@pytest.mark.parametrize(
-    "variables", [{"ROS_LOCALHOST_ONLY": "1"}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}]
-)
-def test_participants_that_keep_to_themselves_are_told(variables: Mapping[str, str]) -> None:
-    (text,) = read(labelled_container(TWO, variables))[1]
-    assert text.endswith("keeps its participants from being found: unset it")
 
 
 def test_on_an_internal_network_it_reaches_outside_through_the_proxy() -> None:

@@ -13,7 +13,10 @@ from rosproxy_operator.docker.planner.labels.readers import (
     ADVERTISE_HOST,
     ENABLE,
     LABELS,
+    MASTER_URI,
     REDIRECT,
+    ROS,
+    NoMaster,
     UnusableLabel,
 )
 from rosproxy_operator.docker.planner.model import ALIVE, Container, HostState, Key, Member
@@ -169,7 +172,8 @@ def _ros2_request(container: Container, observed: HostState, settings: PlanSetti
 def _request(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> Member:
-    labels, uri = container.labels, readers.master_uri(container, settings, proxies)
+    labels = container.labels
+    uri = _master_uri(container, settings, proxies)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
@@ -183,6 +187,17 @@ def _request(
         policy=readers.policy(labels),
         redirect=readers.redirect(labels),
     )
+
+
+def _master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
+    """The URI of a container's master. Raises UnusableLabel if it has none."""
+    try:
+        return readers.master_uri(container, settings, proxies)
+    except NoMaster:
+        if not ros_versions.is_guessed(container):
+            raise
+        text = f"nothing says which ROS it is: add the label {ROS}=2 for ROS 2, or the label "
+        raise UnusableLabel(f"{text}{MASTER_URI}=http://HOST:11311 for ROS 1") from None
 
 
 def _problem(container: Container, text: str, fatal: bool) -> Problem:

@@ -59,6 +59,10 @@ class UnusableLabel(Exception):
     """Why a container is left out: what is wrong, and what to do."""
 
 
+class NoMaster(UnusableLabel):
+    """Neither the container nor the operator names a master."""
+
+
 def quoted(value: str) -> str:
     """A value as messages may show it: shortened and escaped."""
     return repr(bounded(value, 80))
@@ -254,8 +258,8 @@ def _why_no_network(owner: Container) -> str:
 def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
     """The URI of the real master: from the label, else the environment, else the settings.
 
-    ``proxies`` are names of the operator's own containers. Raises UnusableLabel if there is none
-    or it can't be one.
+    ``proxies`` are names of the operator's own containers. Raises NoMaster if there is none,
+    UnusableLabel if it can't be one.
     """
     if MASTER_URI in container.labels:
         source = named(MASTER_URI, container.labels)
@@ -267,7 +271,7 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
     if settings.master_uri:
         source = f"the operator's --master-uri {quoted(settings.master_uri)}"
         return _parse_master(source, settings.master_uri, proxies)
-    raise UnusableLabel(
+    raise NoMaster(
         f"no master is known: add the label {MASTER_URI}=http://HOST:11311 with the real master, "
         "or start the operator with --master-uri"
     )

@@ -1,20 +1,21 @@
 """Which ROS a container is of, and what it wants of a proxy for ROS 2.
 
 A label says it, else the container's own variables, which most images with ROS have: ROS_VERSION,
-ROS_DISTRO. Where nothing says it a container is of ROS 1, as before there was anything else.
+ROS_DISTRO. Else a label or a variable that one version alone has says it: ROS_MASTER_URI for ROS 1,
+ROS_DOMAIN_ID for ROS 2. Where nothing says it, the container counts as one of ROS 1.
 """
 
 import re
 from collections.abc import Collection, Iterator
 
 from rosproxy_operator.common.ros2 import (
-    ALONE,
     LAST_DOMAIN,
     MOST_PEERS,
     ROS1_DISTROS,
     is_dds,
     read_peer_name,
 )
+from rosproxy_operator.common.ros2_variables import OF_ROS2
 from rosproxy_operator.docker.planner.labels.readers import (
     DOMAIN,
     MASTER_URI,
@@ -42,10 +43,22 @@ def versions(container: Container) -> frozenset[str]:
             text = f"{named(ROS, container.labels)} is none of 1, 2 and 1,2: write {ROS}=2"
             raise UnusableLabel(text)
         return tokens
-    version, distro = (container.variables.get(name, "") for name in ("ROS_VERSION", "ROS_DISTRO"))
+    version = container.variables.get("ROS_VERSION", "")
     if version in ("1", "2"):
         return frozenset({version})
-    return frozenset({"1" if distro.lower() in ("", *ROS1_DISTROS) else "2"})
+    distro = container.variables.get("ROS_DISTRO", "").lower()
+    if distro:
+        return frozenset({"1" if distro in ROS1_DISTROS else "2"})
+    return frozenset({"2" if _is_marked_ros2(container) else "1"})
+
+
+def _is_marked_ros2(container: Container) -> bool:
+    """Whether a container has marks of ROS 2, and none of ROS 1."""
+    if MASTER_URI in container.labels or container.master_uri:
+        return False
+    return any(name in container.labels for name in _OF_ROS2) or bool(
+        OF_ROS2 & container.variables.keys()
+    )
 
 
 def domain(container: Container) -> int:
@@ -87,12 +100,13 @@ def refuse_unserved(container: Container, host: str) -> None:
 def is_guessed(container: Container) -> bool:
     """Whether nothing says which version of ROS a container is of."""
     explicit = {ROS, MASTER_URI} & container.labels.keys() or container.master_uri
-    return not explicit and not {"ROS_VERSION", "ROS_DISTRO"} & container.variables.keys()
+    is_told = explicit or {"ROS_VERSION", "ROS_DISTRO"} & container.variables.keys()
+    return not is_told and not _is_marked_ros2(container)
 
 
 def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[str]:
     """Warnings for a container of these versions, which has a proxy nevertheless."""
-    labels, variables = container.labels, container.variables
+    labels = container.labels
     if is_guessed(container):
         yield f"nothing says which ROS it is, so it is taken for ROS 1: add the label {ROS}=1 or 2"
     for version, labels_of_version in (("1", _OF_ROS1), ("2", _OF_ROS2)):
@@ -102,7 +116,3 @@ def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[st
                 for label in labels_of_version
                 if label in labels
             )
-    for name, values in ALONE.items() if "2" in ros_versions else ():
-        if variables.get(name, "").upper() in values:
-            text = f"its variable {name}={variables[name]} keeps its participants from being found"
-            yield f"{text}: unset it"

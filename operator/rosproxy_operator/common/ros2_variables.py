@@ -1,0 +1,64 @@
+"""The variables of ROS 2 and DDS in a container: which say its version, and which keep nodes apart.
+
+A profile of DDS can say anything, and the operator does not read files in containers. So such a
+variable is told only where the proxy has heard no participant of the container.
+"""
+
+from collections.abc import Callable, Mapping
+
+from rosproxy.telemetry.text import brief
+
+LONGEST_VALUE = 80
+"""Characters of a variable's value that are told."""
+
+_PROFILE = (
+    "its profile may name other interfaces, addresses or a discovery server: try without it, or "
+    "have it use UDP on all interfaces and announce no address of its own"
+)
+_LOCAL = "its nodes look for others on their own machine alone: unset it"
+
+
+def _always(_: str) -> bool:
+    return True
+
+
+def _is_without_udp(value: str) -> bool:
+    """Whether FASTDDS_BUILTIN_TRANSPORTS names transports that a proxy can't carry.
+
+    LARGE_DATA sends data by TCP, after discovery by UDP (Fast DDS, rtps/builtin_transports).
+    """
+    return value.upper().partition("?")[0] not in ("", "DEFAULT", "DEFAULTV6", "UDPV4", "UDPV6")
+
+
+_KEEP_APART: dict[str, tuple[Callable[[str], bool], str]] = {
+    "ROS_DISCOVERY_SERVER": (
+        _always,
+        "its nodes ask a discovery server and announce themselves to no other: unset it",
+    ),
+    "ROS_LOCALHOST_ONLY": (lambda value: value == "1", _LOCAL),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": (
+        lambda value: value.upper() in ("LOCALHOST", "OFF"),
+        f"{_LOCAL}, or write SUBNET",
+    ),
+    "FASTDDS_BUILTIN_TRANSPORTS": (
+        _is_without_udp,
+        "a proxy carries UDP alone: unset it, or write UDPv4",
+    ),
+    "CYCLONEDDS_URI": (_always, _PROFILE),
+    "FASTDDS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
+    "FASTRTPS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
+}
+"""Variables that may keep participants from being heard, the surest cause first: for which values
+they do, and why and what to do."""
+
+OF_ROS2 = frozenset({*_KEEP_APART, "ROS_DOMAIN_ID", "ROS_STATIC_PEERS", "RMW_IMPLEMENTATION"})
+"""Variables that ROS 1 does not have."""
+
+
+def why_unheard(variables: Mapping[str, str]) -> str:
+    """Why no participant of a container may be heard, and what to do; empty if nothing says it."""
+    for name, (keeps_apart, text) in _KEEP_APART.items():
+        value = variables.get(name, "")
+        if value and keeps_apart(value):
+            return f"its variable {name}={brief(value, LONGEST_VALUE)}: {text}"
+    return ""
