@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from ipaddress import IPv4Network
 
 import pytest
 
@@ -26,6 +27,7 @@ from tests.unit.operator.docker.builders import (
 ON = {"rosproxy.enable": "true"}
 TWO = {**ON, "rosproxy.ros": "2"}
 DOMAIN = Key("", HERE, 0)
+STATIC_PEERS = "ROS_STATIC_PEERS"
 
 
 def labelled_container(
@@ -102,7 +104,7 @@ def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
 
 @pytest.mark.parametrize("name", sorted(OF_ROS2))
 def test_a_variable_of_ros_2_alone_says_it(name: str) -> None:
-    variables = {name: "7"}
+    variables = {name: "localhost"} if name == STATIC_PEERS else {name: "7"}
     assert keys(labelled_container(variables=variables))[0].is_ros2
     assert read(labelled_container(variables=variables))[1] == []
     assert keys(labelled_container(variables=variables, env=ROBOT)) == [KEY]
@@ -191,6 +193,23 @@ def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
     assert "is no DDS" in refusal(labelled_container(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
     text = refusal(labelled_container(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
     assert text.endswith("give an IPv4 address")
+
+
+APP = Network("n1", "app", subnets=(IPv4Network("172.30.0.0/16"),))
+
+
+@pytest.mark.parametrize("host", ["robot", "192.0.2.7", "Robot.local"])
+def test_a_static_peer_outside_is_told(host: str) -> None:
+    variables = {STATIC_PEERS: f"rosproxy;{host}"}
+    _, (text,) = read(labelled_container(TWO, variables), networks=(UPLINK, APP))
+    assert f"ROS_STATIC_PEERS names '{host.lower()}'" in text
+    assert text.endswith(f"unset the variable and add the label rosproxy.peers='{host.lower()}'")
+
+
+@pytest.mark.parametrize("peers", ["", "rosproxy", "172.30.0.9;127.0.0.1", "talker; localhost ;"])
+def test_a_static_peer_inside_is_not(peers: str) -> None:
+    talker = labelled_container(TWO, {STATIC_PEERS: peers})
+    assert read(talker, networks=(UPLINK, APP))[1] == []
 
 
 def test_on_an_internal_network_it_reaches_outside_through_the_proxy() -> None:

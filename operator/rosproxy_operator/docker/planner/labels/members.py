@@ -149,6 +149,9 @@ def _requests(
         requests.append(_ros2_request(container, observed, settings))
     granted = [bounds.narrowed(r, settings) for r in requests]
     warnings = [*ros_versions.warnings(container, served)]
+    for request in requests:
+        if request.key.is_ros2:
+            warnings += ros_versions.past_the_proxy(container, request.networks, observed)
     warnings += dict.fromkeys(text for _, texts in granted for text in texts)
     return [request for request, _ in granted], warnings
 

@@ -8,6 +8,7 @@ ROS_DOMAIN_ID for ROS 2. Where nothing says it, the container counts as one of R
 import re
 from collections.abc import Collection, Iterator
 
+from rosproxy.net.addresses import is_inside, is_loopback
 from rosproxy_operator.common.ros2 import (
     LAST_DOMAIN,
     MOST_PEERS,
@@ -17,6 +18,7 @@ from rosproxy_operator.common.ros2 import (
 )
 from rosproxy_operator.common.ros2_variables import OF_ROS2
 from rosproxy_operator.docker.planner.labels.readers import (
+    ALIAS,
     DOMAIN,
     MASTER_URI,
     PEERS,
@@ -29,7 +31,7 @@ from rosproxy_operator.docker.planner.labels.readers import (
     named,
     quoted,
 )
-from rosproxy_operator.docker.planner.model import Container
+from rosproxy_operator.docker.planner.model import Container, HostState
 
 _OF_ROS1 = (MASTER_URI, REDIRECT, SLAVE_CONTROL, UDP)
 _OF_ROS2 = (DOMAIN, PEERS)
@@ -95,6 +97,28 @@ def refuse_unserved(container: Container, host: str) -> None:
     if ":" in host:
         text = f"{host} can't be advertised for ROS 2, which is proxied by IPv4 alone"
         raise UnusableLabel(f"{text}: give an IPv4 address")
+
+
+def past_the_proxy(
+    container: Container, networks: Collection[str], observed: HostState
+) -> Iterator[str]:
+    """Warnings for hosts outside that a container's own ROS_STATIC_PEERS names.
+
+    ``networks`` are those of the container, by name. Its nodes announce themselves to such a host
+    with addresses that the host can't reach. A participant keeps the locators that it learns first
+    (Fast DDS: PDPListener.cpp), so the announcement by the proxy comes too late.
+    """
+    attachments = (a for c in observed.containers for a in c.attachments if a.network in networks)
+    inside = {ALIAS, "localhost", *(name for a in attachments for name in a.names)}
+    subnets = [s for n in observed.networks if n.name in networks for s in n.subnets]
+    named_hosts = container.variables.get("ROS_STATIC_PEERS", "").split(";")
+    for host in filter(None, (host.strip().lower() for host in named_hosts[:MOST_PEERS])):
+        if host not in inside and not is_loopback(host) and not is_inside(host, subnets):
+            yield (
+                f"its variable ROS_STATIC_PEERS names {quoted(host)}, which is not on its networks:"
+                " that host learns an address which it can't reach, and keeps that; unset the "
+                f"variable and add the label {PEERS}={quoted(host)}"
+            )
 
 
 def is_guessed(container: Container) -> bool:
