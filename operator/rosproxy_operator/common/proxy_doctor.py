@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, warning
+from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, Severity, warning
 from rosproxy.telemetry.text import brief
 
 MOST_FINDINGS = 500
@@ -31,6 +31,33 @@ def read_findings(proxy: str, output: bytes, cures: Mapping[str, str]) -> list[D
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         text = "its own doctor says nothing that can be read: its image may be of another release"
         return [warning("proxy", proxy, text)]
+
+
+def without_names_of_others(
+    findings_by_proxy: Sequence[Sequence[DoctorFinding]], names: Sequence[str]
+) -> list[DoctorFinding]:
+    """The findings of all proxies; a name that one proxy knows is unknown to none.
+
+    Each proxy has a graph of its own, and a topic of ROS 1 is in no domain of ROS 2.
+    """
+    known = {name for findings in findings_by_proxy for name in _known(findings, names)}
+    return [
+        finding
+        for findings in findings_by_proxy
+        for finding in findings
+        if finding.check != UNKNOWN_NAME or not known & _words(finding)
+    ]
+
+
+def _known(findings: Sequence[DoctorFinding], names: Sequence[str]) -> set[str]:
+    """The names that a proxy says something about."""
+    told = {word for f in findings if f.check != UNKNOWN_NAME for word in _words(f)}
+    return told & {*names}
+
+
+def _words(finding: DoctorFinding) -> set[str]:
+    """The words of a finding's subject, such as ``proxy a: /topic from /talker to /listener``."""
+    return {*finding.subject.split()}
 
 
 def _finding(proxy: str, row: Mapping[str, Any], cures: Mapping[str, str]) -> DoctorFinding:

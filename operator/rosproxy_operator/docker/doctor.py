@@ -9,9 +9,10 @@ import asyncio
 from collections.abc import Iterator, Sequence
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
+from rosproxy.doctor.rules.participant import OTHER_DOMAIN, OWN_MACHINE
 from rosproxy.telemetry.text import plural
 from rosproxy_operator.common.proxy_client import Json
-from rosproxy_operator.common.proxy_doctor import command, read_findings
+from rosproxy_operator.common.proxy_doctor import command, read_findings, without_names_of_others
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker.engine_client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
@@ -50,7 +51,23 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
 
     running = [proxy["name"] for proxy in status["proxies"] if proxy["state"] == "running"]
     findings_by_proxy = await asyncio.gather(*map(ask, running))
-    return [*host_findings(status), *(f for findings in findings_by_proxy for f in findings)]
+    served = served_participants(status)
+    return [
+        *host_findings(status),
+        *(f for f in without_names_of_others(findings_by_proxy, names) if not _is_about(f, served)),
+    ]
+
+
+def served_participants(status: Json) -> frozenset[str]:
+    """The GUID prefixes of participants in containers, which have a proxy on this host."""
+    participants = (p for c in status["containers"] for p in c["participants"])
+    return frozenset(p["guid_prefix"] for p in participants)
+
+
+def _is_about(finding: DoctorFinding, served: frozenset[str]) -> bool:
+    """Whether a proxy says that it does not hear a participant that another proxy serves."""
+    is_of_another = finding.check in (OTHER_DOMAIN, OWN_MACHINE)
+    return is_of_another and finding.subject.rpartition(" ")[2] in served
 
 
 def host_findings(status: Json) -> Iterator[DoctorFinding]:

@@ -15,7 +15,11 @@ from kubernetes.stream import stream
 from websocket import WebSocketException
 
 from rosproxy.admin.doctor_finding import DoctorFinding, warning
-from rosproxy_operator.common.proxy_doctor import command, read_findings
+from rosproxy_operator.common.proxy_doctor import (
+    command,
+    read_findings,
+    without_names_of_others,
+)
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
@@ -54,7 +58,7 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     pods = [pod for pod in own_pods if pod["status"].get("phase") == "Running"]
     with ThreadPoolExecutor(AT_ONCE) as threads:
         answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], pods)
-        return [*findings, *(finding for answer in answers for finding in answer)]
+        return [*findings, *without_names_of_others([*answers], names)]
 
 
 def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:

@@ -20,6 +20,10 @@ class Severity(IntEnum):
     ERROR = 3
 
 
+UNKNOWN_NAME = "unknown name"
+"""The check that finds no node, topic or service of a name that was asked for."""
+
+
 class DoctorFinding(msgspec.Struct, frozen=True):
     """One result: of which ``check``, about which ``subject``, what, and what mends it."""
 

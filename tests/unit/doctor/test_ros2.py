@@ -149,7 +149,7 @@ def test_who_serves_a_service() -> None:
 
 
 def test_a_name_that_nobody_has() -> None:
-    assert diagnose_domain(BOTH, "/chater")["name", "/chater"][0] is Severity.ERROR
+    assert diagnose_domain(BOTH, "/chater")["unknown name", "/chater"][0] is Severity.ERROR
 
 
 def test_who_is_on_a_network_inside_and_not_heard() -> None:

@@ -1,15 +1,26 @@
 """What a proxy's own doctor has printed, read by the operator's."""
 
 import json
+from typing import cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, ok
+from rosproxy.admin.doctor_finding import (
+    UNKNOWN_NAME,
+    DoctorFinding,
+    Severity,
+    error,
+    note,
+    ok,
+    warning,
+)
 from rosproxy.doctor.presentation import as_json
-from rosproxy_operator.common.proxy_doctor import read_findings
+from rosproxy_operator.common.proxy_doctor import read_findings, without_names_of_others
+from rosproxy_operator.docker import doctor as docker_doctor
 from rosproxy_operator.docker.doctor import CURES, host_findings
+from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 
 
@@ -111,3 +122,49 @@ def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:
     assert "there is no RosProxy" in cluster_findings([])[0].text
     assert "selects no pod" in cluster_findings([rosproxy(nodes=0)])[0].text
     assert "does the operator run?" in cluster_findings([rosproxy(observedGeneration=1)])[0].fix
+
+
+def test_a_name_that_one_proxy_knows_is_unknown_to_none() -> None:
+    unknown = error(UNKNOWN_NAME, "proxy b: /scan", "no participant has it")
+    connected = ok("pair", "proxy a: /scan from /lidar to /nav", "connected")
+    other = warning("node", "proxy b: /scanner", "is slow")
+    found = without_names_of_others([[connected], [unknown, other]], ["/scan"])
+    assert found == [connected, other]
+    lonely = note("topic", "proxy a: /scan", "nobody subscribes to it")
+    assert unknown not in without_names_of_others([[unknown], [lonely]], ["/scan"])
+
+
+def test_a_name_that_no_proxy_knows_is_told_by_each() -> None:
+    unknown = [error(UNKNOWN_NAME, f"proxy {name}: /scan", "no one has it") for name in "ab"]
+    about_another = ok("pair", "proxy a: /map from /slam to /nav", "connected")
+    found = without_names_of_others([[unknown[0], about_another], [unknown[1]]], ["/scan", "/map"])
+    assert found == [unknown[0], about_another, unknown[1]]
+
+
+def test_a_participant_of_another_domains_proxy_is_not_missed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two proxies on one network, each for a domain, hear the participants of both."""
+    ours = warning("domain", "01.0f.aa", "it is in domain 5; this proxy serves 0")
+    lost = warning("domain", "01.0f.bb", "it is in domain 9; this proxy serves 0")
+    said = json.dumps(as_json([ours, lost])).encode()
+    container = {"name": "talker", "proxy": "p5", "participants": [{"guid_prefix": "01.0f.aa"}]}
+    status = {
+        "problems": [],
+        "proxies": [{"name": "p0", "state": "running"}],
+        "containers": [container],
+        "actions": [],
+    }
+
+    class Host:
+        async def now(self) -> object:
+            return status
+
+    class Engine:
+        def run(self, *_: str) -> bytes:
+            return said
+
+    monkeypatch.setattr(docker_doctor, "DockerClient", Engine)
+    subjects = [finding.subject for finding in docker_doctor.examine(cast(HostStatus, Host()), [])]
+    assert "proxy p0: 01.0f.bb" in subjects
+    assert "proxy p0: 01.0f.aa" not in subjects

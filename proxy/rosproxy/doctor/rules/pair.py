@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from difflib import get_close_matches
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok
+from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
@@ -42,7 +42,7 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     hint = f"; there is {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
     fix = "compare with rosnode list and rostopic list; check namespaces and remappings"
-    return error(PAIR, name, text, fix)
+    return error(UNKNOWN_NAME, name, text, fix)
 
 
 def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:

@@ -6,7 +6,7 @@ is on the networks inside but not heard by the proxy, and which topics and servi
 
 from collections.abc import Iterator
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
 from rosproxy.net.addresses import parse_host_port
@@ -18,6 +18,10 @@ RECENT = 120.0
 SETTLED = 10.0
 """Seconds after its start in which the proxy may still ask those that it has heard for their ports
 (`rosproxy.ros2.discovery.domain`), and does not tell of them yet."""
+OTHER_DOMAIN = "domain"
+"""The check for a participant on a network inside that is in another domain."""
+OWN_MACHINE = "range"
+"""The check for a participant on a network inside that announces itself on its own machine."""
 _REFUSED = {
     "refused: no locator": (
         "tcp: unset FASTDDS_BUILTIN_TRANSPORTS there; loopback: ROS_AUTOMATIC_DISCOVERY_RANGE="
@@ -113,7 +117,7 @@ def _heard(
             f"ROS_DOMAIN_ID={served[0]} for it, or --ros2-domain {participant.domain} for the "
             "proxy as well"
         )
-        yield warning("domain", participant.guid_prefix, text + listed(map(str, served)), fix)
+        yield warning(OTHER_DOMAIN, participant.guid_prefix, text + listed(map(str, served)), fix)
     elif participant.guid_prefix not in prefixes:
         text = f"{label}: it answers, but does not announce itself to the network, so that the "
         text += "proxy does not hear it: its discovery range is its own machine"
@@ -121,7 +125,7 @@ def _heard(
             "where it runs: ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, and unset ROS_LOCALHOST_ONLY; or "
         )
         fix += "ROS_STATIC_PEERS with the proxy's address"
-        yield warning("range", participant.guid_prefix, text, fix)
+        yield warning(OWN_MACHINE, participant.guid_prefix, text, fix)
 
 
 def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
@@ -129,7 +133,7 @@ def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[D
     participants = [p for domain in domains for side in _sides(domain) for p in side]
     if not any(name in (*p.publishes, *p.subscribes, *p.services) for p in participants):
         text = "no participant has a topic or service of this name"
-        yield error("name", name, text, "compare with those that rosproxy status lists")
+        yield error(UNKNOWN_NAME, name, text, "compare with those that rosproxy status lists")
     for domain in domains:
         yield from _name_in_domain(domain, name)
 
