@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from rosproxy.leases.ports import PortRange
 
+LAST_PORT = 65535
 RETRY_FOR = 20.0
 """Seconds for which a proxy that has served is tried again on its ports before it leaves them."""
 TAKEN_FOR = 300.0
@@ -63,6 +64,27 @@ def negotiate(
         if len(gap) >= count:
             return PortRange(gap.first, gap.first + count - 1)
     raise PortsExhausted(count, window, [len(gap) for gap in gaps])
+
+
+def negotiate_with_room(
+    count: int,
+    window: PortRange,
+    blocked: Collection[int],
+    growing: Iterable[PortRange],
+    fixed: Iterable[PortRange] = (),
+) -> PortRange:
+    """Ports as `negotiate`, where possible with room for the range and its neighbours to double.
+
+    ``growing`` are the ranges of other proxies, which may get longer, ``fixed`` other ranges.
+    """
+    growing = [*growing]
+    fixed = [*fixed]
+    doubled = [PortRange(ports.first, min(ports.last + len(ports), LAST_PORT)) for ports in growing]
+    try:
+        roomy = negotiate(2 * count, window, blocked, [*doubled, *fixed])
+    except PortsExhausted:
+        return negotiate(count, window, blocked, [*growing, *fixed])
+    return PortRange(roomy.first, roomy.first + count - 1)
 
 
 def extended(

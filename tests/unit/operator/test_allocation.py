@@ -11,6 +11,7 @@ from rosproxy_operator.common.port_negotiation import (
     extended,
     is_free,
     negotiate,
+    negotiate_with_room,
     overlap,
     within,
 )
@@ -80,6 +81,22 @@ def test_free_means_that_no_port_is_held(
 def test_overlap(first: PortRange, second: PortRange) -> None:
     assert overlap(first, second) == bool(set(first.ports()) & set(second.ports()))
     assert within(first, second) == (set(first.ports()) <= set(second.ports()))
+
+
+@given(COUNTS, BLOCKED, RANGES)
+def test_room_is_left_where_there_is_some(
+    count: int, blocked: frozenset[int], ranges: list[PortRange]
+) -> None:
+    try:
+        given = negotiate_with_room(count, WINDOW, blocked, ranges)
+    except PortsExhausted:
+        assert not any(free(ports, blocked, ranges) for ports in every(count))
+        return
+    assert free(given, blocked, ranges)
+    assert len(given) == count
+    doubled = [PortRange(r.first, r.last + len(r)) for r in ranges]
+    roomy = [ports for ports in every(2 * count) if free(ports, blocked, doubled)]
+    assert not roomy or given.first == roomy[0].first
 
 
 def test_the_error_says_how_many_there_are() -> None:

@@ -11,7 +11,8 @@ from rosproxy_operator.common.port_negotiation import (
     after_move,
     extended,
     is_free,
-    negotiate,
+    negotiate_with_room,
+    overlap,
     within,
 )
 from rosproxy_operator.common.problem import Problem
@@ -101,8 +102,12 @@ class _Allocation:
 
     def blocked_ranges(self, key: Key) -> list[PortRange]:
         """The ranges that a key can't have: other proxies', and the kernel's."""
+        return [self.observed.ephemeral, *self.ranges_of_proxies(key)]
+
+    def ranges_of_proxies(self, key: Key) -> list[PortRange]:
+        """The ranges that other proxies have, and those that other keys have been given."""
         occupied = [sandbox.range for sandbox in self.observed.sandboxes if sandbox.key != key]
-        return [self.observed.ephemeral, *occupied, *self.ranges_of_others(key)]
+        return [*occupied, *self.ranges_of_others(key)]
 
     def ranges_of_others(self, key: Key) -> list[PortRange]:
         """The ranges that other keys have been given."""
@@ -149,11 +154,14 @@ class _Allocation:
     def fill(self, desired: Desired, frozen: bool) -> None:
         """Give a key more ports if it has too few, or a range if it has none."""
         key, count, window = desired.key, desired.ports, self.settings.port_window
-        blocked, ranges = self.blocked(key) | reserved_ports(key), self.blocked_ranges(key)
+        blocked = self.blocked(key) | reserved_ports(key)
         kept = self.allocated.get(key)
         if kept is None:
+            others = self.ranges_of_proxies(key)
             try:
-                self.allocated[key] = negotiate(count, window, blocked, ranges)
+                self.allocated[key] = negotiate_with_room(
+                    count, window, blocked, others, [self.observed.ephemeral]
+                )
             except PortsExhausted as error:
                 text = (
                     f"{error}: lower --ports or the label rosproxy.ports ({count}), widen "
@@ -161,15 +169,28 @@ class _Allocation:
                 )
                 self.problems.append(_problem(key, text, fatal=True))
         elif not frozen:
+            ranges = self.blocked_ranges(key)
             self.allocated[key] = extended(kept, count, window, blocked, ranges) or kept
             if len(self.allocated[key]) < count:
                 missing = PortRange(kept.last + 1, kept.first + count - 1)
                 text = (
                     f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps "
-                    f"its {len(kept)} at {kept}, since {missing} are not free or beyond "
-                    "--port-window: stop what holds them"
+                    f"its {len(kept)} at {kept}: {self._why_not_longer(key, missing)}"
                 )
                 self.problems.append(_problem(key, text))
+
+    def _why_not_longer(self, key: Key, missing: PortRange) -> str:
+        """What keeps a key's range from getting these ports, and what to do."""
+        window = self.settings.port_window
+        if missing.last > window.last:
+            return f"{missing} is beyond --port-window ({window}): widen that"
+        for neighbour, ports in sorted(self.allocated.items()):
+            if neighbour != key and overlap(ports, missing):
+                return (
+                    f"proxy {proxy_name(neighbour)} has {ports}. To have it move, stop its "
+                    "containers until the operator has removed it (--grace), then start them"
+                )
+        return f"{missing} are not all free: stop what holds them (ss -ltnup)"
 
 
 def allocate(

@@ -199,7 +199,7 @@ def test_both_versions_have_ports_of_their_own() -> None:
     boxes = [action for action in actions(observed(container(labels=labels)))
              if isinstance(action, CreateSandbox)]  # fmt: skip
     assert {(box.key.domain, str(box.range)) for box in boxes} == {
-        (0, "11400-11431"), (None, "11432-11463"),
+        (0, "11400-11431"), (None, "11464-11495"),
     }  # fmt: skip
 
 

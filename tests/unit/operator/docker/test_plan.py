@@ -56,6 +56,8 @@ ARM = Key("http://arm:11311", HERE)
 ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master_uri}
 LAB = Network("n2", "lab")
 NEXT = PortRange(11432, 11463)
+WITH_ROOM = PortRange(11464, 11495)
+"""The next range that leaves both proxies room to have twice as many ports."""
 ELSEWHERE = PortRange(11500, 11531)
 LONGER = PortRange(11400, 11439)
 ASKS_FOR_40 = {**ENABLED, "rosproxy.ports": "40"}
@@ -453,8 +455,8 @@ def ranges(plan: DockerPlan) -> dict[Key, PortRange]:
         (observed(container(), container("web", {}, state="exited", ports=[11431])), 11432),
         (observed(container(), listening=[11400, 11410]), 11411),
         (observed(container(), ephemeral=PortRange(10000, 20000)), 20001),
-        (observed(container(), **both(key=ARM)), 11432),
-        (observed(container(), sandboxes=[sandbox(ARM, state="created")]), 11432),
+        (observed(container(), **both(key=ARM)), WITH_ROOM.first),
+        (observed(container(), sandboxes=[sandbox(ARM, state="created")]), WITH_ROOM.first),
     ],
 )
 def test_new_ports_are_nobodys(seen: HostState, first: int) -> None:
@@ -469,10 +471,10 @@ def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
 def test_two_new_proxies_do_not_get_the_same() -> None:
     """Who has been promised some keeps them: its container is being created."""
     plan = look(observed(container(), container("b", ON_ARM)))
-    assert ranges(plan) == {ARM: RANGE, KEY: NEXT}
+    assert ranges(plan) == {ARM: RANGE, KEY: WITH_ROOM}
     memory = look(observed(container())).memory
     plan = look(observed(container(), container("a", ON_ARM)), memory=memory)
-    assert ranges(plan) == {ARM: NEXT, KEY: RANGE}
+    assert ranges(plan) == {ARM: WITH_ROOM, KEY: RANGE}
 
 
 def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
@@ -518,7 +520,37 @@ def test_more_ports_that_can_not_be_had() -> None:
     plan = look(observed(container(labels=ASKS_FOR_40), listening=[11435], **both()))
     assert plan.actions == ()
     assert "40 ports are wanted" in port_problem(plan)
-    assert "it keeps its 32 at 11400-11431, since 11432-11439 are not free" in port_problem(plan)
+    text = "it keeps its 32 at 11400-11431: 11432-11439 are not all free: stop what holds them"
+    assert text in port_problem(plan)
+
+
+def test_more_ports_where_the_next_proxy_begins() -> None:
+    neighbour: Any = both(key=ARM, ports=NEXT)
+    own: Any = both()
+    seen = observed(
+        container(labels=ASKS_FOR_40),
+        container("b", ON_ARM),
+        sandboxes=[*own["sandboxes"], *neighbour["sandboxes"]],
+        proxies=[*own["proxies"], *neighbour["proxies"]],
+    )
+    plan = look(seen)
+    text = f"at 11400-11431: proxy {proxy_name(ARM)} has 11432-11463. To have it move, stop its"
+    assert text in port_problem(plan)
+
+
+def test_more_ports_beyond_the_window() -> None:
+    settings = replace(SETTINGS, port_window=PortRange(11400, 11435))
+    plan = look(observed(container(labels=ASKS_FOR_40), **both()), settings=settings)
+    text = "11432-11439 is beyond --port-window (11400-11435): widen that"
+    assert text in port_problem(plan)
+
+
+def test_two_proxies_may_both_have_twice_as_many_ports() -> None:
+    plan = look(observed(container(), container("b", ON_ARM)))
+    assert {*ranges(plan).values()} == {RANGE, WITH_ROOM}
+    settings = replace(SETTINGS, port_window=PortRange(11400, 11463))
+    plan = look(observed(container(), container("b", ON_ARM)), settings=settings)
+    assert {*ranges(plan).values()} == {RANGE, NEXT}, "a narrow window has no room to leave"
 
 
 def test_exhausted() -> None:
