@@ -200,7 +200,7 @@ def read_peer(text: str) -> HostPort:
     try:
         return HostPort(read_host(text), 0)
     except ValueError:
-        return read_host_port(text)
+        return read_host_port(text, "HOST or HOST:PORT, such as robot or 192.0.2.7:11400")
 
 
 def read_network(text: str) -> Network:

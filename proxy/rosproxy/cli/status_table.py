@@ -59,8 +59,9 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
     if not settings.for_ros1:
         inside = f"ROS 2, domain {listed(str(domain.domain) for domain in status.domains)}"
-    selected = f", {settings.selected} addresses selected" if settings.selected is not None else ""
-    yield f"inside   {inside}, networks {networks}{selected}"
+    selected = settings.selected
+    chosen = "" if selected is None else f", {plural(selected, 'address')} selected"
+    yield f"inside   {inside}, networks {networks}{chosen}"
     if stand_ins := status.stand_ins:
         yield f"outside  {_stand_ins(stand_ins)}"
     if settings.publish_master:

@@ -106,8 +106,10 @@ def size(count: float) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """``1 port``, ``2 ports``."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+    """``1 port``, ``2 ports``, ``2 addresses``."""
+    if count == 1:
+        return f"{count} {noun}"
+    return f"{count} {noun}es" if noun.endswith("s") else f"{count} {noun}s"
 
 
 def listed(items: Iterable[str], most: int = 5) -> str:

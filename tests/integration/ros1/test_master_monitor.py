@@ -84,3 +84,13 @@ async def test_what_the_master_loses_later_is_registered_again(master, make_prox
     for _ in range(2):
         await rpc(master.uri, "unregisterPublisher", node.name, "/chatter", uri)
         await until(lambda: master.holds("publishers", "/chatter") == [uri], "it is there again")
+
+
+async def test_a_master_port_where_no_program_listens_is_told_in_plain_words(make_proxy):
+    port = free_ports(1)
+    proxy = await make_proxy(master_uri=f"http://{OUTSIDE}:{port}")
+    await until(lambda: proxy.app.status()["master"]["error"], "the master is away")
+    assert proxy.app.status()["master"]["error"] == (
+        f"master http://{OUTSIDE}:{port}: connection refused: no roscore runs there; by default "
+        "it listens on port 11311"
+    )

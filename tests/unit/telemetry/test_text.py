@@ -151,3 +151,4 @@ def test_lists_and_plurals() -> None:
     assert listed("abcdef", 2) == "a, b and 4 more"
     assert plural(1, "port") == "1 port"
     assert plural(0, "port") == "0 ports"
+    assert plural(2, "address") == "2 addresses"

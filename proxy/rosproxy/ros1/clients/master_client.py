@@ -8,6 +8,7 @@ the ROS triple ``[1, message, value]`` in the reply; ``multicall`` makes many to
 """
 
 import asyncio
+import os
 import socket
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -271,6 +272,9 @@ def _unreachable(peer: str, error: BaseException) -> Unreachable:
         probe = ProbeResult.ANSWERED
     if isinstance(error, TimeoutError):
         reason = "no answer in time"
+    elif isinstance(error, OSError) and (error.errno or 0) > 0:
+        # The text of asyncio is "Connect call failed ('192.0.2.7', 11311)".
+        reason = os.strerror(error.errno or 0).lower()
     elif isinstance(error, OSError) and error.strerror:
         reason = error.strerror.lower()
     else:

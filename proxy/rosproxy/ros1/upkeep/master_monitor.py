@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -65,7 +66,7 @@ class MasterMonitor:
                 await self._registrar.register_lost()
             self._mark(True)
         except (Unreachable, MasterError) as error:
-            self._mark(False, str(error) + self._path_hint(error))
+            self._mark(False, f"{error}{self._path_hint(error)}{_port_hint(error)}")
         except TimeoutError:
             uri = self._context.settings.master_uri
             self._mark(False, f"master {uri}: no answer in {LOOK_TIMEOUT:g} s")
@@ -93,3 +94,10 @@ class MasterMonitor:
                 log.warning("%s; waiting for it", error)
                 self._context.problems.add("master", error)
         self.up, self.error = up, error
+
+
+def _port_hint(error: Exception) -> str:
+    """What to do where no program listens."""
+    if isinstance(error, Unreachable) and error.probe is ProbeResult.REFUSED:
+        return ": no roscore runs there; by default it listens on port 11311"
+    return ""

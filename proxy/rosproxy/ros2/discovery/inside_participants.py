@@ -257,7 +257,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)
         if port is None:
-            text = f"no port of {ports} is free for {locator}: give a longer --port-range"
+            text = f"no port of {ports} is free for {locator}"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         lease = participant.leases[locator] = Lease(port, locator, kind)

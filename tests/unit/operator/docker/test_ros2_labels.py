@@ -144,7 +144,11 @@ def test_peers() -> None:
     (member,), told = read(labelled_container({**TWO, "rosproxy.peers": "Robot, 192.0.2.7:11400"}))
     assert sorted(member.peers) == ["192.0.2.7:11400", "robot"]
     assert not told
-    assert "rosproxy.peers" in refusal(labelled_container({**TWO, "rosproxy.peers": "no/host"}))
+    text = refusal(labelled_container({**TWO, "rosproxy.peers": "no/host"}))
+    assert text == (
+        "label rosproxy.peers: 'no/host' is not of the form HOST or HOST:PORT, such as robot or "
+        "192.0.2.7:11400"
+    )
     many = " ".join(f"robot{number}" for number in range(33))
     assert "names more than 32 hosts" in refusal(
         labelled_container({**TWO, "rosproxy.peers": many})

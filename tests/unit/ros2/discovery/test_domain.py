@@ -261,7 +261,7 @@ def test_a_range_that_is_too_short_is_told() -> None:
         )
     assert len(domain.inside.leases) == 15  # of sixteen, one is for discovery
     shortages = domain.inside.port_shortages.values()
-    assert all("--port-range" in shortage.text for shortage in shortages)
+    assert all("is free for" in shortage.text for shortage in shortages)
     assert {shortage.kind for shortage in shortages} == {ShortageKind.RANGE}
     assert domain.inside.port_shortages
 
