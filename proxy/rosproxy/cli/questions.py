@@ -96,7 +96,12 @@ def _open_page(admin: Any) -> None:
 
     url = admin.page()
     click.echo(url)
-    webbrowser.open(url)
+    if not webbrowser.open(url):
+        text = (
+            "No browser here. In a container this address is the container's own. The operator's "
+        )
+        text += "page shows all proxies: rosproxy-operator docker status. By hand: "
+        click.echo(f"{text}docs/guide/live-page.md.", err=True)
 
 
 def _why_not_ready(admin: Any) -> str:

@@ -373,6 +373,12 @@ async def test_status_has_a_browser_show_it(proxy: Proxy, tmp_path: Any) -> None
     assert shown.read_text() == result.out.strip() == f"{admin_url(proxy)}/"
 
 
+async def test_status_without_a_browser_tells_of_the_operators_page(proxy: Proxy) -> None:
+    result = await run("status", "--open", "--admin", admin_url(proxy), BROWSER="false")
+    assert (result.code, result.out) == (0, f"{admin_url(proxy)}/\n")
+    assert "rosproxy-operator docker status" in result.err
+
+
 async def test_a_proxy_whose_master_is_away_is_shown(
     make_proxy: MakeProxy, master: FakeMaster
 ) -> None:

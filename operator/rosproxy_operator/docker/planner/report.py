@@ -34,6 +34,8 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     if status["operator"] is None:
         text = "No operator was asked: this is as one with these options would see it."
         head += wrap(text, columns, "")
+    else:
+        head += wrap(f"Live page of all proxies: {clean(status['operator'])}/", columns, "")
     subjects = {f"container {container['name']}" for container in status["containers"]}
     problems = [
         f"{clean(problem['subject'])}: {clean(problem['text'])}"

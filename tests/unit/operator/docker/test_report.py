@@ -201,6 +201,7 @@ def test_the_status_is_good_if_every_proxy_can_do_its_work(
 def test_the_whole_status() -> None:
     assert render(STATUS, 100).splitlines() == [
         "rosproxy-operator 1.0: 2 containers, 1 proxy, uplink network 0-rosproxy",
+        "Live page of all proxies: http://127.0.0.1:11313/",
         "",
         "PROXY                  STATE    MASTER OR DOMAIN    OUTSIDE     PORTS",
         "rosproxy-robot-eefee4  running  http://robot:11311  192.0.2.10  11400-11431 2 used",
