@@ -42,7 +42,7 @@ def report_taken_ports(
     if not taken:
         return
     port_kind = "ports" if ros == "1" else "UDP ports"
-    proxies = proxy_signs.overlapping_proxies(ros, ports.first, ports.last, settings.admin)
+    proxies = proxy_signs.overlapping_proxies(ros, ports.first, ports.last)
     holders = "; ".join(map(str, proxies))
     cure = "give one of the two another range (ROSPROXY_PORT_RANGE), or end one"
     if len(taken) == len(ports):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from rosproxy.net import signs
-from rosproxy.net.addresses import is_address, parse_host_port
+from rosproxy.net.addresses import HostPort, is_address, parse_host_port
 
 MOST = 8
 """Proxies that are told of."""
@@ -44,11 +44,14 @@ def publish_sign(
     return signs.put_up(f"rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}")
 
 
-def overlapping_proxies(ros: str, first: int, last: int, admin: object) -> list[Sign]:
+def overlapping_proxies(
+    ros: str, first: int, last: int, admin: HostPort | None = None
+) -> list[Sign]:
     """The other proxies on this machine, for a version of ROS, that have some of these ports.
 
-    ``admin`` is the own admin endpoint, which no other can have. MOST at most, and none whose admin
-    endpoint is not at an address: people are told to ask there.
+    ``admin`` is the own admin endpoint, which no other can have; None before the own sign is up. A
+    proxy that was started twice has the same one. MOST at most, and none whose admin endpoint is
+    not at an address: people are told to ask there.
     """
     proxies = (Sign(m[1], int(m[2]), int(m[3]), m[4]) for m in signs.read_all(_SIGN))
     overlapping = (

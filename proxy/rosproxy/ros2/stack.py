@@ -132,7 +132,7 @@ class Ros2:
             self.servers.append(server)
             self._leases.domains.append(server.domain.inside)
             # Any proxy for ROS 2: these ports follow from the domain, not from the range.
-            other_proxies = proxy_signs.overlapping_proxies("2", 1, 65535, settings.admin)
+            other_proxies = proxy_signs.overlapping_proxies("2", 1, 65535)
             with setting_error_if_taken(
                 "--ros2-domain", f"a port of domain {number}", other_proxies
             ):

@@ -66,6 +66,16 @@ async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_
     assert (await status(first))["ports"]["blocked"] == 0
 
 
+@pytest.mark.parametrize("ros", [{}, {"ros": "2", "ros2_domain": 203, "ros2_peer": "127.0.0.1"}])
+async def test_a_proxy_that_is_started_twice_names_itself(start_process, ros):
+    """With the same admin endpoint it took the other's sign for its own."""
+    first: Process = start_process(**ros)
+    ended = await asyncio.to_thread(started, first.options)
+    assert ended.returncode == 2
+    assert f"another rosproxy, with --port-range {first.options['port_range']}" in ended.stderr
+    assert f"rosproxy status --admin {admin_of(first)}" in ended.stderr
+
+
 async def test_a_second_proxy_on_a_part_of_the_range_names_the_first(start_process):
     low = free_ports(7)
     port = low + 3
