@@ -1,5 +1,6 @@
 """Who may change something at the admin endpoint, what is refused, and what a controller tells."""
 
+import asyncio
 import json
 
 import pytest
@@ -7,6 +8,8 @@ import pytest
 from examples.demo.fake_http import End, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.clients.node_client import ProbeAnswer
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.setting_kinds import hash_token
 from tests.integration.admin_calls import news, post, tell
@@ -227,6 +230,39 @@ async def test_its_open_connections_end(make_proxy: MakeProxy, node: FakeNode) -
         await node.slave.stop()
         assert await news(proxy, gone=[NODE]) == (1, 0, 0)
         assert await wire.end() == "closed"
+
+
+async def test_a_port_that_a_living_node_got_meanwhile_keeps_its_connections(
+    make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the dead node was asked, its port went to another: the last one of the range."""
+    port = free_ports(1)
+    proxy = await make_proxy(port_range=f"{port}-{port}", probe_interval=0.05, linger=60.0)
+    dead, alive = await make_node(), await make_node("/alive", OTHER_NODE)
+    await dead.publish(proxy.master)
+    await dead.stop()
+    await until(lambda: proxy.endpoint(dead).health.down, "the proxy knows that it is dead")
+    asked, answered = asyncio.Event(), asyncio.Event()
+    probe = proxy.ros1.context.nodes.probe
+
+    async def slow_probe(slave: HostPort, *timeout: float) -> ProbeAnswer:
+        if timeout:  # on the word of the operator
+            asked.set()
+            await answered.wait()
+        return await probe(slave, *timeout)
+
+    monkeypatch.setattr(proxy.ros1.context.nodes, "probe", slow_probe)
+    told = asyncio.create_task(news(proxy, gone=[NODE]))
+    await asked.wait()
+    await alive.publish(proxy.master, "/news")
+    assert proxy.lease(alive)[1] == port
+    async with connect(proxy.lease(alive)) as wire:
+        await wire.send(topic_header("/news"))
+        await read_header(wire)
+        answered.set()
+        await told
+        assert await greet(proxy.lease(alive), topic_header("/news"))
+        assert not wire.reader.at_eof()
 
 
 async def test_another_process_at_an_address_that_is_gone(

@@ -184,6 +184,8 @@ class ContainerEvents:
     def _close(self, endpoint: Endpoint) -> None:
         """Let a port refuse whose node has ended, and end what is still connected to it."""
         endpoint.health.end(self.context.now())
+        if self.context.registry.by_port.get(endpoint.port) is not endpoint:
+            return  # while the node was asked, a living one got the port of this dead one
         self.leases.close(endpoint)
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
