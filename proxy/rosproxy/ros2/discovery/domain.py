@@ -5,7 +5,8 @@ Participants inside announce themselves to a multicast group, or to the well-kno
 these. The announcement that outside answers to a port for metatraffic goes on to the participant
 inside, with a port of the proxy's (a *stand-in*) in place of outside's metatraffic: so all of
 discovery passes the proxy, both ways, and can be rewritten. What users send passes unread: to
-inside through the range, to outside without the proxy.
+inside through the range, to outside without the proxy. Discovery that a sender puts among it is
+read like any other where the receiver would read it (`Participant.reads_discovery_at`).
 
 Nothing here does I/O: each method takes a datagram, where it came from and the time, and gives the
 datagrams to send. After each, `leases` and `stand_ins` tell which ports have to be open.
@@ -170,16 +171,17 @@ class Domain(DomainParticipants):
     def is_read_at(self, port: int, datagram: bytes, source: str) -> bool:
         """Whether `at_lease` reads a datagram, which takes long, and does not just pass it on."""
         leased = self.inside.leases.get(port)
-        if leased is not None:
-            is_metatraffic = leased[1].kind is LeaseKind.METATRAFFIC
-            return is_metatraffic and self.outside.is_met(source) and may_be_discovery(datagram)
-        return False
+        if leased is None:
+            return False
+        _, lease = leased
+        may_be_read = lease.is_read and self.outside.is_met(source)
+        return may_be_read and may_be_discovery(datagram)
 
     def is_read_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
         """Whether `at_stand_in` reads a datagram, which takes long, and does not just pass it."""
         users = self.outside.stand_ins.get(port, ())
-        is_metatraffic = any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users)
-        return is_metatraffic and may_be_discovery(datagram)
+        may_be_read = any(outsider.reads_discovery_at(lease) for outsider, lease in users)
+        return may_be_read and may_be_discovery(datagram)
 
     def at_lease(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What outside sends to a port of the range."""
@@ -189,12 +191,13 @@ class Domain(DomainParticipants):
                 self._note_former_use(port, datagram, source, now)
                 return []
             insider, lease = leased
-            if lease.kind is LeaseKind.DATA:
+            is_for_data = lease.kind is LeaseKind.DATA
+            if is_for_data and not (lease.is_read and may_be_discovery(datagram)):
                 return [self._passed(lease, datagram, True)]
             if self.outside.is_strange(source):
                 return []
             passed, back = [datagram], list[Outgoing]()
-            if may_be_discovery(datagram):  # Cyclone DDS has one locator for both
+            if is_for_data or may_be_discovery(datagram):  # Cyclone DDS has one locator for both
                 if self._is_too_much(datagram, source, now):
                     return []
                 imported = partial(self._imported, port, source, insider, now)

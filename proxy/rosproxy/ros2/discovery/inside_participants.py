@@ -80,6 +80,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
             participant.proxy_address = self.settings.proxy_address_for(source)
             self.add(participant)
+        if participant.note_vendor(source_vendor(datagram)):
+            self._mark_read(source)
         participant.until = now + lease_duration(spdp, datagram)
         participant.metatraffic = first_metatraffic(spdp, datagram, source)
         participant.traits = traits(spdp, datagram, source)
@@ -183,12 +185,23 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
 
     def forget(self, participant: InsideParticipant) -> None:
         """Forget a participant that has gone, and take its ports back."""
-        self.changes += 1
         for lease in participant.leases.values():
             del self.leases[lease.port]
             self.ports.give_back(lease.port)
         self.remove(participant)
+        self._mark_read(participant.address)
         self.port_shortages.pop(participant.prefix, None)
+
+    def _mark_read(self, address: str) -> None:
+        """Mark the leases to locators at which a participant at an address reads discovery.
+
+        A participant may name the locator of another participant at the same address.
+        """
+        leases = [(p, lease) for p in self.at(address) for lease in p.leases.values()]
+        read = {lease.target for p, lease in leases if p.reads_discovery_at(lease)}
+        for _, lease in leases:
+            lease.is_read = lease.target in read
+        self.changes += 1
 
     def _lead_out(
         self,
@@ -213,7 +226,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             return None
         if is_metatraffic and lease.kind is not kind:
             lease.kind = kind  # Cyclone DDS has one locator for both
-            self.changes += 1
+            self._mark_read(participant.address)
         host = self.settings.host_for(locator.host)
         return HostPort(host, self.settings.ports.advertised(lease.port))
 
@@ -262,5 +275,5 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             return None
         lease = participant.leases[locator] = Lease(port, locator, kind)
         self.leases[port] = participant, lease
-        self.changes += 1
+        self._mark_read(participant.address)
         return lease

@@ -35,7 +35,11 @@ address, on a side."""
 
 
 class LeaseKind(StrEnum):
-    """What arrives at a lease. ``METATRAFFIC`` is read and rewritten, ``DATA`` passes unread."""
+    """What the participant announces a lease for: discovery (``METATRAFFIC``), or user data.
+
+    The proxy reads discovery at a lease for user data as well, unless the participant ignores
+    discovery there (`Participant.reads_discovery_at`).
+    """
 
     METATRAFFIC = "metatraffic"
     DATA = "data"
@@ -114,13 +118,15 @@ class Lease:
     """A port that leads to one locator of a participant.
 
     Of one inside it is a port of the range; of one outside its *stand-in*, a port that those inside
-    reach. ``bytes`` and ``datagrams`` are those that were passed on; ``rate`` is in bytes per
-    second, as of the last `sample`.
+    reach. ``is_read`` (inside alone): a participant there may act on discovery. ``bytes`` and
+    ``datagrams`` are those that were passed on; ``rate`` is in bytes per second, as of the last
+    `sample`.
     """
 
     port: int
     target: HostPort
     kind: LeaseKind
+    is_read: bool = False
     datagrams: int = 0
     bytes: int = 0
     rate: float = 0.0
@@ -167,6 +173,28 @@ class Participant:
     def vendor_name(self) -> str:
         """The implementation's name, or its id."""
         return VENDORS.get(self.vendor, self.vendor.hex())
+
+    def reads_discovery_at(self, lease: Lease) -> bool:
+        """Whether the participant may act on discovery that arrives where a lease leads.
+
+        Fast DDS gives a datagram only to the readers that have the port among their own locators.
+        The built-in readers have the ports for metatraffic alone (RTPSParticipantImpl.cpp,
+        assignEndpoint2LocatorList; MessageReceiver.cpp, associated_readers_; from 1.8 to 3.2).
+        Cyclone DDS finds the writer of a datagram in one table for all sockets (ddsi_receive.c,
+        handle_submsg_sequence). Other implementations count as Cyclone DDS does.
+        """
+        return lease.kind is LeaseKind.METATRAFFIC or self.vendor != FAST_DDS
+
+    def note_vendor(self, vendor: bytes) -> bool:
+        """Note the vendor in a later announcement. Return whether the vendor has changed.
+
+        Another vendor outweighs Fast DDS, and the first other vendor stays. So a forger that
+        announces the participant first, as one of Fast DDS, gains nothing for long.
+        """
+        if self.vendor != FAST_DDS or vendor == FAST_DDS:
+            return False
+        self.vendor = vendor
+        return True
 
 
 @dataclass(slots=True)

@@ -29,6 +29,7 @@ PROOF = RelayProof(SECRET, lambda: UNIX_TIME)
 RANGE = PortMap(PortRange(45000, 45015), PortRange(46000, 46015))
 NOW = REMEMBERED + 1
 SEDP_WRITERS = 0x000003C2
+CYCLONE_DDS = b"\x01\x10"
 
 
 def everything(*_: object) -> bool:
@@ -68,6 +69,11 @@ def spdp(
         *([(Pid.ENTITY_NAME, bytes(padding))] if padding else []),
     ]
     return message(data(payload(parameters)), prefix=prefix)
+
+
+def of_vendor(datagram: bytes, vendor: bytes = CYCLONE_DDS) -> bytes:
+    """A message of another implementation than Fast DDS."""
+    return datagram[:6] + vendor + datagram[8:]
 
 
 def carried(source: str, datagram: bytes) -> bytes:

@@ -23,6 +23,7 @@ from tests.unit.ros2.discovery.domains import (
     B,
     allowance_left,
     make_domain,
+    of_vendor,
     sedp,
     spdp,
 )
@@ -112,10 +113,6 @@ def test_strangers_are_not_passed_on_there() -> None:
     assert domain.at_stand_in(stand_in, message(SAID, prefix=A), OTHER, NOW) == []
 
 
-def of_cyclone(datagram: bytes) -> bytes:
-    return datagram[:6] + b"\x01\x10" + datagram[8:]
-
-
 STATISTICS = submessage(0x80, 0, bytes(56))
 
 
@@ -154,7 +151,7 @@ def test_what_users_send_is_known(unread: bytes) -> None:
         *[message(between(kind, UNKNOWN, SEDP_WRITERS)) for kind in (0x06, 0x07, 0x08, 0x12, 0x13)],
         *[message(submessage(kind, 0, bytes(40)), SAID) for kind in range(0x30, 0x35)],
         *[message(submessage(kind, 0, bytes(40)), SAID) for kind in (0x00, 0x0F, 0x81, 0xFF)],
-        of_cyclone(message(SAID, STATISTICS)),
+        of_vendor(message(SAID, STATISTICS)),
     ],
 )
 def test_what_can_not_be_told_from_discovery_is_read(read: bytes) -> None:
