@@ -10,7 +10,12 @@ from prometheus_client.registry import Collector
 from rosproxy.admin import status_document as document
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.ros2.discovery.data_leases import DataLeases
-from rosproxy.ros2.registry.participants import Lease, LeaseKind
+from rosproxy.ros2.registry.participants import (
+    InsideParticipant,
+    Lease,
+    LeaseKind,
+    Participant,
+)
 
 
 @dataclass(eq=False)
@@ -24,9 +29,8 @@ class DomainPlane(Collector):
         """How user data is forwarded."""
         return msgspec.convert(self._plane.status(), document.DataPlaneStatus)
 
-    def locator(self, lease: Lease) -> document.LocatorStatus:
-        """A port, where it leads, and who forwards what arrives there."""
-        is_read = lease.kind is LeaseKind.METATRAFFIC
+    def locator(self, participant: Participant, lease: Lease) -> document.LocatorStatus:
+        """A port of a participant, where the port leads, and what forwards the datagrams there."""
         status = document.LocatorStatus(
             lease.port,
             str(lease.target),
@@ -35,7 +39,7 @@ class DomainPlane(Collector):
             lease.bytes,
             lease.rate,
             self._plane.user_plane,
-            "it is read and rewritten" if is_read else "the kernel forwards to inside alone",
+            _reason(participant, lease),
         )
         forwarded = self._forwarded.by_port.get(lease.port)
         if forwarded is None:
@@ -61,3 +65,14 @@ class DomainPlane(Collector):
         text = "Bytes of these as IP packets, headers included."
         received = self._plane.total.received
         yield CounterMetricFamily("rosproxy_ros2_kernel_bytes", text, value=received)
+
+
+def _reason(participant: Participant, lease: Lease) -> str:
+    """Why the kernel may not forward a lease, if it may not."""
+    if lease.kind is LeaseKind.METATRAFFIC:
+        return "it is read and rewritten"
+    if not isinstance(participant, InsideParticipant):
+        return "the kernel forwards to inside alone"
+    if not participant.reads_discovery_at(lease):
+        return "another participant at the address may read discovery at this port"
+    return f"{participant.vendor_name} may read discovery at this port"

@@ -202,7 +202,9 @@ class Ros2State(Collector):
             guid_prefix=participant.guid_prefix,
             address=participant.address,
             vendor=participant.vendor_name,
-            leases=tuple(self._plane.locator(lease) for lease in participant.leases.values()),
+            leases=tuple(
+                self._plane.locator(participant, lease) for lease in participant.leases.values()
+            ),
             publishes=tuple(publishes),
             subscribes=tuple(subscribes),
             services=tuple(services),

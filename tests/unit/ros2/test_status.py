@@ -16,7 +16,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.participants import Lease
+from rosproxy.ros2.registry.participants import Lease, Participant
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.status import Ros2State
 from tests.unit.ros2.discovery.domains import (
@@ -49,7 +49,7 @@ class Copied:
     def status(self) -> DataPlaneStatus:
         return DataPlaneStatus()
 
-    def locator(self, lease: Lease) -> LocatorStatus:
+    def locator(self, _: Participant, lease: Lease) -> LocatorStatus:
         return LocatorStatus(lease.port, rate=lease.rate)
 
 

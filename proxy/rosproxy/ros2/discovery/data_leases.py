@@ -1,9 +1,10 @@
 """Which ports of the range the kernel may forward, and to which locators: those of user data.
 
-Metatraffic is read and rewritten, so that it stays in user space; what arrives at a lease of user
-data goes to one locator, whatever it is. A port that the kernel forwarded before the proxy started
-is here until it is given to somebody, or until nobody is left who could claim it: meanwhile the
-kernel goes on forwarding as the former process had told it to.
+The proxy reads and rewrites discovery. So the kernel forwards a port only if discovery
+is ignored there: a port for user data of Fast DDS (`Participant.reads_discovery_at`). All that
+arrives at such a port goes to one locator. A port that the kernel forwarded before the proxy
+started is here until the proxy lends the port, or until no participant is left that could claim the
+port. Meanwhile the kernel goes on forwarding as the former process had told it to.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,7 +13,6 @@ from dataclasses import dataclass, field
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.registry.participants import LeaseKind
 
 
 @dataclass(eq=False, slots=True)
@@ -95,7 +95,7 @@ class DataLeases:
         """The leases that are lent, each the same object for as long as it leads to the same."""
         for inside in self.domains:
             for port, (participant, lease) in inside.leases.items():
-                if lease.kind is not LeaseKind.DATA:
+                if lease.is_read:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
                 cached = self._cached.get(port)

@@ -5,8 +5,20 @@ from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
+from rosproxy.ros2.registry.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import LeaseKind
-from tests.unit.ros2.discovery.domains import INSIDE, OTHER, A, B, farewell, make_domain, meet, spdp
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    OTHER,
+    A,
+    B,
+    farewell,
+    make_domain,
+    meet,
+    of_vendor,
+    spdp,
+)
 
 LOCATOR = HostPort(INSIDE, 7411)
 
@@ -72,4 +84,35 @@ def test_what_was_forwarded_before_goes_on_until_its_port_is_given_to_somebody()
     domain.heard_inside(farewell(A), INSIDE, 100)
     assert port not in led(leases)
     leases.note_former({})
+    assert led(leases) == {}
+
+
+def test_a_port_at_which_discovery_is_read_is_not_forwarded() -> None:
+    """The kernel forwarded discovery to Cyclone DDS, with topics that the policy denies."""
+    domain = make_domain()
+    leases = data_leases_of(domain)
+    domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 100)
+    assert [lease.kind for _, lease in domain.inside.leases.values()] == [*LeaseKind]
+    assert led(leases) == {}
+
+
+def test_a_participant_that_turns_out_not_to_be_of_fast_dds_is_not_forwarded() -> None:
+    domain = make_domain()
+    leases = data_leases_of(domain)
+    meet(domain)
+    assert led(leases)
+    domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 100)
+    assert led(leases) == {}
+
+
+def test_what_an_older_process_forwarded_to_such_a_port_ends_with_the_participants_return() -> None:
+    domain = make_domain()
+    leases = data_leases_of(domain)
+    port = 45007
+    leases.note_former({port: LOCATOR})
+    domain.ports.note_forwarded({port: LOCATOR})
+    assert led(leases) == {port: LOCATOR}
+    domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 0.0)
+    domain.settle(SETTLING + ANSWER_TIME)
+    assert domain.inside.leases[port][1].target == LOCATOR
     assert led(leases) == {}

@@ -1,0 +1,56 @@
+"""Why the kernel does not forward a port, as the status tells."""
+
+from dataclasses import dataclass
+from typing import cast
+
+import pytest
+
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.leases.ports import PortPool
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.data_leases import DataLeases
+from rosproxy.ros2.domain_plane import DomainPlane
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    NOW,
+    ROBOT,
+    A,
+    B,
+    make_domain,
+    of_vendor,
+    spdp,
+)
+
+
+@dataclass
+class Plane:
+    """What is asked of a plane for a port that the kernel may not forward."""
+
+    user_plane: str = "copy"
+
+
+@pytest.mark.parametrize(
+    ("prefix", "address", "port", "reason"),
+    [
+        (A, INSIDE, 7410, "it is read and rewritten"),
+        (A, INSIDE, 7411, "Cyclone DDS may read discovery at this port"),
+        (B, INSIDE, 7411, "another participant at the address may read discovery at this port"),
+        (B, ROBOT, 7411, "the kernel forwards to inside alone"),
+    ],
+)
+def test_why_the_kernel_does_not_forward_a_port(
+    prefix: bytes, address: str, port: int, reason: str
+) -> None:
+    domain = make_domain(both_ways=True)
+    domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, NOW)
+    if address == ROBOT:
+        domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    elif prefix == B:
+        domain.heard_inside(spdp(B, INSIDE), INSIDE, NOW)
+    leases = DataLeases(PortPool(domain.settings.ports.listen))
+    leases.domains.append(domain.inside)
+    table = domain.inside if address == INSIDE else domain.outside
+    participant = table.by_prefix[prefix]
+    lease = participant.leases[HostPort(address, port)]
+    status = DomainPlane(cast(KernelPlane, Plane()), leases).locator(participant, lease)
+    assert (status.plane, status.reason) == ("copy", reason)
