@@ -14,9 +14,9 @@ from types import TracebackType
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.reliable import heartbeats
-from rosproxy.ros2.protocol.rtps import NO_VENDOR, source_prefix, source_vendor
+from rosproxy.ros2.protocol.rtps import FAST_DDS, NO_VENDOR, source_prefix, source_vendor
 from rosproxy.ros2.rewriting.discovery import read_discovery
-from tests.unit.ros2.discovery.domains import spdp
+from tests.unit.ros2.discovery.domains import of_vendor, spdp
 from tests.unit.ros2.protocol.messages import message, submessage
 
 WELL_KNOWN = 7410
@@ -39,10 +39,14 @@ def udp(address: str, port: int = 0) -> socket.socket:
 
 
 class Participant:
-    """A participant at an address, with a socket for metatraffic and one for data."""
+    """A participant at an address, with a socket for metatraffic and one for data.
 
-    def __init__(self, prefix: bytes, address: str, port: int) -> None:
+    ``vendor`` is the id of the implementation.
+    """
+
+    def __init__(self, prefix: bytes, address: str, port: int, vendor: bytes = FAST_DDS) -> None:
         self.prefix, self.address, self.port = prefix, address, port
+        self.vendor = vendor
         self.meta, self.data = udp(address, port), udp(address, port + 1)
 
     def close(self) -> None:
@@ -54,7 +58,7 @@ class Participant:
         """Announce itself."""
         for target in to:
             announcement = spdp(self.prefix, self.address, self.port, padding=PADDING)
-            self.meta.sendto(announcement, target)
+            self.meta.sendto(of_vendor(announcement, self.vendor), target)
 
     def proves_to_receive(self, asked: Callable[[], object]) -> None:
         """Answer the question that the proxy sends to this address; ``asked`` is done meanwhile."""
