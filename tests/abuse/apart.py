@@ -24,6 +24,9 @@ STRANGERS = tuple(f"198.18.1.{number}" for number in range(11, 31))
 """Machines outside."""
 
 
+NEAR = "abuse-near"
+FAR = "abuse-far"
+"""The ends of the cable: on this machine, and in the namespace."""
 NAME = f"abuse-{os.getpid()}"
 NAMES = Path("/etc/netns") / NAME
 """Whose files stand in for those of /etc in the namespace (ip-netns(8))."""
@@ -48,14 +51,13 @@ class Apart:
     """The namespace; root makes and removes it."""
 
     def __init__(self) -> None:
-        near, far = "abuse-near", "abuse-far"
         _ip("netns", "add", NAME)
-        _ip("link", "add", near, "type", "veth", "peer", "name", far, "netns", NAME)
+        _ip("link", "add", NEAR, "type", "veth", "peer", "name", FAR, "netns", NAME)
         for address in (APART_MASTER, *STRANGERS, *NODES):
-            _ip("address", "add", f"{address}/24", "dev", near)
+            _ip("address", "add", f"{address}/24", "dev", NEAR)
         for address in (APART, APART_HOST):
-            _ip("-n", NAME, "address", "add", f"{address}/24", "dev", far)
-        for command in (("link", "set", near), ("-n", NAME, "link", "set", far)):
+            _ip("-n", NAME, "address", "add", f"{address}/24", "dev", FAR)
+        for command in (("link", "set", NEAR), ("-n", NAME, "link", "set", FAR)):
             _ip(*command, "up")
         _ip("-n", NAME, "link", "set", "lo", "up")
 
@@ -65,7 +67,9 @@ class Apart:
         return ["ip", "netns", "exec", NAME]
 
     def remove(self) -> None:
-        """Remove it, and the cable with it."""
+        """Remove the namespace and the cable."""
+        # With the namespace alone, Linux removes the cable some time later.
+        _ip("link", "delete", NEAR)
         _ip("netns", "delete", NAME)
 
 
