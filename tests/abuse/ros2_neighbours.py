@@ -128,6 +128,7 @@ class Flood:
 
     Each comes with where it is from, an address of this machine's, and where it goes. ``via`` is
     the address on whose network forged ones go to a group; ``per_second`` is how many are sent.
+    ``make_packet`` makes a forged packet of those three.
     """
 
     def __init__(
@@ -136,11 +137,13 @@ class Flood:
         is_forged: bool,
         via: str = "0.0.0.0",
         per_second: float = float("inf"),
+        make_packet: Callable[[str, Address, bytes], bytes] = packet,
     ) -> None:
         self._datagrams = list(datagrams)
         self._is_forged = is_forged
         self._via = via
         self._pause = 1 / per_second
+        self._make_packet = make_packet
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self.sent = 0
@@ -175,7 +178,7 @@ class Flood:
             if self._ended.is_set():
                 break
             if self._is_forged:
-                raw.sendto(packet(source, to, datagram), (to[0], 0))
+                raw.sendto(self._make_packet(source, to, datagram), (to[0], 0))
             else:
                 own[source].sendto(datagram, to)
             self.sent += 1

@@ -32,7 +32,7 @@ class FakeTools(Tools):
 
     ``table`` is None where there is none; ``flows`` is what conntrack prints, ``counted`` are the
     bytes that nft prints for each mark. The next runs of a
-    program fail as often as ``failing`` says.
+    program fail as often as ``failing`` says. ``lacking`` is an expression that the kernel lacks.
     """
 
     def __init__(self) -> None:
@@ -42,6 +42,7 @@ class FakeTools(Tools):
         self.flows = ""
         self.counted = {"sent": 1000, "received": 1000}
         self.failing = 0
+        self.lacking = ""
         self.documents: list[str] = []
         self.forgotten: list[tuple[bool, tuple[str, ...]]] = []
 
@@ -50,6 +51,8 @@ class FakeTools(Tools):
         self._maybe_fail()
         if "list" in words:
             return self._listed()
+        if self.lacking and self.lacking in document:
+            raise ToolError("nft: Could not process rule: No such file or directory")
         self.documents.append(document)
         for line in document.splitlines():
             self._apply(line.split(maxsplit=5))

@@ -344,6 +344,26 @@ async def test_what_is_missing_is_said(
     assert bench.plane.status_of(endpoint)["port"] == 45002
 
 
+async def test_a_kernel_without_limits_forwards_and_says_so(
+    sound: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = Bench()
+    bench.tools.lacking = "limit rate"
+    await bench.plane.start()
+    bench.plane.recovered([])
+    await bench.forwarded()
+    assert bench.plane.status()["plane"] == "kernel"
+    (problem,) = bench.context.problems.all()
+    assert "forged SYNs" in problem.text
+    assert "nft_limit" in problem.text
+    assert problem.text in caplog.text
+    bench.tools.lacking = ""
+    await bench.plane.syncer.begin()
+    assert "limit rate" in bench.tools.documents[-1]
+    await bench.context.tasks.cancel()
+    await bench.plane.stop()
+
+
 @pytest.mark.parametrize("mode", ["splice", "copy"])
 async def test_other_modes_leave_the_kernel_alone(mode: str) -> None:
     bench = Bench(mode)

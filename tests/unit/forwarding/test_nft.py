@@ -10,7 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.forwarding.kernel.connection_table import ConnectionTable, Marks
+from rosproxy.forwarding.kernel.connection_table import (
+    NEW_BURST,
+    NEW_PER_SECOND,
+    ConnectionTable,
+    Marks,
+)
 from rosproxy.forwarding.kernel.datagram_table import DatagramTable
 from rosproxy.forwarding.kernel.decisions import Changes
 from rosproxy.forwarding.kernel.nft import (
@@ -104,6 +109,20 @@ def test_what_leads_outside_is_open_to_those_who_are_near_alone() -> None:
     assert "near4" not in elements(TABLE.adapted({}, NOTHING), "add")
 
 
+def test_new_connections_have_a_limit_before_they_are_led_elsewhere() -> None:
+    """Forged SYNs took all ports of the masquerade, at some 540 a second."""
+    rules = re.search(r"chain prerouting {(.*?)}", TABLE.made({45050: FOUR}, NOTHING), re.S)
+    assert rules is not None
+    marked, limited, *led = rules[1].strip().splitlines()[3:]
+    assert "ct mark set tcp dport map @marks" in marked
+    assert f"limit rate over {NEW_PER_SECOND}/second" in limited
+    assert limited.endswith("ct mark set 0 return")
+    assert f"{TABLE.marks.of(0):#x}" in limited
+    assert ["dnat" in rule for rule in led] == [True, True]
+    longest_half_open_s = 120
+    assert NEW_BURST + NEW_PER_SECOND * longest_half_open_s < 64_512 / 2
+
+
 @pytest.mark.parametrize("host", ["robot", "10.0.0.5 }; flush ruleset", "fe80::1%}\nflush ruleset"])
 def test_nothing_but_addresses_gets_into_a_document(host: str) -> None:
     document = TABLE.made({45050: HostPort(host, 50000)}, NOTHING)
@@ -152,7 +171,7 @@ def test_a_table_leaves_udp_alone() -> None:
         assert rules
         assert all("meta l4proto tcp " in line for line in rules)
     prerouting = chains["prerouting"].splitlines()[1:]
-    assert all("tcp dport" in line for line in prerouting)
+    assert all("tcp dport" in line or "l4proto tcp" in line for line in prerouting)
 
 
 def test_tables_of_both_transports_have_names_of_their_own() -> None:

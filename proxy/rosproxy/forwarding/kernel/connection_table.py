@@ -5,7 +5,7 @@ connections that are being ended. ``inward`` has the ports of nodes outside, and
 ``near6`` the networks that may use those ports. Three chains use them:
 
 - prerouting: a connection to an address of this machine gets the mark of its port, and leads to the
-  node;
+  node. New connections have a limit, and those over the limit stay with the proxy's own socket;
 - postrouting: the connection leaves with this machine's address, so that replies come back;
 - forward: bytes of IP packets are counted, in each direction. The chain stands before any filter,
   so that the proxy knows of packets that a filter drops.
@@ -19,6 +19,16 @@ import msgspec
 from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Elements, Json, Surroundings, Table, pairs
 from rosproxy.leases.ports import PortRange
+
+NEW_PER_SECOND = 200
+NEW_BURST = 2000
+"""New connections that the kernel forwards in a second, and at once, all ports together.
+
+A forged SYN costs its sender nothing. The kernel tracks an unanswered connection for 120 s
+(nf_conntrack_tcp_timeout_syn_sent), and a half-open connection for 60 s. Masquerade gives each
+connection to a node another one of 64,512 ports. With these limits forged SYNs take at most 26,000.
+The proxy's own socket gets the connections over the limit, and there the kernel uses SYN cookies.
+"""
 
 # Chains of type nat see only the first packet of a connection (nft(8)), so its port is kept in the
 # connection's mark.
@@ -39,7 +49,7 @@ table inet $name {
     tcp dport @inward ip saddr != @near4 return
     tcp dport @inward ip6 saddr != @near6 return
     fib daddr type local ct mark set tcp dport map @marks
-    fib daddr type local dnat ip to tcp dport map @hosts4 : tcp dport map @ports
+$limit    fib daddr type local dnat ip to tcp dport map @hosts4 : tcp dport map @ports
     fib daddr type local dnat ip6 to tcp dport map @hosts6 : tcp dport map @ports
   }
   chain postrouting {
@@ -54,6 +64,11 @@ table inet $name {
   }
 }
 """)
+# A port that nothing is forwarded from has no mark, and uses up nothing of the limit.
+_LIMIT = Template(
+    "    meta l4proto tcp ct mark & 0xffff0000 == $mark "
+    "limit rate over $rate/second burst $burst packets ct mark set 0 return\n"
+)
 _END_DOCUMENT = Template("""\
 flush map inet $name marks
 flush map inet $name hosts4
@@ -90,6 +105,7 @@ class ConnectionTable(Table):
     """The table ``rosproxy-NUMBER``; the number is the master port.
 
     ``leases`` are the ports whose forwards lead to nodes inside; all others lead outside.
+    ``limits_new`` tells whether new connections have a limit, for which Linux needs a module.
     """
 
     maps = ("marks", "hosts4", "hosts6", "ports")
@@ -99,11 +115,15 @@ class ConnectionTable(Table):
         super().__init__(f"rosproxy-{number}")
         self.marks = Marks(number)
         self._leases = leases
+        self.limits_new = True
 
     @property
     def chains(self) -> str:
         """Return the document that makes the table without elements."""
-        return _CHAINS.substitute(name=self.name)
+        limit = _LIMIT.substitute(
+            mark=f"{self.marks.of(0):#x}", rate=NEW_PER_SECOND, burst=NEW_BURST
+        )
+        return _CHAINS.substitute(name=self.name, limit=limit if self.limits_new else "")
 
     def counter_key(self, port: int) -> int:
         """Bytes are counted by mark."""

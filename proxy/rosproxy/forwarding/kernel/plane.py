@@ -174,6 +174,9 @@ class KernelPlane:
         if reason is None:
             log.info("the kernel forwards %s: nftables table %s", traffic, self._table.table.name)
             self._problems.solved(self.syncer.subject)
+            if self._table.weakness:
+                log.warning("%s: %s", self.syncer.subject, self._table.weakness)
+                self._problems.add(self.syncer.subject, self._table.weakness)
         elif self._settings.data_plane == "kernel":
             text = f"the kernel forwards no {traffic}, the proxy does ({plane}): {reason}"
             log.error("%s kernel: %s", OPTION, text)

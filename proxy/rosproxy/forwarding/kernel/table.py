@@ -21,6 +21,8 @@ class KernelTable:
 
     has_connections = False
     """Whether the kernel tracks what it forwards: answered, and ended by a reset."""
+    weakness = ""
+    """What the table lacks although it forwards, and what to do about that; mostly nothing."""
 
     def __init__(self, table: Table, tools: Tools) -> None:
         self.table = table
@@ -105,7 +107,17 @@ class TrackedTable(KernelTable):
         """
         # Only to see, before anything is forwarded, whether conntrack can be run.
         await self._list_flows(lambda lines: None, False)
-        await super().begin(surroundings)
+        self._connections.limits_new = True
+        self.weakness = ""
+        try:
+            await super().begin(surroundings)
+        except ToolError as error:
+            self._connections.limits_new = False
+            await super().begin(surroundings)
+            self.weakness = (
+                f"the kernel forwards without a limit for new connections ({error}), and forged "
+                "SYNs can keep new subscribers out: load the module nft_limit on the host"
+            )
 
     async def look(self, ipv6: bool) -> tuple[Counters, Survey | None]:
         """Take in what the kernel really has: what was counted by port, and connections.
