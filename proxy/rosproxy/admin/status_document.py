@@ -306,6 +306,7 @@ class DomainStatus(msgspec.Struct, frozen=True):
 
     ``discovery`` is where outside announces itself to the proxy, ``direction`` that of the proxy.
     ``dropped`` were refused, ``lost`` the kernel did not take; ``data_plane`` is for user data.
+    ``not_compared`` counts pairs of a reader and a writer of which nothing is known.
     """
 
     domain: Count = 0
@@ -322,6 +323,7 @@ class DomainStatus(msgspec.Struct, frozen=True):
     outside: tuple[ParticipantStatus, ...] = ()
     mismatches: tuple[MismatchStatus, ...] = ()
     mismatches_left_out: Count = 0
+    not_compared: Count = 0
     left_out: Count = 0
 
 

@@ -80,6 +80,16 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
         yield DomainProblem(
             "qos", f"domain {domain.domain}", text, "first correct the pairs that are named"
         )
+    if domain.not_compared:
+        text = (
+            f"{plural(domain.not_compared, 'pair')} of a reader and a writer are not compared: "
+            "there are too many"
+        )
+        fix = (
+            "`rosproxy status --json` lists the readers and writers of each address: end programs "
+            "that have thousands; a domain of hundreds of nodes may have as many by itself"
+        )
+        yield DomainProblem("qos", f"domain {domain.domain}", text, fix, grave=False)
 
 
 def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, DomainProblem]]:

@@ -22,7 +22,7 @@ from rosproxy.ros2.protocol.ros_names import (
     ros_topic,
     ros_type,
 )
-from rosproxy.ros2.registry.matching import MismatchedPair, mismatched_pairs
+from rosproxy.ros2.registry.matching import MismatchedPair, compare
 from rosproxy.ros2.registry.participants import (
     EndpointKind,
     InsideParticipant,
@@ -139,9 +139,8 @@ class Ros2State(Collector):
     def _domain(self, server: DomainServer) -> document.DomainStatus:
         domain, settings = server.domain, server.domain.settings
         discovery = settings.ports.advertised(settings.discovery_port)
-        pairs = mismatched_pairs(
-            domain.inside.by_prefix.values(), domain.outside.by_prefix.values()
-        )
+        comparison = compare(domain.inside.by_prefix.values(), domain.outside.by_prefix.values())
+        pairs = comparison.mismatched
         shortages = domain.inside.port_shortages
         shown_pairs = fair_choice(pairs, _address_inside, MOST_MISMATCHES)
         return document.DomainStatus(
@@ -157,6 +156,7 @@ class Ros2State(Collector):
             data_plane=self._plane.status(),
             mismatches=tuple(map(_mismatch, shown_pairs)),
             mismatches_left_out=len(pairs) - len(shown_pairs),
+            not_compared=comparison.left_out,
             inside=tuple(
                 self._inside(p, most, shortages.get(p.prefix, _NO_SHORTAGE), domain.is_kept(p))
                 for p, most in self._shares(domain.inside.by_prefix.values())

@@ -130,3 +130,9 @@ def test_a_pair_of_which_one_is_not_reached_at_all_says_nothing_more() -> None:
 def test_pairs_that_are_left_out_are_counted() -> None:
     (problem,) = domain_problems(replace(DOMAIN, mismatches_left_out=7))
     assert "7 more pairs" in problem.text
+
+
+def test_pairs_that_are_not_compared_are_counted() -> None:
+    (problem,) = domain_problems(replace(DOMAIN, not_compared=7))
+    assert "7 pairs" in problem.text
+    assert not problem.grave

@@ -6,10 +6,16 @@ Both sides decide it by themselves, and neither tells the other, so that a misma
 silence. Only pairs of one inside and one outside are looked at: no others pass the proxy.
 
 Types are compared by their names, as ROS 2 has them: another definition has the same name.
+
+One participant may have thousands of readers and writers, and so millions of pairs. So addresses
+take turns, and what is left out is counted: no address keeps a pair of another one from being
+compared.
 """
 
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice, product
+from itertools import islice, product, repeat
+from typing import TypeVar
 
 import msgspec
 
@@ -18,9 +24,15 @@ from rosproxy.ros2.protocol.ros_names import ros_name, ros_type
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 
 MOST_LOOKED_AT = 20_000
-"""Readers and writers of a side that are looked at; a participant of ROS 2 has some tens."""
+"""Readers and writers of a side that are looked at; a participant of ROS 2 has some tens. The
+addresses of the side take turns."""
 MOST_COMPARED = 20_000
-"""Pairs that are compared at a time."""
+"""Pairs that are compared at a time. The addresses inside take turns, and in the turns of each of
+them its readers and writers; each meets those outside in the order of their addresses' turns."""
+_OPPOSITE = {
+    EndpointKind.READER: EndpointKind.WRITER,
+    EndpointKind.WRITER: EndpointKind.READER,
+}
 _WILDCARDS = {"*", "?", "["}
 _XCDR = 0
 _REPRESENTATIONS = {0: "XCDR", 1: "XML", 2: "XCDR2"}
@@ -48,41 +60,79 @@ def mismatch(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
     return next((reason for rule in _RULES if (reason := rule(writer, reader))), None)
 
 
-def mismatched_pairs(
-    inside: Iterable[Participant], outside: Iterable[Participant]
-) -> list[MismatchedPair]:
-    """The pairs of a topic that don't match, one of them inside and one outside.
+class Comparison(msgspec.Struct, frozen=True):
+    """The pairs that don't match, and how many pairs are not compared.
+
+    A reader or writer that is not looked at counts as one pair.
+    """
+
+    mismatched: list[MismatchedPair] = []
+    left_out: int = 0
+
+
+def compare(inside: Iterable[Participant], outside: Iterable[Participant]) -> Comparison:
+    """Compare the readers and writers of a topic, of which one is inside and one outside.
 
     Each mismatch of the same two participants is there once for each topic or service.
     """
-    outside_by_topic: dict[str, list[tuple[Participant, DdsEndpoint]]] = {}
-    for participant, endpoint in _endpoints(outside):
-        outside_by_topic.setdefault(endpoint.topic, []).append((participant, endpoint))
-    pairs = (
-        (insider, endpoint, outsider, outer_endpoint)
-        for insider, endpoint in _endpoints(inside)
-        for outsider, outer_endpoint in outside_by_topic.get(endpoint.topic, ())
-    )
+    insiders, not_looked_at_inside = _endpoints(inside)
+    outsiders, not_looked_at_outside = _endpoints(outside)
+    by_partner: defaultdict[tuple[str, EndpointKind], list[_Owned]] = defaultdict(list)
+    for owned in outsiders:
+        _, endpoint = owned
+        by_partner[endpoint.topic, _OPPOSITE[endpoint.kind]].append(owned)
+    by_address: defaultdict[str, list[Iterator[tuple[_Owned, _Owned]]]] = defaultdict(list)
+    count = 0
+    for owned in insiders:
+        participant, endpoint = owned
+        partners = by_partner.get((endpoint.topic, endpoint.kind), [])
+        by_address[participant.address].append(zip(repeat(owned), partners))
+        count += len(partners)
+    pairs = _in_turn(map(_in_turn, by_address.values()))
     mismatched: dict[tuple[str, bytes, bytes, str], MismatchedPair] = {}
-    for insider, endpoint, outsider, outer_endpoint in islice(pairs, MOST_COMPARED):
-        if endpoint.kind is outer_endpoint.kind:
-            continue
-        pair = (insider, endpoint), (outsider, outer_endpoint)
+    for insider, outsider in islice(pairs, MOST_COMPARED):
+        is_written_inside = insider[1].kind is EndpointKind.WRITER
         (source, writer), (sink, reader) = (
-            pair if endpoint.kind is EndpointKind.WRITER else pair[::-1]
+            (insider, outsider) if is_written_inside else (outsider, insider)
         )
-        reason = mismatch(writer, reader)
-        if reason:
-            name = ros_name(endpoint.topic)
-            key = name, insider.prefix, outsider.prefix, reason.policy
-            mismatched.setdefault(key, MismatchedPair(reason, endpoint.topic, source, sink))
-    return list(mismatched.values())
+        if reason := mismatch(writer, reader):
+            key = ros_name(writer.topic), insider[0].prefix, outsider[0].prefix, reason.policy
+            mismatched.setdefault(key, MismatchedPair(reason, writer.topic, source, sink))
+    left_out = max(count - MOST_COMPARED, 0) + not_looked_at_inside + not_looked_at_outside
+    return Comparison(list(mismatched.values()), left_out)
 
 
-def _endpoints(side: Iterable[Participant]) -> Iterator[tuple[Participant, DdsEndpoint]]:
-    """The readers and writers of a side; equal ones of a participant count as one."""
-    endpoints = ((p, e) for p in side for e in dict.fromkeys(p.endpoints.values()))
-    return islice(endpoints, MOST_LOOKED_AT)
+_Owned = tuple[Participant, DdsEndpoint]
+_Item = TypeVar("_Item")
+
+
+def _endpoints(side: Iterable[Participant]) -> tuple[list[_Owned], int]:
+    """Return the readers and writers of a side in turn, and how many are not looked at.
+
+    Equal ones of a participant count as one.
+    """
+    by_address: defaultdict[str, list[Iterator[_Owned]]] = defaultdict(list)
+    count = 0
+    for participant in side:
+        owned = zip(repeat(participant), participant.endpoints.values())
+        by_address[participant.address].append(owned)
+        count += len(participant.endpoints)
+    in_turn = islice(_in_turn(map(_in_turn, by_address.values())), MOST_LOOKED_AT)
+    different = {
+        (participant.prefix, endpoint): (participant, endpoint) for participant, endpoint in in_turn
+    }
+    return list(different.values()), max(count - MOST_LOOKED_AT, 0)
+
+
+def _in_turn(sequences: Iterable[Iterable[_Item]]) -> Iterator[_Item]:
+    """Yield the first item of each, then the second item of each, and so on."""
+    waiting = deque(map(iter, sequences))
+    while waiting:
+        items = waiting.popleft()
+        for item in items:
+            yield item
+            waiting.append(items)
+            break
 
 
 def _type(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:

@@ -7,7 +7,15 @@ from hypothesis import given
 from msgspec.structs import replace
 
 from rosproxy.ros2.protocol.qos import Durability, EndpointQos, Liveliness
-from rosproxy.ros2.registry.matching import Mismatch, mismatch, mismatched_pairs
+from rosproxy.ros2.registry import matching
+from rosproxy.ros2.registry.matching import (
+    MOST_COMPARED,
+    MOST_LOOKED_AT,
+    Comparison,
+    Mismatch,
+    compare,
+    mismatch,
+)
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 from tests.unit.ros2.protocol.test_qos import QOS
 
@@ -138,17 +146,17 @@ def test_more_offered_never_hurts(offered: EndpointQos, requested: EndpointQos) 
 
 def test_only_pairs_across_the_boundary_are_looked_at() -> None:
     publisher = make_participant(1, writer(EndpointQos()), reader(RELIABLE))
-    assert mismatched_pairs([publisher], []) == []
+    assert compare([publisher], []) == Comparison()
     subscriber = make_participant(
         2, reader(RELIABLE), writer(RELIABLE), reader(RELIABLE, "rt/other")
     )
-    (pair,) = mismatched_pairs([publisher], [subscriber])
+    (pair,) = compare([publisher], [subscriber]).mismatched
     assert (pair.writer, pair.reader, pair.mismatch.policy) == (
         publisher,
         subscriber,
         "reliability",
     )
-    (pair,) = mismatched_pairs([subscriber], [publisher])
+    (pair,) = compare([subscriber], [publisher]).mismatched
     assert (pair.writer, pair.reader) == (publisher, subscriber)
 
 
@@ -158,20 +166,52 @@ def test_a_service_is_told_once() -> None:
     client = make_participant(
         2, writer(EndpointQos(), "rq/addRequest"), reader(EndpointQos(), "rr/addReply")
     )
-    assert len(mismatched_pairs([server], [client])) == 1
+    assert len(compare([server], [client]).mismatched) == 1
     other = make_participant(3, writer(latched, "rq/addRequest"), reader(latched, "rr/addReply"))
-    (pair,) = mismatched_pairs([server], [other])
+    (pair,) = compare([server], [other]).mismatched
     assert (pair.topic, pair.mismatch.policy) == ("rr/addReply", "durability")
 
 
-def test_so_many_are_compared_and_no_more() -> None:
-    """Whoever has two hundred readers has as many pairs with two hundred writers of one topic."""
+def many(
+    number: int, count: int, make: Callable[..., DdsEndpoint], topic: str = "rt/chatter"
+) -> Participant:
+    ends = (make(EndpointQos(deadline=float(index)), topic) for index in range(count))
+    return make_participant(number, *ends)
 
-    def many(number: int, make: Callable[[EndpointQos], DdsEndpoint]) -> Participant:
-        ends = (make(EndpointQos(deadline=float(index))) for index in range(200))
-        return make_participant(number, *ends)
 
-    last = make_participant(3, writer(kind=LOG))
-    assert len(mismatched_pairs([last], [many(2, reader)])) == 1
-    pairs = mismatched_pairs([many(1, writer), last], [many(2, reader)])
-    assert [pair.writer.address for pair in pairs] == ["10.0.0.1"]
+HONEST = make_participant(3, writer(kind=LOG))
+LISTENER = make_participant(4, reader())
+FLOODS: dict[str, tuple[list[Participant], list[Participant]]] = {
+    "inside": ([many(1, 300, writer)], [many(2, 300, reader)]),
+    "outside": ([], [many(2, MOST_COMPARED + 100, reader)]),
+    "of other topics": (
+        [many(1, MOST_LOOKED_AT + 100, writer, "rt/other")],
+        [many(2, MOST_LOOKED_AT + 100, reader, "rt/other")],
+    ),
+}
+
+
+@pytest.mark.parametrize("where", FLOODS)
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_an_address_with_many_pairs_hides_no_other(where: str, is_turned: bool) -> None:
+    """One participant with thousands of readers or writers used up all comparisons."""
+    flooding_inside, flooding_outside = FLOODS[where]
+    inside = [*flooding_inside, HONEST]
+    outside = [*flooding_outside, LISTENER]
+    comparison = compare(outside, inside) if is_turned else compare(inside, outside)
+    assert (HONEST, LISTENER) in [(pair.writer, pair.reader) for pair in comparison.mismatched]
+    assert comparison.left_out > 0
+
+
+def test_so_many_are_compared_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A participant with 200 readers has 40,000 pairs with 200 writers of one topic."""
+    compared = list[tuple[DdsEndpoint, DdsEndpoint]]()
+    monkeypatch.setattr(matching, "mismatch", lambda *pair: compared.append(pair))
+    comparison = compare([many(1, 200, writer)], [many(2, 200, reader), many(5, 7, writer)])
+    assert len(compared) == MOST_COMPARED
+    assert comparison.left_out == 200 * 200 - MOST_COMPARED
+
+
+def test_readers_and_writers_that_are_not_looked_at_are_counted() -> None:
+    comparison = compare([many(1, MOST_LOOKED_AT + 5, writer)], [LISTENER])
+    assert comparison.left_out == 5
