@@ -18,11 +18,11 @@ from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED, stand_in_port
 from rosproxy.ros2.servers.domain_server import DomainServer
 from tests.integration.net import PATIENCE, until
+from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, reached_at, spdp
 
 PROXY, INSIDE, OUTSIDE = "127.0.7.1", "127.0.7.2", "127.0.7.9"
-DOMAIN = 30
-"""Its ports are below those that tests draw."""
+DOMAIN = own_domain()
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
 from rosproxy.ros2.servers.multicast_ear import Ear, EarSettings
 from tests.integration.net import PATIENCE, until
+from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp
 
 PROXY = "127.0.0.1"
@@ -33,8 +34,7 @@ INSIDE = "127.0.7.32"
 RELAY = "127.0.7.33"
 LAN = "127.0.7.34"
 LAPTOP = "127.0.7.35"
-DOMAIN = 29
-"""Its ports are below those that tests draw (`PortDraws`)."""
+DOMAIN = own_domain()
 ON_LAN = GROUP, 7400 + 250 * DOMAIN
 SECRET = "0123456789abcdef"
 

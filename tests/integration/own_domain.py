@@ -1,0 +1,29 @@
+"""A domain of DDS for the tests of one process.
+
+The ports of a domain follow from its number, and all programs of a machine hear the domain's group.
+So tests that run in two processes at once heard each other, or found a port taken.
+"""
+
+import socket
+
+from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST
+
+_DOMAINS = range(29, 0, -1)
+"""Their ports are below those that tests draw (`PortDraws`)."""
+_SIGN = 240
+"""A domain has 250 ports; no program of the tests uses this one."""
+_held = list[socket.socket]()
+
+
+def own_domain() -> int:
+    """Return the number of a domain that no other caller gets until this process ends."""
+    for domain in _DOMAINS:
+        sign = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            sign.bind(("127.0.0.1", SPDP_MULTICAST + PORTS_PER_DOMAIN * domain + _SIGN))
+        except OSError:
+            sign.close()
+            continue
+        _held.append(sign)
+        return domain
+    raise AssertionError("other processes use all domains that tests may have")
