@@ -7,6 +7,7 @@
 from collections.abc import Iterator
 
 import msgspec
+from msgspec.structs import replace
 
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
 from rosproxy.ros2.protocol.rtps import FAST_DDS
@@ -17,7 +18,8 @@ from rosproxy.telemetry.text import plural
 class DomainProblem(msgspec.Struct, frozen=True):
     """A cause: the ``check`` that found it, the participant or name it is about, and its cure.
 
-    ``grave``: it keeps participants apart for certain.
+    ``grave``: it keeps participants apart for certain. ``owner`` is the participant's address, and
+    of a pair the address inside.
     """
 
     check: str
@@ -25,6 +27,7 @@ class DomainProblem(msgspec.Struct, frozen=True):
     text: str
     fix: str
     grave: bool = True
+    owner: str = ""
 
 
 _FAST_DDS_NAME, _CYCLONE_DDS_NAME = VENDORS[FAST_DDS], VENDORS[b"\x01\x10"]
@@ -81,10 +84,8 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
             "qos", f"domain {domain.domain}", text, "first correct the pairs that are named"
         )
     if domain.not_compared:
-        text = (
-            f"{plural(domain.not_compared, 'pair')} of a reader and a writer are not compared: "
-            "there are too many"
-        )
+        # The number changes with each look, and the watch reports each change of a text.
+        text = "some pairs of a reader and a writer are not compared: there are too many"
         fix = (
             "`rosproxy status --json` lists the readers and writers of each address: end programs "
             "that have thousands; a domain of hundreds of nodes may have as many by itself"
@@ -97,9 +98,12 @@ def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, Do
     hindered = {p.guid_prefix for p, problem in _participant_problems(domain) if problem.grave}
     labels = {p.guid_prefix: participant_label(p, True) for p in domain.inside}
     labels |= {p.guid_prefix: participant_label(p, False) for p in domain.outside}
+    addresses = {p.guid_prefix: p.address for p in domain.inside}
     for pair in domain.mismatches:
         if not hindered & {pair.writer, pair.reader}:
-            yield pair, _mismatch(pair, labels.get(pair.writer, ""), labels.get(pair.reader, ""))
+            problem = _mismatch(pair, labels.get(pair.writer, ""), labels.get(pair.reader, ""))
+            owner = addresses.get(pair.writer, addresses.get(pair.reader, ""))
+            yield pair, replace(problem, owner=owner)
 
 
 def participant_label(participant: ParticipantStatus, is_inside: bool) -> str:
@@ -116,7 +120,7 @@ def _participant_problems(
         for participant in side:
             problem = next(_problems(participant, domain, side is domain.inside), None)
             if problem:
-                yield participant, problem
+                yield participant, replace(problem, owner=participant.address)
 
 
 def _problems(

@@ -6,6 +6,7 @@ whose readers and writers are not all known. When it is mended, the problem goes
 
 import logging
 
+from rosproxy.admin.status_bounds import fair_choice
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems
 from rosproxy.ros2.status import Ros2State
 from rosproxy.telemetry.problems import Problems
@@ -13,7 +14,7 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 MOST_NOTED = 20
-"""Problems noted at a time, so that nobody hides all others behind those of his own."""
+"""Problems that are noted at a time, with fair shares by address."""
 
 
 class DomainWatch:
@@ -31,7 +32,7 @@ class DomainWatch:
         lasting = sorted(problems & self._previous, key=lambda p: (not p.grave, p.subject))
         self._previous = problems
         current: dict[str, set[DomainProblem]] = {}
-        for problem in lasting[:MOST_NOTED]:
+        for problem in fair_choice(lasting, lambda p: p.owner, MOST_NOTED):
             current.setdefault(problem.subject, set()).add(problem)
         for subject in self._noted.keys() | current.keys():
             self._note(subject, self._noted.get(subject, set()), current.get(subject, set()))

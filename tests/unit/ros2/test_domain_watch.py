@@ -72,3 +72,16 @@ def test_so_many_are_told_and_no_more() -> None:
     for _ in range(2):
         look(watch, told, *crowd)
     assert len(problems.all()) == MOST_NOTED
+
+
+def test_an_address_with_many_problems_hides_no_other() -> None:
+    """The problems of one address, whose prefixes sorted first, were all that was noted."""
+    told, problems = Told(), Problems()
+    watch = DomainWatch(told, problems)
+    many = [replace(TCP, guid_prefix=f"01.0f.{number:02d}") for number in range(2 * MOST_NOTED)]
+    other = replace(TCP, guid_prefix="ff.0f", address="172.30.0.6")
+    for _ in range(2):
+        look(watch, told, *many, other)
+    noted = [problem.subject for problem in problems.all()]
+    assert "ff.0f" in noted
+    assert len(noted) == MOST_NOTED
