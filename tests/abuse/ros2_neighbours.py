@@ -23,6 +23,8 @@ WELL_KNOWN = 7410
 AGAIN = 0.1
 """Seconds after which an announcement is repeated that may be lost."""
 PATIENCE = 60.0
+SHORTEST_PAUSE = 0.005
+"""Seconds by which a flood is ahead of its rate before it waits."""
 PADDING = 200
 """Bytes by which an announcement is as long as a real one: no address is sent more than came."""
 
@@ -142,7 +144,7 @@ class Flood:
         self._datagrams = list(datagrams)
         self._is_forged = is_forged
         self._via = via
-        self._pause = 1 / per_second
+        self._per_second = per_second
         self._make_packet = make_packet
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -174,6 +176,7 @@ class Flood:
         raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
         raw.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._via))
         own = {} if self._is_forged else {source: udp(source) for source in sources}
+        began = monotonic()
         for source, to, datagram in itertools.cycle(self._datagrams):
             if self._ended.is_set():
                 break
@@ -182,8 +185,9 @@ class Flood:
             else:
                 own[source].sendto(datagram, to)
             self.sent += 1
-            if self._pause:
-                self._ended.wait(self._pause)
+            ahead = self.sent / self._per_second - (monotonic() - began)
+            if ahead > SHORTEST_PAUSE:
+                self._ended.wait(ahead)
         for sock in (raw, *own.values()):
             sock.close()
 

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
+from ipaddress import ip_network
 from subprocess import PIPE, Popen
 
 import pytest
@@ -13,7 +14,9 @@ import pytest
 from examples.demo.fake_http import free_ports
 from examples.demo.proxy_process import clean_environment
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_rates import cost
 from rosproxy.ros2.discovery.domain_settings import MOST_OUTSIDE_UNPROVEN, MOST_PER_UNPROVEN
+from rosproxy.ros2.discovery.lan_sources import UNPROVEN_BURST, UNPROVEN_PER_SECOND
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -21,7 +24,15 @@ from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.servers.groups import group_socket, join
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
-from tests.abuse.ros2_neighbours import WELL_KNOWN, Address, Counted, Flood, Participant, forge
+from tests.abuse.ros2_neighbours import (
+    PADDING,
+    WELL_KNOWN,
+    Address,
+    Counted,
+    Flood,
+    Participant,
+    forge,
+)
 from tests.integration.net import until
 from tests.unit.ros2.discovery.domains import SEDP_WRITERS, farewell, sedp, spdp
 from tests.unit.ros2.protocol.messages import (
@@ -43,6 +54,12 @@ MORE = 20_000_000
 """Bytes that a second flood may take more than the first."""
 PER_SECOND = 5000
 """Announcements that a forger sends to a LAN in a second."""
+RELAYED_PER_SECOND = 10_000
+"""Announcements that a forger sends in a second to a LAN with a relay."""
+HEARD = 40
+"""Announcements of an honest participant that the relay has to carry meanwhile."""
+FORGED_NETWORK = ip_network("198.19.0.0/18")
+"""Forged sources."""
 AMONG = 20_000
 """Datagrams of a flood in which everybody else is served."""
 ANNOUNCED = APART, WELL_KNOWN
@@ -358,3 +375,43 @@ async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot,
         served(good, robot, b"after")
         known = {p["guid_prefix"] for p in abused.status()["domains"][0]["outside"]}
         assert {LAPTOP.hex("."), ROBOT.hex(".")} <= known
+
+
+async def test_forged_sources_on_the_lan_take_no_more_than_their_share(abused, good, robot, ear):
+    """The relay handed the proxy all that it could read, and lost honest announcements."""
+    served(good, robot, b"before")
+    said = [
+        (str(source), GROUP, spdp(prefix(number), str(source), padding=PADDING))
+        for number, source in enumerate(FORGED_NETWORK)
+    ]
+    laptop = Participant(LAPTOP, STRANGERS[2], WELL_KNOWN)
+    newcomer = Participant(NEWCOMER, STRANGERS[3], WELL_KNOWN)
+    honest_count = 0
+
+    def all_announce() -> None:
+        nonlocal honest_count
+        honest_count += 2
+        good.announce(ANNOUNCED)
+        laptop.announce(GROUP)
+        newcomer.announce(GROUP)
+
+    def refused_count() -> float:
+        return abused.metric('rosproxy_ros2_dropped_datagrams_total{domain="0"}')
+
+    with closing(laptop), closing(newcomer), abused.watched():
+        laptop.proves_to_receive(all_announce)
+        before = refused_count()
+        began = time.monotonic()
+        with Flood(said, is_forged=True, via=STRANGERS[4], per_second=RELAYED_PER_SECOND) as flood:
+            flood.wait(AMONG)
+            for _ in range(HEARD):
+                good.hears(LAPTOP, all_announce)
+            newcomer.proves_to_receive(all_announce)
+            good.hears(NEWCOMER, all_announce)
+            served(good, robot, b"amid")
+            flood.wait(5 * AMONG)
+        served(good, robot, b"after")
+        units = UNPROVEN_BURST + UNPROVEN_PER_SECOND * (time.monotonic() - began)
+        most = units / cost(len(said[0][2]))
+        assert refused_count() - before <= most + 2 * honest_count
+    assert ear.poll() is None

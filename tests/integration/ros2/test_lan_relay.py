@@ -17,7 +17,10 @@ from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery import lan_sources
+from rosproxy.ros2.discovery.discovery_rates import Standing
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
+from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
@@ -37,6 +40,9 @@ LAPTOP = "127.0.7.35"
 DOMAIN = own_domain()
 ON_LAN = GROUP, 7400 + 250 * DOMAIN
 SECRET = "0123456789abcdef"
+FORGED = 50
+SHARED = 10
+"""Forged sources, and how many datagrams of unproven sources the relay may read."""
 
 
 class Boundary:
@@ -202,10 +208,10 @@ async def test_refused_datagrams_cost_the_proxy_none_of_its_allowance(boundary: 
     with closing(bind(PROXY, 0)) as process:
         process.sendto(spdp(B, PROXY), target)
         await until(lambda: relay.dropped == 1, "the datagram is refused")
-        assert not relay._rates._by_source
+        assert not relay._proxy_rates._by_source
         process.sendto(good.sealed(Direction.TO_LAN, spdp(A, PROXY)), target)
         await until(lambda: relay.to_lan == 1, "the proxy is announced")
-    assert PROXY in relay._rates._by_source
+    assert PROXY in relay._proxy_rates._by_source
 
 
 async def test_secrets_that_differ_are_told(
@@ -228,3 +234,48 @@ async def test_secrets_that_differ_are_told(
         await until(proxy_refuses, "the proxy refuses what the relay carries")
         await until(relay_refuses, "the relay refuses what the proxy announces")
     assert "give the proxy and its LAN relay one secret" in caplog.text
+
+
+async def test_unproven_sources_share_one_allowance(
+    boundary: Boundary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each forged source had an allowance of its own, and the proxy got all announcements."""
+    monkeypatch.setattr(lan_sources, "UNPROVEN_PER_SECOND", 0.0)
+    monkeypatch.setattr(lan_sources, "UNPROVEN_BURST", float(SHARED))
+    relay = boundary.start_relay()
+    for number in range(FORGED):
+        announce(f"127.0.8.{number + 1}", bytes([number]) * 12)
+    await until(lambda: relay.from_lan + relay.dropped == FORGED, "the relay has read them all")
+    assert relay.from_lan == SHARED
+    (listed,) = address_lists([LAPTOP])
+    sealed = RelayProof(SECRET, time.time).sealed(Direction.TO_LAN, listed)
+    with closing(bind(PROXY, 0)) as process:
+        process.sendto(sealed, (boundary.bind.host, boundary.bind.port))
+
+    def is_carried() -> bool:
+        announce(LAPTOP, B)
+        return relay.from_lan > SHARED
+
+    await until(is_carried, "the relay carries what a proven address announces")
+
+
+def announce(address: str, prefix: bytes) -> None:
+    """Have a participant at an address announce itself to the LAN."""
+    with closing(bind(address, 0)) as sock:
+        send_through(sock, address, loop=True)
+        sock.sendto(spdp(prefix, address), ON_LAN)
+
+
+async def test_the_relay_is_told_which_addresses_are_proven(boundary: Boundary) -> None:
+    server = boundary.start_proxy()
+    relay = boundary.start_relay()
+    proofs = server.domain.proofs
+    for address in (INSIDE, LAPTOP):
+        proofs._until[address] = float("inf")
+    await server.observe()
+
+    def standing(address: str) -> Standing:
+        return relay._sources.standing(address, asyncio.get_running_loop().time())
+
+    await until(lambda: standing(LAPTOP) is Standing.PROVEN, "the relay knows the laptop")
+    assert standing(INSIDE) is Standing.OUTSIDE

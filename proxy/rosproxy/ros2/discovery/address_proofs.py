@@ -42,6 +42,11 @@ class AddressProofs:
         """Whether an address has proved to receive."""
         return address in self._until
 
+    @property
+    def addresses(self) -> list[str]:
+        """The addresses that have proved to receive."""
+        return list(self._until)
+
     def question(self, address: str, prefix: bytes, reached_at: Iterable[HostPort]) -> bytes:
         """The datagram that asks a participant at an address.
 

@@ -54,30 +54,36 @@ class _Allowance:
 class DiscoveryRates:
     """The allowance of each source, and one for all unproven sources of a side together.
 
-    A forger has as many sources as it likes; they share one allowance.
+    A forger has as many sources as it likes; they share one allowance. ``unproven_per_second`` and
+    ``unproven_burst`` are that one.
     """
 
     per_second: float = PER_SECOND
     burst: float = BURST
+    unproven_per_second: float = PER_SECOND
+    unproven_burst: float = BURST
     _by_source: dict[str, _Allowance] = field(default_factory=dict)
     _of_unproven: dict[Standing, _Allowance] = field(init=False)
 
     def __post_init__(self) -> None:
         """Nothing has been used yet."""
         sides = (Standing.INSIDE, Standing.OUTSIDE)
-        self._of_unproven = {side: _Allowance(self.burst, 0.0) for side in sides}
+        self._of_unproven = {side: _Allowance(self.unproven_burst, 0.0) for side in sides}
 
     def take(
         self, source: str, size: int, now: float, standing: Standing = Standing.PROVEN
     ) -> bool:
         """Charge a source for a datagram of so many bytes. Return False if it may not be read."""
-        allowances = [self._allowance(source, now)]
-        if standing in self._of_unproven:
-            allowances.append(self._of_unproven[standing])
-        if any(a.refill(self.per_second, self.burst, now) < 1.0 for a in allowances):
+        shared = self._of_unproven.get(standing)
+        # First: a forged source costs no place among those that are remembered.
+        if shared and shared.refill(self.unproven_per_second, self.unproven_burst, now) < 1.0:
             return False
-        for allowance in allowances:
-            allowance.remaining -= cost(size)
+        own = self._allowance(source, now)
+        if own.refill(self.per_second, self.burst, now) < 1.0:
+            return False
+        own.remaining -= cost(size)
+        if shared:
+            shared.remaining -= cost(size)
         return True
 
     def charge(self, source: str, total: int, standing: Standing = Standing.PROVEN) -> None:

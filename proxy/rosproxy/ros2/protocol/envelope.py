@@ -2,25 +2,54 @@
 
 16 bytes before the datagram: the address, IPv4 as IPv4-in-IPv6. The proxy uses a participant
 outside only at the address that it sends from, which is lost when the ear passes a datagram on.
+
+The other way, the proxy tells the relay which addresses have proved to receive: `LIST_MAGIC`, and
+16 bytes for each address. An announcement begins with the letters RTPS.
 """
 
+from collections.abc import Iterable, Iterator
 from ipaddress import IPv6Address, ip_address
 
 from rosproxy.net.addresses import plain_address
 from rosproxy.ros2.protocol.rtps import RtpsError
 
+LIST_MAGIC = b"ADDR"
+MOST_LISTED = 256
+"""Addresses in a list; the datagram has 4 KiB."""
 _SIZE = 16
 
 
 def wrapped(source: str, datagram: bytes) -> bytes:
     """A datagram with the address that it came from. Raises ValueError if ``source`` is none."""
-    address = ip_address(source)
-    packed = IPv6Address(f"::ffff:{address}").packed if address.version == 4 else address.packed
-    return packed + datagram
+    return _packed(source) + datagram
 
 
 def unwrapped(data: bytes) -> tuple[str, bytes]:
     """The address and the datagram. Raises RtpsError if it is too short."""
     if len(data) < _SIZE:
         raise RtpsError("shorter than an address")
-    return plain_address(str(IPv6Address(data[:_SIZE]))), data[_SIZE:]
+    return _unpacked(data[:_SIZE]), data[_SIZE:]
+
+
+def address_lists(addresses: Iterable[str]) -> Iterator[bytes]:
+    """Yield lists of addresses, each for one datagram. Raises ValueError if one is no address."""
+    packed = list(map(_packed, addresses))
+    for start in range(0, len(packed), MOST_LISTED):
+        yield LIST_MAGIC + b"".join(packed[start : start + MOST_LISTED])
+
+
+def listed_addresses(content: bytes) -> list[str] | None:
+    """Return the addresses of a list; None if the content is no list."""
+    if not content.startswith(LIST_MAGIC):
+        return None
+    starts = range(len(LIST_MAGIC), len(content) - _SIZE + 1, _SIZE)
+    return [_unpacked(content[start : start + _SIZE]) for start in starts]
+
+
+def _packed(text: str) -> bytes:
+    address = ip_address(text)
+    return IPv6Address(f"::ffff:{address}").packed if address.version == 4 else address.packed
+
+
+def _unpacked(packed: bytes) -> str:
+    return plain_address(str(IPv6Address(packed)))

@@ -32,6 +32,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     DomainSettings,
     Outgoing,
 )
+from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, by_source
 from rosproxy.ros2.registry.selected import SelectedAddresses
@@ -183,6 +184,7 @@ class DomainServer:
         self._ask(self._selected.selected or ())
         self._send(self.domain.own.announced_outside())
         self._send(self.domain.own.port_reminders())
+        self._tell_relay()
 
     def close(self) -> None:
         """Close all sockets."""
@@ -197,6 +199,13 @@ class DomainServer:
             self._stop_reading(sock)
         for sock in self._out.values():
             sock.close()
+
+    def _tell_relay(self) -> None:
+        """Tell the LAN relay which addresses have proved to receive."""
+        proven = self.domain.proofs.addresses
+        outside = [address for address in proven if not self._is_inside(address)]
+        for listed in address_lists(outside):
+            self._send(self.domain.settings.to_lan(listed))
 
     def _release(self) -> None:
         """Take in what participants have announced that are let in now."""

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from rosproxy.forwarding.datagrams import RECEIVE_BUFFER
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import interface_index
 
@@ -161,6 +162,7 @@ def group_socket(group: HostPort, link_of: str = "") -> socket.socket:
     try:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         if sock.family == socket.AF_INET:
             with contextlib.suppress(OSError):  # else it hears more than it has to
                 sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)

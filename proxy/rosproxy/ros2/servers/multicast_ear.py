@@ -16,6 +16,7 @@ import logging
 import socket
 import time
 from dataclasses import dataclass, field
+from functools import partial
 
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
@@ -24,18 +25,18 @@ from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
+    Outgoing,
 )
-from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.discovery.lan_sources import BURST, PER_SECOND, LanSources
+from rosproxy.ros2.protocol.envelope import listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
 from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
 
 log = logging.getLogger(__name__)
 
-PER_SECOND, BURST = 500.0, 2000.0
-"""Datagrams of one source that are read in a second, and at once, each of 256 bytes; a participant
-makes one in three seconds, the proxy those of all inside."""
 QUIET_S = 60.0
 """Seconds after which a refused proof is logged again."""
 
@@ -64,7 +65,10 @@ class Ear:
         self._sockets: list[socket.socket] = []
         self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
         self._groups = GroupEars(self._port, self._begin, self._end)
-        self._rates = DiscoveryRates(PER_SECOND, BURST)
+        self._sources = LanSources()
+        # A machine on the LAN may forge the proxy's address, but not its proof.
+        self._proxy_rates = DiscoveryRates(PER_SECOND, BURST)
+        self._reader = DiscoveryReader()
         self._warned_at = -QUIET_S
         self.from_lan = self.to_lan = self.dropped = 0
 
@@ -80,10 +84,11 @@ class Ear:
         if not self._groups.join([settings.lan]):
             text = f"can't join the multicast group on the network of the address {settings.lan}"
             raise OSError(errno.EADDRNOTAVAIL, text)
-        self._loop.add_reader(self._own, self._tell)
+        self._loop.add_reader(self._own, self._take_in)
 
     def close(self) -> None:
         """End."""
+        self._reader.close()
         self._groups.close()
         for sock in self._sockets:
             self._end(sock)
@@ -96,21 +101,34 @@ class Ear:
         sock.close()
 
     def _hear(self, lan: socket.socket) -> None:
-        """Tell the proxy what the LAN announces."""
+        """Receive what the LAN announces, which is read later, in an order fair to its sources."""
+        now = self._loop.time()
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
                 datagram, sender = lan.recvfrom(LARGEST_DATAGRAM)
                 source = plain_address(sender[0])
-                # What `_tell` has sent comes back here, by loop: the proxy leaves that out.
-                for announcement in self._announcements(datagram, source):
-                    self.from_lan += 1
-                    carried = wrapped(source, announcement)
-                    sealed = self._proof.sealed(Direction.TO_PROXY, carried)
-                    # The proxy takes a proof from the address of this socket alone.
-                    self._send(self._own, sealed, self._settings.proxy)
+                size = len(datagram)
+                read = partial(self._tell_proxy, datagram, source)
+                is_read = self._sources.take(source, size, now) and self._reader.put(
+                    source, self._sources.standing(source, now), size, read
+                )
+                self.dropped += not is_read
 
-    def _tell(self) -> None:
-        """Tell the LAN what the proxy announces."""
+    def _tell_proxy(self, datagram: bytes, source: str) -> list[Outgoing]:
+        """Tell the proxy what a source on the LAN announces, and return what was sent."""
+        # What `_tell_lan` has sent comes back here, by loop: the proxy leaves that out.
+        announcements = self._announcements(datagram)
+        self.from_lan += len(announcements)
+        carried = [wrapped(source, announcement) for announcement in announcements]
+        sealed = [self._proof.sealed(Direction.TO_PROXY, content) for content in carried]
+        sent = [Outgoing(self._settings.proxy, proven) for proven in sealed]
+        for out in sent:
+            # The proxy takes a proof from the address of this socket alone.
+            self._send(self._own, out)
+        return sent
+
+    def _take_in(self) -> None:
+        """Take in what the proxy sends: announcements, and which addresses are proven."""
         with contextlib.suppress(BlockingIOError):
             for _ in range(DATAGRAMS_PER_TURN):
                 try:
@@ -121,11 +139,19 @@ class Ear:
                 content = self._proven(datagram, source)
                 if content is None:
                     self.dropped += 1
-                    continue
-                for announcement in self._announcements(content, source):
-                    self.to_lan += 1
-                    for group in groups_of(self._settings.lan):
-                        self._send(self._lan, announcement, HostPort(group, self._port))
+                elif (addresses := listed_addresses(content)) is not None:
+                    self._sources.note_proven(addresses, self._loop.time())
+                elif self._proxy_rates.take(source, len(content), self._loop.time()):
+                    self._tell_lan(content)
+                else:
+                    self.dropped += 1
+
+    def _tell_lan(self, content: bytes) -> None:
+        """Tell the LAN what the proxy announces."""
+        for announcement in self._announcements(content):
+            self.to_lan += 1
+            for group in groups_of(self._settings.lan):
+                self._send(self._lan, Outgoing(HostPort(group, self._port), announcement))
 
     def _proven(self, datagram: bytes, source: str) -> bytes | None:
         """The content of a datagram of the proxy; None if the datagram is another program's."""
@@ -140,21 +166,20 @@ class Ear:
                 log.warning("refused: a datagram from %s, the proxy's address: %s", source, error)
             return None
 
-    def _announcements(self, datagram: bytes, source: str) -> list[bytes]:
-        """The announcements of participants in a datagram; none if its source sends too many.
+    def _announcements(self, datagram: bytes) -> list[bytes]:
+        """The announcements of participants in a datagram.
 
         Several participants of a program may share a datagram.
         """
         announcements = list[bytes]()
-        if self._rates.take(source, len(datagram), self._loop.time()):
-            with contextlib.suppress(RtpsError):
-                messages = map(read_discovery, by_source(datagram))
-                announcements = [m.datagram for m in messages if m.of_participant is not None]
+        with contextlib.suppress(RtpsError):
+            messages = map(read_discovery, by_source(datagram))
+            announcements = [m.datagram for m in messages if m.of_participant is not None]
         self.dropped += not announcements
         return announcements
 
-    def _send(self, sock: socket.socket, data: bytes, target: HostPort) -> None:
+    def _send(self, sock: socket.socket, out: Outgoing) -> None:
         try:
-            sock.sendto(data, (target.host, target.port))
+            sock.sendto(out.datagram, (out.target.host, out.target.port))
         except OSError as error:
-            log.debug("can't send an announcement to %s: %s", target, error)
+            log.debug("can't send an announcement to %s: %s", out.target, error)
