@@ -34,6 +34,7 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
+from rosproxy.ros2.discovery.port_keeper import keeper_key
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import DomainWatch
 from rosproxy.ros2.protocol.relay_proof import RelayProof
@@ -106,7 +107,10 @@ class Ros2:
 
     def _start_servers(self) -> None:
         """Serve all domains. Raises SettingError."""
-        settings, taken = self._settings, list[int]()
+        settings = self._settings
+        taken = list[int]()
+        # Each process of the proxy is given the same secret, and containers know neither.
+        key = keeper_key(settings.token_hash or settings.ros2_ear_secret)
         for number, ports in zip(settings.domains, self._domain_ports(), strict=True):
             domain_settings = DomainSettings(
                 number=number,
@@ -118,6 +122,7 @@ class Ros2:
                 is_inside=self._is_inside,
                 both_ways=settings.direction == "both",
                 relay=_relay(settings),
+                keeper_key=key,
             )
             server = DomainServer(
                 domain_settings,

@@ -15,7 +15,8 @@ Every datagram may be forged. So
 
 - a participant inside is one whose address is inside, and only locators at that very address get a
   lease: no announcement makes the proxy a way to another host;
-- the prefix of a participant that is there can't be taken at another address or on the other side;
+- the prefix of a participant that is there can't be taken at another address or on the other side
+  (`PrefixOwners`);
 - a participant outside is one whose address is a peer's, or that the LAN relay has heard from
   there, and the proxy itself sends to its locators at that very address alone;
 - the LAN relay is known by the proof of a shared secret, and the address that it claims for a
@@ -41,7 +42,6 @@ from rosproxy.ros2.protocol.addressing import (
     for_all,
     may_be_discovery,
 )
-from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
 from rosproxy.ros2.protocol.envelope import unwrapped
 from rosproxy.ros2.protocol.relay_proof import Direction
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
@@ -53,6 +53,7 @@ from rosproxy.ros2.protocol.rtps import (
     source_prefix,
     source_vendor,
 )
+from rosproxy.ros2.registry.locator_ports import NamedBy
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
@@ -225,9 +226,8 @@ class Domain(DomainParticipants):
         """Admit those that waited until it was known who had which port; and have others meet."""
         sent = self.returning.repeated_questions(now)
         for source, message in self.returning.ready(now):
-            if message.prefix not in self.outside.by_prefix:
-                admit = partial(self._announced_inside, message, source, now)
-                sent += self._unless_malformed(source, admit)
+            admit = partial(self._admitted_inside, message, source, now)
+            sent += self._unless_malformed(source, admit)
         for insider in list(self.inside.by_prefix.values()):
             proceed = partial(self.rediscovery.proceed, insider, now)
             sent += self._unless_malformed(insider.address, proceed)
@@ -279,7 +279,7 @@ class Domain(DomainParticipants):
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         prefix, spdp = message.prefix, message.of_participant
-        if prefix in self.outside.by_prefix or source_vendor(message.datagram) == NO_VENDOR:
+        if source_vendor(message.datagram) == NO_VENDOR:
             return []  # a proxy's own participants are not passed on
         if self.proofs.note(source, message.datagram, now):
             return [out for insider in self.inside.prove() for out in self._end_for(insider)]
@@ -290,12 +290,27 @@ class Domain(DomainParticipants):
         is_new = prefix not in self.inside.by_prefix
         if is_new and (self.ports.may_have_returning(now) or self.inside.lacks_proof(source)):
             return self._wait(message, source, now)
-        return self._announced_inside(message, source, now)
+        return self._admitted_inside(message, source, now)
+
+    def _admitted_inside(
+        self, message: DiscoveryMessage, source: str, now: float
+    ) -> list[Outgoing]:
+        """Let in a participant inside, unless its prefix is that of a participant outside."""
+        if not self.owners.yields_to_inside(message.prefix, source):
+            outsider = self.outside.by_prefix[message.prefix]
+            text = f"GUID prefix {outsider.guid_prefix} belongs to a participant outside, at "
+            return self._drop("prefix", source, text + outsider.address)
+        sent = self._give_prefix_to_inside(message.prefix, source)
+        return sent + self._announced_inside(message, source, now)
 
     def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Have a participant inside wait until it has answered the proxy."""
         sent = self.returning.wait(message, source, now)
-        return sent + self._question_to_inside(message, source) if sent else []
+        if not sent:
+            return []
+        if self.owners.yields_to_inside(message.prefix, source):
+            sent += self._give_prefix_to_inside(message.prefix, source)
+        return sent + self._question_to_inside(message, source)
 
     def _question_to_inside(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
         """What asks a participant inside that announces itself to prove that it receives."""
@@ -311,15 +326,31 @@ class Domain(DomainParticipants):
         received: int,
         now: float,
     ) -> list[Outgoing]:
-        if message.prefix in self.inside.by_prefix or message.prefix == self.own.observer.prefix:
-            return []  # the LAN relay hears what it has sent to the LAN itself
+        if message.prefix == self.own.observer.prefix:
+            return []
         if message.of_participant is None:
             return self._told_outside(message, source, received, now)
         if not by_relay and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
             return self._drop("not_a_peer", source, "an announcement; the address is no peer's")
+        if self.owners.is_inside(message.prefix):
+            return self._claimed_by_outside(message, source, received, now)
         return self._announced_outside(message, source, received, now)
+
+    def _claimed_by_outside(
+        self, message: DiscoveryMessage, source: str, received: int, now: float
+    ) -> list[Outgoing]:
+        """Take in an announcement from outside with a prefix that inside uses. Raises RtpsError."""
+        claimant = self.outside.claimant(message, source, received, now)
+        if claimant is None:
+            return []  # the LAN relay hears what it has sent to the LAN itself, or an end
+        if self.owners.yields_to_outside(message.prefix, source, now):
+            self._give_prefix_to_outside(message.prefix, source)
+            return self._announced_outside(message, source, received, now)
+        text = f"GUID prefix {claimant.guid_prefix} belongs to a participant inside"
+        self.refused("prefix", source, text)
+        return self.own.question_to_outside(claimant)
 
     def _told_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
@@ -328,7 +359,8 @@ class Domain(DomainParticipants):
         sent = list[Outgoing]()
         if self.proofs.note(source, message.datagram, now):
             told, ended = self.outside.prove(source)
-            sent += [out for outsider in ended for out in self._end_outside(outsider)]
+            inside = self.inside.by_prefix.values()
+            sent += [out for outsider in ended for out in self._end_outside(outsider, inside)]
             sent += self.outside.introduced(told, self.inside.by_prefix.values(), now)
         return sent + self.own.told_outside(message, source, received)
 
@@ -359,14 +391,7 @@ class Domain(DomainParticipants):
         if spdp is None or spdp.ended or message.prefix in self.outside.by_prefix:
             return []
         outsider = self.outside.gives_place(source)
-        return self._end_outside(outsider) if outsider else []
-
-    def _end_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
-        """Forget a participant outside, and tell inside that it has ended."""
-        ended = farewell(outsider.prefix, outsider.vendor, LAST_SEQUENCE)
-        insiders = self.inside.by_prefix.values() if outsider.is_introduced else ()
-        self._forget_outside(outsider)
-        return [sent for insider in insiders for sent in sent_to(insider.metatraffic, [ended])]
+        return self._end_outside(outsider, self.inside.by_prefix.values()) if outsider else []
 
     def _announced_inside(
         self, message: DiscoveryMessage, source: str, now: float
@@ -383,11 +408,15 @@ class Domain(DomainParticipants):
         insider = self.inside.meet(message, source, now)
         if insider is None:
             return sent
+        if is_new:
+            insider.was_inside = self.returning.was_inside(prefix, source)
+            holders = self.ports.displaced_by(prefix, now)
+            sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
         lease_count = len(insider.leases)
         exported = self.inside.exported(insider, message, now, self.returning.former_ports(prefix))
         sent += self.inside.introduced(insider, message)
         # It knew the proxy elsewhere: it forgets the keeper there, and meets all outside anew.
-        if is_new and prefix in self.returning.former:
+        if is_new and self.returning.must_meet_anew(prefix):
             sent += self.own.keeper_farewell(insider)
             insider.parting_from = now
         else:
@@ -535,7 +564,15 @@ class Domain(DomainParticipants):
             return
         if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
             return
-        self.ports.note_use(port, datagram, self.settings.is_peer(source), now)
+        self.ports.note_use(port, datagram, self._named_by(source), now)
+
+    def _named_by(self, source: str) -> NamedBy:
+        """How much it counts that an address outside names a participant."""
+        if self.settings.is_peer(source):
+            return NamedBy.PEER
+        # A participant inside proves its address, too, and sends to ports of the range.
+        is_proven = self.proofs.has(source) and not self.settings.is_inside(source)
+        return NamedBy.PROVEN if is_proven else NamedBy.OTHERS
 
     def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
         """Charge a source with the datagrams that its own have led to."""

@@ -5,20 +5,22 @@ decided in `rosproxy.ros2.discovery.domain`.
 """
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Self
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
+from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.own_participants import OwnParticipants
 from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
@@ -43,6 +45,7 @@ class DomainParticipants:
     fragments: FragmentStores
     rediscovery: Rediscovery
     proofs: AddressProofs
+    owners: PrefixOwners
     rates: DiscoveryRates = field(default_factory=DiscoveryRates)
     passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
 
@@ -63,7 +66,9 @@ class DomainParticipants:
         pool.claim(settings.discovery_port)  # where outside announces itself: nobody gets it
         ports, refused = LocatorPorts(pool, now), Refused(settings.note)
         proofs = AddressProofs(secret)
-        keeper = Keeper.of(settings.host, settings.ports.listen, settings.number, when)
+        keeper = Keeper.of(
+            settings.host, settings.ports.listen, settings.number, when, settings.keeper_key
+        )
         inside = InsideParticipants(settings, ports, refused, proofs)
         outside = OutsideParticipants(settings, refused, proofs)
         returning = ReturningParticipants(settings, ports, keeper, proofs)
@@ -82,6 +87,7 @@ class DomainParticipants:
             fragments,
             Rediscovery(settings, outside),
             proofs,
+            PrefixOwners(settings, inside, outside, returning, proofs),
         )
 
     def is_kept(self, participant: InsideParticipant) -> bool:
@@ -112,6 +118,55 @@ class DomainParticipants:
         self._forget_inside(insider)
         return self.settings.to_outside(farewell(insider.prefix, insider.vendor, LAST_SEQUENCE))
 
+    def _end_outside(
+        self, outsider: OutsideParticipant, inside: Iterable[InsideParticipant]
+    ) -> list[Outgoing]:
+        """Forget a participant outside, and tell some inside that it has ended."""
+        ended = farewell(outsider.prefix, outsider.vendor, LAST_SEQUENCE)
+        told = list(inside) if outsider.is_introduced else []
+        self._forget_outside(outsider)
+        return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
+
+    def _give_prefix_to_inside(self, prefix: bytes, source: str) -> list[Outgoing]:
+        """Forget the participant outside, if any, whose prefix is that of one at an address inside.
+
+        Only participants on other networks are told of the end: those on its own know the rightful
+        one, and would forget it.
+        """
+        outsider = self.outside.by_prefix.get(prefix)
+        if outsider is None:
+            return []
+        text = f"GUID prefix {outsider.guid_prefix} belongs to a participant inside, at {source}"
+        self.refused("prefix", outsider.address, text)
+        near = self.settings.proxy_address_for(source)
+        elsewhere = [p for p in self.inside.by_prefix.values() if p.proxy_address != near]
+        return self._end_outside(outsider, elsewhere)
+
+    def _give_prefix_to_outside(self, prefix: bytes, source: str) -> None:
+        """Forget the participant inside, if any, whose prefix is that of one at an address outside.
+
+        Outside is told of no end: it knows the rightful one, and would forget it.
+        """
+        insider = self.inside.by_prefix.get(prefix)
+        if insider is not None:
+            text = (
+                f"GUID prefix {insider.guid_prefix} belongs to a participant outside, at {source}"
+            )
+            self.refused("prefix", insider.address, text)
+            self._forget_inside(insider)
+
+    def _give_up_ports(self, insider: InsideParticipant) -> list[Outgoing]:
+        """End a participant inside for the ports that are another one's; what outside is told.
+
+        It is let in again with its next announcement, and gets other ports.
+        """
+        text = f"{insider.guid_prefix} gives back a port that another participant has claimed"
+        self.refused("port_claim", insider.address, text)
+        number = next_number(insider.announcement) if insider.announcement else LAST_SEQUENCE
+        self._forget_inside(insider)
+        self.returning.displace(insider.prefix)
+        return self.settings.to_outside(farewell(insider.prefix, insider.vendor, number))
+
     def _forget_inside(self, insider: InsideParticipant) -> None:
         self.inside.forget(insider)
         self.own.forget(insider.prefix)
@@ -120,7 +175,8 @@ class DomainParticipants:
     def _forget_outside(self, outsider: OutsideParticipant) -> None:
         self.rediscovery.forget(self.inside.by_prefix.values(), outsider.prefix)
         self.outside.forget(outsider)
-        self.own.forget(outsider.prefix)
+        # What is known of ports belongs to a participant inside, which may have the same prefix.
+        self.own.observer.forget(outsider.prefix)
         self.fragments.forget(outsider.prefix)
 
     def _drop(self, reason: str, source: str, text: str) -> list[Outgoing]:

@@ -1,7 +1,7 @@
 """The settings of a domain, and which ports DDS gives it."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 
@@ -86,6 +86,7 @@ class DomainSettings:
     ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
     ``is_inside`` tells whether an address lies in an inside network.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
+    ``keeper_key`` proves which ports participants had (`port_keeper.keeper_key`).
     """
 
     number: int
@@ -98,6 +99,7 @@ class DomainSettings:
     both_ways: bool = False
     peers: tuple[HostPort, ...] = ()
     relay: LanRelay | None = None
+    keeper_key: bytes = field(default=b"", repr=False)
 
     @property
     def host(self) -> str:

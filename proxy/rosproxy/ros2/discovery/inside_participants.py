@@ -235,6 +235,13 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         in_range = locator.port in self.settings.ports.listen
         return in_range and locator.host == self.settings.proxy_address_for(locator.host)
 
+    def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
+        """Have a participant meet all outside anew, which knows it by a port that it lost."""
+        participant.parting_from = now
+        text = f"{participant.guid_prefix} claims port {former_port}, on which another participant "
+        text += "has as good a claim; it gets another port, and outside meets it anew"
+        self.refused("port_claim", participant.address, text)
+
     def _has_its_share(self, address: str) -> bool:
         """Whether those at an address have as many ports as they may together.
 
@@ -273,6 +280,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             text = f"no port of {ports} is free for {locator}"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
+        if former_port not in (None, port) and self.ports.may_have_returning(now):
+            self._lose(participant, former_port, now)
         lease = participant.leases[locator] = Lease(port, locator, kind)
         self.leases[port] = participant, lease
         self._mark_read(participant.address)

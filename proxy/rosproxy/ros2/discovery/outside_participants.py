@@ -108,6 +108,28 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             participant.traits = traits(spdp, datagram, source)
         return participant
 
+    def claimant(
+        self, message: DiscoveryMessage, source: str, received: int, now: float
+    ) -> OutsideParticipant | None:
+        """A participant that announces itself with a prefix that inside uses, which is not added.
+
+        There is none if the message is an end, or leads to the proxy itself, as one that the LAN
+        relay hears of its own. ``received`` is how many bytes came. Raises RtpsError.
+        """
+        require_rewritable(message)
+        spdp = message.of_participant
+        if spdp is None or spdp.ended:
+            return None
+        metatraffic = first_metatraffic(spdp, message.datagram, source)
+        if metatraffic is None or self._is_own_port(metatraffic):
+            return None
+        claimant = OutsideParticipant(
+            message.prefix, source, source_vendor(message.datagram), now, metatraffic=metatraffic
+        )
+        claimant.proven = self.proofs.has(source)
+        claimant.credit = received
+        return claimant
+
     def imported(
         self, outsider: OutsideParticipant, insider: InsideParticipant, message: DiscoveryMessage
     ) -> bytes:

@@ -17,7 +17,6 @@ from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.port_keeper import Keeper
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
-from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 
@@ -72,8 +71,7 @@ class OwnParticipants:
 
     def keeper_farewell(self, participant: InsideParticipant) -> list[Outgoing]:
         """What makes a participant forget the keeper, which it knows at a former address."""
-        self.keeper.forget(participant.prefix)  # it is to keep its ports anew
-        return sent_to(participant.metatraffic, [farewell(self.keeper.prefix)])
+        return sent_to(participant.metatraffic, self.keeper.farewells(participant.prefix))
 
     def port_reminders(self) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
@@ -86,7 +84,7 @@ class OwnParticipants:
         insider = self.inside.find(prefix, source)
         # One that waits to be let in is in no table yet, and its answer is what it waits for.
         is_waiting = self.returning.is_waiting(prefix, source)
-        if (is_waiting or insider) and self.keeper.take(prefix, message.datagram):
+        if (is_waiting or insider) and self.returning.take_answer(prefix, source, message.datagram):
             return []
         if insider is None:
             return []

@@ -33,8 +33,9 @@ class ReturningParticipants:
 
     At one address as many may wait as there may be participants. ``former`` are the ports of those
     that knew the proxy at another address, or with another range, by prefix, until they have gone.
+    ``displaced`` are those that had to give back a port since the start.
     Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp,
-    PDPSimple::updateInfoMatchesEDP): these must meet everybody anew, and don't answer the keeper.
+    PDPSimple::updateInfoMatchesEDP): both must meet all outside anew.
     """
 
     settings: DomainSettings
@@ -43,6 +44,7 @@ class ReturningParticipants:
     proofs: AddressProofs
     waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
     former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
+    displaced: set[bytes] = field(default_factory=set)
     _counts: Counter[str] = field(default_factory=Counter)
 
     def is_waiting(self, prefix: bytes, source: str) -> bool:
@@ -107,15 +109,50 @@ class ReturningParticipants:
             in_range = all(port in self.ports.pool.range for port in ports)
             if ports and prefix not in present and len(self.former) < MOST_WAITING:
                 self.former[prefix] = tuple(ports) if in_range else ()
+                self.ports.note_claims(prefix, self.former[prefix], len(ports))
 
     def former_ports(self, prefix: bytes) -> Sequence[int]:
         """The ports that a participant had before the start, in the order of its locators."""
         return self.former.get(prefix) or self.keeper.former_ports(prefix)
 
+    def take_answer(self, prefix: bytes, source: str, datagram: bytes) -> bool:
+        """Note what a participant tells the keeper; return whether it does. Raises RtpsError.
+
+        What it tells once it has its ports follows from these, and is no claim.
+        """
+        if not self.keeper.take(prefix, source, datagram):
+            return False
+        if self.is_waiting(prefix, source) and prefix not in self.former:
+            proven_count = self.keeper.proven_count(prefix, source)
+            self.ports.note_claims(prefix, self.keeper.former_ports(prefix), proven_count)
+        return True
+
+    def was_inside(self, prefix: bytes, source: str) -> bool:
+        """Whether a former process served a participant inside, as more than its word says.
+
+        The kernel's table tells nothing of it: this has addresses, and no prefixes.
+        """
+        return (
+            prefix in self.former
+            or self.keeper.proven_count(prefix, source) > 0
+            or self.ports.is_named(prefix)
+        )
+
+    def must_meet_anew(self, prefix: bytes) -> bool:
+        """Whether outside knows a participant that comes by other ports than it gets."""
+        return prefix in self.former or prefix in self.displaced
+
+    def displace(self, prefix: bytes) -> None:
+        """Note that a participant has lost a port, and with it all that is known of it."""
+        if len(self.displaced) < MOST_WAITING:
+            self.displaced.add(prefix)
+
     def forget_participant(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
         self.former.pop(prefix, None)
+        self.displaced.discard(prefix)
         self.keeper.forget(prefix)
+        self.ports.forget_claims(prefix)
 
     def reminders(self, participant: InsideParticipant) -> list[Outgoing]:
         """What makes a participant keep the ports that it has now."""
@@ -132,8 +169,8 @@ class ReturningParticipants:
 
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
         return (
-            prefix in self.former
-            or prefix in self.keeper.number_by_prefix
+            self.must_meet_anew(prefix)
+            or self.keeper.has_answered(prefix)
             or now - since >= ANSWER_TIME
         )
 

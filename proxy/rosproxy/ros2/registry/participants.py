@@ -237,8 +237,9 @@ class InsideParticipant(Participant):
 
     ``verdicts``: whether the policy allows a topic or service, by rule; of its own endpoints and of
     those outside that it was to be told of. ``proxy_address`` is the proxy's address on its
-    network; ``is_in_group``: it was heard there by multicast. ``announced_at`` is when outside was
-    last told of it. `Rediscovery` sets the rest, None if it does not apply: since when it waits to
+    network; ``is_in_group``: it was heard there by multicast. ``was_inside``: a former process
+    served it, as more than its own word says. ``announced_at`` is when outside was last told of it.
+    `Rediscovery` sets the rest, None if it does not apply: since when it waits to
     be parted from outside; until when it is apart; when it was last told to forget each one
     outside, by prefix.
     """
@@ -246,6 +247,7 @@ class InsideParticipant(Participant):
     verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
     proxy_address: str = ""
     is_in_group: bool = False
+    was_inside: bool = False
     announced_at: float = 0.0
     parting_from: float | None = None
     apart_until: float | None = None

@@ -42,6 +42,7 @@ def make_domain(
     judge: Judge = everything,
     both_ways: bool = False,
     ports: PortMap = RANGE,
+    keeper_key: bytes = b"",
 ) -> Domain:
     settings = DomainSettings(
         number=0,
@@ -54,6 +55,7 @@ def make_domain(
         both_ways=both_ways,
         peers=tuple(HostPort(peer, 7410) for peer in peers),
         relay=LanRelay(ear, PROOF) if ear else None,
+        keeper_key=keeper_key,
     )
     return Domain.starting(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
 
@@ -100,6 +102,23 @@ def sedp(prefix: bytes, address: str, port: int, to: bytes = b"") -> bytes:
 def reached_at(datagram: bytes) -> list[HostPort]:
     (announcement,) = read_discovery(datagram).announcements
     return [locator for _, locator in announcement.reached_at(datagram)]
+
+
+def kept_number(keeper: bytes, prefix: bytes, number: int) -> bytes:
+    """What a participant answers a keeper: the number that it expects next."""
+    body = struct.pack(">II", 0x000003C7, SEDP_WRITERS)
+    body += struct.pack("<iIIi", number >> 32, number & 0xFFFFFFFF, 0, 1)
+    return message(submessage(0x0E, 0, keeper), submessage(0x06, 2, body), prefix=prefix)
+
+
+def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:
+    """What a participant answers the keeper of a domain."""
+    return kept_number(domain.own.keeper.prefix, prefix, number)
+
+
+def proof_answer(domain: Domain, prefix: bytes, proof: int) -> bytes:
+    """What a participant answers the witness of a domain with a secret."""
+    return kept_number(domain.own.keeper.witness, prefix, proof)
 
 
 def allowance_left(domain: Domain, source: str) -> float:

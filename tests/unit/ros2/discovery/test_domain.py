@@ -29,13 +29,13 @@ from tests.unit.ros2.discovery.domains import (
     NOW,
     OTHER,
     ROBOT,
-    SEDP_WRITERS,
     STRANGER,
     A,
     B,
     allowance_left,
     carried,
     farewell,
+    kept_answer,
     make_domain,
     meet,
     prove,
@@ -296,10 +296,7 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
 def test_a_participant_says_which_ports_it_had() -> None:
     domain = make_domain()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    number = domain.own.keeper.number([45009, 45004])
-    body = struct.pack(">II", 0x000003C7, SEDP_WRITERS) + struct.pack("<iIIi", 0, number, 0, 1)
-    meant = submessage(0x0E, 0, domain.own.keeper.prefix)
-    answer = message(meant, submessage(0x06, 2, body), prefix=A)
+    answer = kept_answer(domain, A, domain.own.keeper.number([45009, 45004]))
     domain.heard_inside(answer, OTHER, 0.2)
     assert not domain.own.keeper.number_by_prefix  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)

@@ -1,40 +1,156 @@
-"""What a participant keeps for the proxy: its ports, in one number."""
+"""What a participant keeps for the proxy: its ports, in one number with a proof."""
 
+from itertools import pairwise
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.port_keeper import COUNTS_EACH_SECOND, Keeper
+from rosproxy.ros2.discovery.port_keeper import (
+    COUNTS_EACH_SECOND,
+    MOST_WRONG,
+    MOST_WRONG_ADDRESSES,
+    Keeper,
+    keeper_key,
+)
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import source_prefix
+from tests.unit.ros2.discovery.domains import kept_number
 
 RANGE = PortRange(11400, 11463)
 PEER, BACK = bytes(range(12)), HostPort("172.30.0.2", 7410)
+ADDRESS = "172.30.0.5"
+KEY = keeper_key("a secret of the proxy")
+keys = st.sampled_from([b"", KEY])
 some_ports = st.lists(st.integers(RANGE.first, RANGE.last), max_size=8, unique=True)
 
 
-def make_keeper(started: float = 0.0) -> Keeper:
-    return Keeper.of("10.0.0.1", RANGE, 0, started)
+def make_keeper(started: float = 0.0, key: bytes = KEY, ports: PortRange = RANGE) -> Keeper:
+    return Keeper.of("10.0.0.1", ports, 0, started, key)
 
 
-@given(some_ports)
-def test_a_number_holds_ports(ports: list[int]) -> None:
-    keeper = make_keeper()
-    keeper.number_by_prefix[PEER] = keeper.number(ports)
-    assert keeper.former_ports(PEER) == ports
+def answered(
+    keeper: Keeper, number: int, proof: int = 1, prefix: bytes = PEER, source: str = ADDRESS
+) -> int:
+    """Have a participant answer a keeper; how many ports that proves."""
+    for own, told in ((keeper.prefix, number), (keeper.witness, proof)):
+        assert keeper.take(prefix, source, kept_number(own, prefix, told)) is bool(own)
+    assert keeper.has_answered(prefix)
+    return keeper.proven_count(prefix, source)
+
+
+@given(some_ports, keys)
+def test_numbers_hold_ports_and_prove_them(ports: list[int], key: bytes) -> None:
+    keeper, later = make_keeper(key=key), make_keeper(1000.0, key)
+    count = answered(later, keeper.number(ports), keeper.proof(PEER, ports))
+    assert count == (len(ports) if key else 0)
+    assert later.former_ports(PEER) == ports
+    assert later.keeps(PEER, ports)
 
 
 @given(some_ports)
 def test_a_port_more_is_a_greater_number(ports: list[int]) -> None:
-    numbers = [make_keeper().number(ports[:count]) for count in range(len(ports) + 1)]
-    assert numbers == sorted(set(numbers))
+    counts = range(len(ports) + 1)
+    numbers = [make_keeper().number(ports[:count]) for count in counts]
+    proofs = [make_keeper().proof(PEER, ports[:count]) for count in counts]
+    for told in (numbers, proofs):
+        assert all(smaller < greater for smaller, greater in pairwise(told))
+    assert max(proofs) < 2**24  # Fast DDS counts up to it one by one
 
 
-@given(st.integers(0, 2**63 - 1), st.integers(1, 3000))
-def test_no_number_names_a_port_outside_of_the_range(number: int, size: int) -> None:
-    keeper = Keeper.of("10.0.0.1", PortRange(11400, 11399 + size), 0, 0.0)
+@given(some_ports.filter(bool), st.binary(min_size=12, max_size=12), st.integers(1, 2**20 - 1))
+def test_a_number_with_another_proof_proves_nothing(
+    ports: list[int], prefix: bytes, error: int
+) -> None:
+    keeper = make_keeper()
+    number = keeper.number(ports)
+    right = keeper.proof(PEER, ports)
+    assert answered(make_keeper(), number, right ^ error) == 0
+    assert answered(make_keeper(), number) == 0
+    assert answered(make_keeper(), number ^ 1, right) == 0
+    assert answered(make_keeper(), number, make_keeper(key=b"another").proof(PEER, ports)) == 0
+    if prefix != PEER:
+        assert answered(make_keeper(), number, right, prefix) == 0
+    assert answered(Keeper.of("10.0.0.1", RANGE, 1, 0.0, KEY), number, right) == 0
+    assert answered(keeper, number, right) == len(ports)
+
+
+def test_a_proof_of_the_first_ports_proves_these() -> None:
+    """The proxy was killed before the participant kept the proof of its last port."""
+    keeper = make_keeper()
+    assert answered(keeper, keeper.number([11405, 11406]), keeper.proof(PEER, [11405])) == 1
+    assert not keeper.keeps(PEER, [11405, 11406])
+    assert not keeper.wrong_by_address
+
+
+@pytest.mark.parametrize(
+    ("size", "count"), [(100, 8), (127, 8), (128, 6), (1023, 6), (1024, 3), (60000, 3)]
+)
+def test_how_many_ports_fit_into_a_number(size: int, count: int) -> None:
+    keeper = make_keeper(ports=PortRange(2000, 1999 + size))
+    ports = [2000 + size - 1 - index for index in range(10)]
+    assert answered(keeper, keeper.number(ports), keeper.proof(PEER, ports)) == count
+    assert keeper.former_ports(PEER) == ports[:count]
+    assert keeper.keeps(PEER, ports)
+    assert not keeper.keeps(PEER, ports[1:])
+
+
+def test_after_guesses_no_proof_counts() -> None:
+    """A proof has 20 bits."""
+    keeper, other = make_keeper(), bytes(12)
+    number = keeper.number([11405])
+    right = keeper.proof(PEER, [11405])
+    for wrong in range(1, MOST_WRONG + 1):
+        assert answered(keeper, number, right) == 1
+        assert answered(keeper, number, right ^ wrong) == 0
+    assert answered(keeper, number, right) == 0
+    assert answered(keeper, number, keeper.proof(other, [11405]), other) == 0
+    assert answered(keeper, number, right, source="172.30.0.6") == 1
+    for index in range(MOST_WRONG_ADDRESSES):
+        answered(keeper, number, right ^ 1, source=f"172.31.{index // 250}.{index % 250}")
+    assert len(keeper.wrong_by_address) == MOST_WRONG_ADDRESSES
+    assert answered(keeper, number, right, source="172.30.0.6") == 0
+
+
+@pytest.mark.parametrize("is_proof", [True, False])
+def test_a_participant_forgets_a_number_that_is_greater(is_proof: bool) -> None:
+    """A reader heeds no smaller one."""
+    keeper = make_keeper()
+    number = keeper.number([11405])
+    proof = keeper.proof(PEER, [11405])
+    answered(keeper, number + (not is_proof), proof + is_proof)
+    farewells = keeper.reminders(PEER, [11405], BACK)
+    assert [source_prefix(told) for told in farewells] == [keeper.prefix, keeper.witness]
+    assert not [beat for told in farewells for beat in heartbeats(told)]
+    assert len(keeper.reminders(PEER, [11405], BACK)) == 4
+
+
+def test_a_participant_of_the_version_before_gets_proofs_for_what_it_keeps() -> None:
+    keeper = make_keeper()
+    answered(keeper, keeper.number([11405, 11406]))
+    (*_, proof) = keeper.reminders(PEER, [11405], BACK)
+    assert [beat.first for beat in heartbeats(proof)] == [keeper.proof(PEER, [11405])]
+
+
+def test_another_secret_has_another_witness() -> None:
+    keeper, other, without = make_keeper(), make_keeper(key=b"another"), make_keeper(key=b"")
+    assert keeper.prefix == other.prefix == without.prefix
+    assert len({keeper.prefix, keeper.witness, other.witness, without.witness}) == 4
+    assert without.witness == b""
+
+
+def test_the_key_follows_from_the_secret() -> None:
+    assert keeper_key("a secret of the proxy") == KEY
+    assert keeper_key("another secret") != KEY
+    assert keeper_key(None) == b""
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(1, 30_000), keys)
+def test_no_number_names_a_port_outside_of_the_range(number: int, size: int, key: bytes) -> None:
+    keeper = make_keeper(key=key, ports=PortRange(11400, 11399 + size))
     keeper.number_by_prefix[PEER] = number
     assert all(port in keeper.ports for port in keeper.former_ports(PEER))
 
@@ -64,17 +180,22 @@ def test_how_many_others_were_asked_is_nothing_to_a_participant() -> None:
 
 @given(some_ports, st.integers(0, 63))
 def test_a_longer_range_has_the_same_keeper(ports: list[int], more: int) -> None:
-    keeper, longer = make_keeper(), Keeper.of("10.0.0.1", PortRange(11400, 11463 + more), 0, 0.0)
+    keeper, longer = make_keeper(), make_keeper(ports=PortRange(11400, 11463 + more))
     assert keeper.prefix == longer.prefix
-    longer.number_by_prefix[PEER] = keeper.number(ports)
+    assert answered(longer, keeper.number(ports), keeper.proof(PEER, ports)) == len(ports)
     assert longer.former_ports(PEER) == ports
 
 
 def test_it_asks_and_reminds_by_heartbeats() -> None:
     keeper = make_keeper()
-    _, question = keeper.questions(PEER, BACK)
-    _, reminder = keeper.reminders(PEER, [11405], BACK)
-    for sent, first in ((question, 1), (reminder, keeper.number([11405]))):
-        (told,) = heartbeats(sent)
-        assert (told.first, told.last) == (first, first - 1)
-        assert (source_prefix(sent), destination(sent)) == (keeper.prefix, PEER)
+    numbers = {keeper.prefix: keeper.number([11405]), keeper.witness: keeper.proof(PEER, [11405])}
+    for sent, is_question in (
+        (keeper.questions(PEER, BACK), True),
+        (keeper.reminders(PEER, [11405], BACK), False),
+    ):
+        for beat in sent[1::2]:
+            (told,) = heartbeats(beat)
+            first = 1 if is_question else numbers[source_prefix(beat)]
+            assert (told.first, told.last) == (first, first - 1)
+            assert destination(beat) == PEER
+        assert [source_prefix(told) for told in sent[::2]] == [*numbers]

@@ -31,7 +31,9 @@ from tests.unit.ros2.discovery.domains import (
     B,
     carried,
     farewell,
+    kept_answer,
     make_domain,
+    proof_answer,
     sedp,
     spdp,
 )
@@ -102,7 +104,10 @@ class Neighbours(RuleBasedStateMachine):
         super().__init__()
         self.denied = set[RuleKind]()
         self.domain = make_domain(
-            peers=(ROBOT,), judge=lambda kind, *_: kind not in self.denied, both_ways=True
+            peers=(ROBOT,),
+            judge=lambda kind, *_: kind not in self.denied,
+            both_ways=True,
+            keeper_key=b"a key",
         )
         self.domain.own.observer.prefix = OWN
         self.now = 0.0
@@ -168,6 +173,18 @@ class Neighbours(RuleBasedStateMachine):
             or (address in self.asked)
         )
         self.asked |= {address} if is_true else set()
+
+    @rule(prefix=PREFIX, address=ADDRESS, ports=st.lists(st.integers(45000, 45015), max_size=3))
+    def a_participant_tells_which_ports_it_had(
+        self, prefix: bytes, address: str, ports: list[int]
+    ) -> None:
+        keeper = self.domain.own.keeper
+        answers = kept_answer(self.domain, prefix, keeper.number(ports))
+        answers += proof_answer(self.domain, prefix, keeper.proof(PREFIXES[0], ports))[20:]
+        if address in NEAR_BY:
+            self.inside_announces(answers, address)
+        else:
+            self.outside_announces(answers, address)
 
     @rule(address=st.sampled_from(NEAR_BY), port=PORT)
     def somebody_speaks_to_all_outside(self, address: str, port: int) -> None:
@@ -270,6 +287,9 @@ class Neighbours(RuleBasedStateMachine):
         assert (
             domain.own.keeper.number_by_prefix.keys() <= prefixes | domain.returning.waiting.keys()
         )
+        keepers = prefixes | domain.returning.waiting.keys()
+        assert domain.own.keeper.proof_by_prefix.keys() <= keepers
+        assert domain.ports._ports_claimed.keys() <= keepers
         assert domain.fragments.by_prefix.keys() <= prefixes
         sizes = [store.size for store in domain.fragments.by_prefix.values()]
         assert domain.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL

@@ -13,6 +13,7 @@ from rosproxy.ros2.registry.locator_ports import (
     SETTLING,
     STAND_INS,
     LocatorPorts,
+    NamedBy,
     order_for,
     stand_in_port,
 )
@@ -20,6 +21,9 @@ from rosproxy.ros2.registry.participants import LeaseKind
 
 RANGE = PortRange(45000, 45019)
 DATA, METATRAFFIC = LeaseKind.DATA, LeaseKind.METATRAFFIC
+OTHERS = NamedBy.OTHERS
+PROVEN = NamedBy.PROVEN
+PEER = NamedBy.PEER
 prefixes = st.binary(min_size=12, max_size=12)
 
 
@@ -53,7 +57,7 @@ def test_no_port_is_given_twice(wanted: list[tuple[bytes, int]]) -> None:
 def test_who_is_meant_at_a_port_gets_it(prefix: bytes, other_prefix: bytes) -> None:
     pool = ports()
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
-    pool.note_former_user(first, other_prefix, DATA, True, 0.5)
+    pool.note_former_user(first, other_prefix, DATA, PEER, 0.5)
     if prefix != other_prefix:
         assert pool.take(prefix, locator(0), DATA, SETTLING) != first
     assert pool.take(other_prefix, locator(3), DATA, SETTLING) == first
@@ -68,14 +72,14 @@ def test_who_says_what_it_had_gets_it(prefix: bytes, had: int) -> None:
 
 def test_what_outside_says_counts_more_than_ones_own_word() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
-    pool.note_former_user(45007, other_prefix, DATA, True, 0.5)
+    pool.note_former_user(45007, other_prefix, DATA, PEER, 0.5)
     assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) != 45007
     assert pool.take(other_prefix, locator(0), DATA, SETTLING) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
     pool, prefix = ports(), bytes(12)
-    pool.note_former_user(45007, prefix, METATRAFFIC, True, 0.5)
+    pool.note_former_user(45007, prefix, METATRAFFIC, PEER, 0.5)
     assert pool.take(prefix, locator(1), DATA, SETTLING) != 45007
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == 45007
 
@@ -86,7 +90,7 @@ def test_where_several_are_named_their_own_word_decides(had: list[tuple[bytes, i
     pool = ports()
     for port in (45003, 45007):
         for prefix, _ in had:
-            pool.note_former_user(port, prefix, DATA, True, 0.5)
+            pool.note_former_user(port, prefix, DATA, PEER, 0.5)
     taken = [pool.take(prefix, locator(0), DATA, SETTLING, port) for prefix, port in had]
     assert taken == [port for _, port in had]
 
@@ -95,14 +99,14 @@ def test_each_locator_of_a_participant_gets_its_own_port() -> None:
     """Fast DDS has two for data, and outside names the participant at both."""
     pool, prefix, had = ports(), bytes(12), {0: 45003, 1: 45007}
     for port in had.values():
-        pool.note_former_user(port, prefix, DATA, True, 0.5)
+        pool.note_former_user(port, prefix, DATA, PEER, 0.5)
     taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
     assert taken == had
 
 
 def test_each_locator_gets_its_own_port_though_outside_names_one_alone() -> None:
     pool, prefix, had = ports(), bytes(12), {0: 45003, 1: 45007}
-    pool.note_former_user(45007, prefix, DATA, True, 0.5)
+    pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
     taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
     assert taken == had
 
@@ -113,28 +117,28 @@ def test_each_locator_gets_its_own_port_without_a_word(order: list[int]) -> None
     before, after, prefix = ports(), ports(), bytes(12)
     had = {n: before.take(prefix, locator(n), DATA, SETTLING) for n in range(3)}
     for port in had.values():
-        after.note_former_user(port or 0, prefix, DATA, True, 0.5)
+        after.note_former_user(port or 0, prefix, DATA, PEER, 0.5)
     assert {n: after.take(prefix, locator(n), DATA, SETTLING) for n in order} == had
 
 
 def test_a_locator_for_both_kinds_keeps_its_port() -> None:
     """Of Cyclone DDS: outside may have sent data alone, and the announcement begins with either."""
     pool, prefix = ports(), bytes(12)
-    pool.note_former_user(45007, prefix, DATA, True, 0.5)
+    pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING, 45007) == 45007
 
 
 def test_a_locator_for_both_kinds_keeps_its_port_without_a_word() -> None:
     pool, prefix = ports(), bytes(12)
     first, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
-    pool.note_former_user(first, prefix, DATA, True, 0.5)
+    pool.note_former_user(first, prefix, DATA, PEER, 0.5)
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == first
 
 
 def test_a_stranger_names_nobody_where_a_peer_has() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
-    pool.note_former_user(45007, prefix, DATA, True, 0.5)
-    pool.note_former_user(45007, other_prefix, DATA, False, 0.5)
+    pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
+    pool.note_former_user(45007, other_prefix, DATA, OTHERS, 0.5)
     assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45007) != 45007
     assert pool.take(prefix, locator(0), DATA, SETTLING) == 45007
 
@@ -143,15 +147,15 @@ def test_where_too_many_are_named_that_tells_nothing() -> None:
     """Nobody can take a port from whom it was by naming all the world there."""
     pool, prefix = ports(), bytes(12)
     for number in range(1, 100):
-        pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, True, 0.5)
-    pool.note_former_user(45007, b"a stranger's", DATA, False, 0.5)
+        pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, PEER, 0.5)
+    pool.note_former_user(45007, b"a stranger's", DATA, OTHERS, 0.5)
     assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) == 45007
 
 
 def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
     for port in RANGE.ports():
-        pool.note_former_user(port, other_prefix, DATA, True, 0.5)
+        pool.note_former_user(port, other_prefix, DATA, PEER, 0.5)
     first, second, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
     assert [pool.take(prefix, locator(0), DATA, SETTLING) for _ in range(2)] == [first, second]
 
@@ -159,8 +163,8 @@ def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
 def test_what_was_heard_is_forgotten_after_a_time() -> None:
     pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
-    pool.note_former_user(first, other_prefix, DATA, True, 0.5)
-    pool.note_former_user(45000, other_prefix, DATA, True, REMEMBERED + 1)
+    pool.note_former_user(first, other_prefix, DATA, PEER, 0.5)
+    pool.note_former_user(45000, other_prefix, DATA, PEER, REMEMBERED + 1)
     assert pool.take(prefix, locator(0), DATA, REMEMBERED) == first
 
 
@@ -195,7 +199,7 @@ def test_what_the_kernel_forwarded_leads_there_again(
 ) -> None:
     pool = ports()
     pool.note_forwarded({port: locator(1), 9: locator(1)})
-    pool.note_former_user(port, other_prefix, DATA, True, 0.5)
+    pool.note_former_user(port, other_prefix, DATA, PEER, 0.5)
     assert pool.take(other_prefix, locator(0), DATA, SETTLING, had=port) != port
     assert pool.take(prefix, locator(1), METATRAFFIC, SETTLING, had=port) != port
     assert pool.take(prefix, locator(1), DATA, SETTLING) == port
@@ -210,3 +214,65 @@ def test_what_the_kernel_forwarded_is_forgotten_in_time() -> None:
     first, *_ = order_for(f"{bytes(12).hex()} {locator(0)}", RANGE)
     pool.note_forwarded({first: locator(1)})
     assert pool.take(bytes(12), locator(0), DATA, REMEMBERED) == first
+
+
+@given(st.permutations([(b"a" * 12, True), (b"b" * 12, False)]), prefixes)
+def test_a_proof_counts_more_than_a_word(order: list[tuple[bytes, bool]], stranger: bytes) -> None:
+    pool = ports()
+    pool.note_former_user(45007, stranger, DATA, PEER, 0.5)
+    for prefix, is_proven in order:
+        pool.note_claims(prefix, [45007], is_proven)
+    taken = {prefix: pool.take(prefix, locator(0), DATA, SETTLING, 45007) for prefix, _ in order}
+    assert taken[b"a" * 12] == 45007
+    assert taken[b"b" * 12] != 45007
+
+
+@given(st.booleans(), st.integers(45000, 45019))
+def test_equal_claims_give_the_port_to_neither(is_proven: bool, port: int) -> None:
+    pool = ports()
+    one, other, third = (letter * 12 for letter in (b"a", b"b", b"c"))
+    for prefix in (one, other):
+        pool.note_claims(prefix, [port], is_proven)
+    assert pool.take(one, locator(0), DATA, SETTLING, port) != port
+    pool.forget_claims(one)
+    assert pool.take(other, locator(0), DATA, SETTLING, port) != port
+    assert pool.displaced_by(other, SETTLING) == set()
+    rest = [pool.take(third, locator(n), DATA, SETTLING) for n in range(18)]
+    assert rest[-1] == port  # the last that is left
+    assert pool.take(third, locator(18), DATA, SETTLING) is None
+
+
+def test_a_proof_gets_a_port_back_from_a_participant_that_came_first() -> None:
+    pool = ports()
+    first, later = b"a" * 12, b"b" * 12
+    had = pool.take(first, locator(0), DATA, SETTLING)
+    assert had is not None
+    pool.note_claims(later, [had], 0)
+    assert pool.displaced_by(later, 3.0) == set()
+    pool.note_claims(later, [had], 1)
+    assert pool.displaced_by(later, 3.0) == {first}
+    assert pool.displaced_by(later, REMEMBERED) == set()
+    pool.give_back(had)
+    assert pool.displaced_by(later, 3.0) == set()
+    assert pool.take(later, locator(0), DATA, 3.0, had) == had
+
+
+def test_what_the_kernel_forwarded_stays_with_its_locator() -> None:
+    pool = ports()
+    pool.note_forwarded({45007: locator(1)})
+    assert pool.take(b"a" * 12, locator(1), DATA, SETTLING) == 45007
+    pool.note_claims(b"b" * 12, [45007], 1)
+    assert pool.displaced_by(b"b" * 12, 3.0) == set()
+
+
+def test_a_name_that_may_be_forged_makes_a_word_no_better_and_voids_one_without_a_rival() -> None:
+    liar, owner = b"a" * 12, b"b" * 12
+    pool = ports()
+    pool.note_former_user(45007, liar, DATA, OTHERS, 0.5)
+    pool.note_claims(owner, [45007], 0)
+    assert pool.take(liar, locator(0), DATA, SETTLING) != 45007
+    assert pool.take(owner, locator(0), DATA, SETTLING, 45007) != 45007
+    pool.note_former_user(45008, liar, DATA, OTHERS, 0.5)
+    pool.note_former_user(45008, owner, DATA, PROVEN, 0.5)
+    assert pool.take(liar, locator(1), DATA, SETTLING, 45008) != 45008
+    assert pool.take(owner, locator(1), DATA, SETTLING, 45008) == 45008
