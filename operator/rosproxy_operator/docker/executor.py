@@ -248,13 +248,14 @@ class DockerApplier:
         await in_thread(self._do, action, snapshot)
 
     async def _retire(self, name: str, access: ProxyAccess) -> None:
+        fields = {"proxy": name}
         try:
             answer = await self._proxies.retire(access.admin, access.token)
-            text, count = "%s has unregistered %s nodes at its master", answer.get("unregistered")
-            log.info(text, name, count, extra={"proxy": name})
+            text = "proxy retired: %s, outside was told that %s nodes or participants have ended"
+            log.info(text, name, answer.get("unregistered"), extra=fields)
         except ProxyError as error:
-            text = "%s could not unregister its nodes at the master: %s"
-            log.warning(text, name, error, extra={"proxy": name})
+            text = "proxy not retired: %s, outside was not told that its nodes have ended: %s"
+            log.warning(text, name, error, extra=fields)
 
     def _do(self, action: Action, snapshot: DockerSnapshot) -> None:
         try:

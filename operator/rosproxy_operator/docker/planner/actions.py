@@ -199,9 +199,10 @@ class Disconnect(Action, frozen=True):
 class Remove(Action, frozen=True):
     """Kill and remove a container.
 
-    With ``retire`` the proxy's nodes are unregistered at the master first: nobody takes over. With
-    ``stop`` it is ended properly first: it goes together with its network, and what the kernel
-    forwards there would never be closed.
+    With ``retire`` no other proxy takes over: the proxy first unregisters its nodes at the master
+    (ROS 1), or sends dispose messages for its participants (ROS 2). With ``stop`` it is ended
+    properly first: it goes together with its network, and what the kernel forwards there would
+    never be closed.
     """
 
     does = "remove container"
@@ -210,5 +211,5 @@ class Remove(Action, frozen=True):
     stop: bool = False
 
     def _details(self) -> str:
-        after = ", after unregistering its nodes at the master" if self.retire else ""
+        after = ", after it has told outside that its nodes have ended" if self.retire else ""
         return f" ({self.why}){after}"

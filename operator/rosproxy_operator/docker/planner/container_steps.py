@@ -43,6 +43,7 @@ from rosproxy_operator.docker.planner.model import (
     Key,
     OwnContainer,
     Proxy,
+    Sandbox,
 )
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
@@ -139,12 +140,16 @@ def removal_steps(
     observed: HostState, key: Key, reason: str, again: bool = False
 ) -> Iterator[Action]:
     """Remove everything of a key; ``again`` also what the engine is removing already."""
-    for own in (*observed.ears_of(key), *observed.proxies_of(key), *observed.sandboxes_of(key)):
-        state, name = own.container.state, own.container.name
-        if state == "paused" and isinstance(own, Proxy):
-            yield Unpause(name)
+    # A proxy that retires reaches the LAN by its relay, and all of outside by its sandbox.
+    ordered = (*observed.proxies_of(key), *observed.ears_of(key), *observed.sandboxes_of(key))
+    for own in ordered:
+        if own.container.state == "paused" and not isinstance(own, Sandbox):
+            yield Unpause(own.container.name)
+    for own in ordered:
+        state = own.container.state
         if again or state != "removing":
-            yield Remove(name, reason, retire=isinstance(own, Proxy) and state in STARTED)
+            retire = isinstance(own, Proxy) and state in STARTED
+            yield Remove(own.container.name, reason, retire=retire)
 
 
 def disconnect_steps(

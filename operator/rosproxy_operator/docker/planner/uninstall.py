@@ -1,8 +1,9 @@
 """What is to be done so that nothing of the operator's is left on a Docker host.
 
 It goes in the opposite order of how it came: redirects out of the networks of containers that stay,
-while their records tell of them; each key's ear, proxy and sandbox, of which the proxy unregisters
-its nodes first; and once no container is left, the networks that the operator has made.
+while their records tell of them; each key's proxy, which first tells outside that its nodes have
+ended, then the proxy's LAN relay and sandbox; and once no container is left, the networks that the
+operator has made.
 
 Nothing may come back meanwhile. Who sees a container of the operator's that was not there before
 has found another operator at work, and stops.

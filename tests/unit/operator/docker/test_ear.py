@@ -17,7 +17,9 @@ from rosproxy_operator.docker.planner.actions import (
     CreateSandbox,
     Remove,
     Start,
+    Unpause,
 )
+from rosproxy_operator.docker.planner.container_steps import removal_steps
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
@@ -123,6 +125,26 @@ def test_the_ear_is_made_once_its_proxy_has_an_address() -> None:
     assert actions(observed(TALKER, **running_proxy())) == []
 
 
+def test_a_proxy_retires_before_its_relay_and_its_sandbox_go() -> None:
+    """The relay carries the dispose messages of a proxy that retires."""
+    assert list(removal_steps(observed(**running_proxy()), KEY, "gone")) == [
+        Remove(PROXY.name, "gone", retire=True),
+        Remove(MADE.name, "gone"),
+        Remove(BOX.name, "gone"),
+    ]
+
+
+def test_a_paused_relay_is_resumed_before_its_proxy_retires() -> None:
+    parts = running_proxy()
+    (ear,) = parts["ears"]
+    paused = replace(ear.container, state="paused")
+    parts["ears"] = (EarContainer(KEY, paused, RANGE, ear.fingerprint),)
+
+    first, second, *_ = removal_steps(observed(**parts), KEY, "gone")
+
+    assert (first, second) == (Unpause(MADE.name), Remove(PROXY.name, "gone", retire=True))
+
+
 def test_the_ear_is_made_anew_when_its_proxy_has_another_address() -> None:
     old = f"{MADE.name}-old"
     rename, create, remove, start = actions(observed(TALKER, **running_proxy("172.30.0.7")))
@@ -143,7 +165,7 @@ def test_the_ear_goes_before_its_sandbox_is_made_anew() -> None:
 
 def test_all_three_go_when_nobody_wants_them() -> None:
     plan = look(observed(**running_proxy()), replace(SETTINGS, grace=0.0))
-    assert [action.name for action in plan.actions] == [MADE.name, PROXY.name, BOX.name]
+    assert [action.name for action in plan.actions] == [PROXY.name, MADE.name, BOX.name]
 
 
 def test_no_lan_no_ear() -> None:

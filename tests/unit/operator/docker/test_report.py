@@ -99,7 +99,7 @@ ACTIONS: list[tuple[Action, str]] = [
     (Remove("p", "made anew"), "remove container p (made anew)"),
     (
         Remove("p", "done", retire=True),
-        "remove container p (done), after unregistering its nodes at the master",
+        "remove container p (done), after it has told outside that its nodes have ended",
     ),
 ]  # fmt: skip
 
