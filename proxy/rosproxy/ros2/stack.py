@@ -201,8 +201,7 @@ class Ros2:
         for server in self.servers:
             # Before they are ended, or their next announcement would let them in again.
             server.select(())
-            participants = server.domain.inside.by_prefix.values()
-            ended += server.end({p.address for p in participants})
+            ended += server.retire()
         return {"unregistered": ended}
 
     @property

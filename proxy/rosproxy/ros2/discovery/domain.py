@@ -263,6 +263,20 @@ class Domain(DomainParticipants):
     def _at_present_host(self, _: int, locator: HostPort) -> HostPort:
         return HostPort(self.settings.host_for(locator.host), locator.port)
 
+    def retire(self, now: float) -> list[Outgoing]:
+        """Have all inside and all outside forget each other, as no proxy takes over.
+
+        Participants may go on, and meet anew by a proxy that is started later. So both sides have
+        to forget (`Rediscovery`), and no dispose message may have `LAST_SEQUENCE`.
+        """
+        sent = list[Outgoing]()
+        self.returning.forget({insider.address for insider in self.inside.by_prefix.values()})
+        for insider in list(self.inside.by_prefix.values()):
+            part = partial(self.rediscovery.separate, insider, now)
+            sent += self._unless_malformed(insider.address, part)
+            self._forget_inside(insider)
+        return sent
+
     def _part(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
         """Part one from all outside, of whom the policy is asked anew then. Raises RtpsError."""
         try:

@@ -160,6 +160,12 @@ class DomainServer:
         self._send(self.domain.gone(addresses))
         return before - len(self.domain.inside.by_prefix)
 
+    def retire(self) -> int:
+        """End all participants inside, as no proxy takes over; returns how many there were."""
+        count = len(self.domain.inside.by_prefix)
+        self._send(self.domain.retire(self._now()))
+        return count
+
     async def expire(self) -> None:
         """Let in participants that have waited, and forget those that have gone."""
         self._release()

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import BURST, STEP, cost
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
@@ -455,6 +456,26 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
     assert [*domain.inside.by_prefix] == [B]
     assert domain.ports.pool.free == taken + 2
     assert domain.gone({INSIDE}) == []
+
+
+def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
+    """What goes on meets anew by a later proxy, and Fast DDS takes no number twice."""
+    domain = make_domain()
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    announced = domain.inside.by_prefix[A].announcement
+
+    sent = domain.retire(NOW)
+
+    (ended,) = to(sent, EAR.host)
+    (outward,) = read_discovery(ended).announcements
+    (inward,) = (read_discovery(datagram).announcements[0] for datagram in to(sent, INSIDE))
+    assert (outward.ended, outward.sample.prefix) == (True, A)
+    assert outward.sample.sequence == next_number(announced) < LAST_SEQUENCE
+    assert (inward.ended, inward.sample.prefix) == (True, B)
+    assert inward.sample.sequence < LAST_SEQUENCE
+    assert not domain.inside.by_prefix
+    assert domain.retire(NOW) == []
 
 
 def test_who_is_gone_gets_no_port_any_more() -> None:
