@@ -123,7 +123,8 @@ def the_proxy(seconds: float = 30) -> Proxy:
 
 def remove_proxies() -> None:
     """Remove all proxies and the uplink."""
-    names = [*managed("redirect"), *managed("ear"), *managed("proxy"), *managed("ports")]
+    roles = ("redirect", "flush", "ear", "proxy", "ports")
+    names = [name for role in roles for name in managed(role)]
     if names:
         docker("rm", "--force", *names, check=False, seconds=120)
     docker("network", "rm", UPLINK, check=False)

@@ -143,10 +143,18 @@ def runs(proxy: Proxy) -> list[tuple[str, str]]:
 class Flow:
     """A talker and a listener on either side; ``heard`` is what each listener hears."""
 
-    def __init__(self, lan: Outside, inside2: Inside2, network: str = "", **more: Any) -> None:
+    def __init__(
+        self,
+        lan: Outside,
+        inside2: Inside2,
+        network: str = "",
+        vendors: tuple[str, str] = ("jazzy", "kilted"),
+        **more: Any,
+    ) -> None:
         network = network or inside2.made.network()
-        self.talker = inside2.node(network, "jazzy", "pub", "/out", "--word", "inside", **more)
-        self.listener = inside2.node(network, "kilted", "sub", "/back", **more)
+        talker, listener = vendors
+        self.talker = inside2.node(network, talker, "pub", "/out", "--word", "inside", **more)
+        self.listener = inside2.node(network, listener, "sub", "/back", **more)
         lan.node("jazzy", "pub", "/back", "--word", "outside")
         self.outward = lan.node("jazzy", "sub", "/out").log
         self.inward = self.listener.log
@@ -157,12 +165,7 @@ class Flow:
         return (self.outward, "inside"), (self.inward, "outside")
 
     def wait(self, since: float, seconds: float = 60) -> None:
-        """Wait until messages flow in both directions; all parts run.
-
-        The kernel forgets first which way datagrams went while no port was published, as engines
-        since 23.0 have it do (github.com/moby/moby/pull/44742); Debian 12 has 20.10.
-        """
-        run("conntrack", "-D", "-p", "udp", "--orig-dst", HERE, check=False)  # there may be none
+        """Wait until messages flow in both directions; all parts run."""
         for log, text in self.heard:
             log.wait_for(text, count=10, since=since, seconds=seconds)
 

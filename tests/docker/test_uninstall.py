@@ -36,10 +36,11 @@ def test_nothing_is_left_once_the_operator_has_ended(
     def made() -> set[str]:
         return {c["Labels"]["io.rosproxy.role"] for c in containers(MANAGED)}
 
-    wait_until(lambda: made() == roles, 60, lambda: docker("ps", "--all"))
+    # An engine before 23.0 needs a flush besides.
+    wait_until(lambda: made() >= roles, 60, lambda: docker("ps", "--all"))
     images = controller_image, proxy_image
     assert "an operator is running" in uninstall(*images, check=False)
-    assert made() == roles, "an operator is running, so that all stays"
+    assert made() >= roles, "an operator is running, so that all stays"
 
     docker("rm", "--force", controller.container)
     uninstall(*images)

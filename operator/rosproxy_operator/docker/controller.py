@@ -12,6 +12,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
@@ -37,7 +38,7 @@ from rosproxy_operator.docker.host_document import host_document
 from rosproxy_operator.docker.operator_sign import publish_sign
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import HostState
-from rosproxy_operator.docker.planner.plan import DockerPlan, plan
+from rosproxy_operator.docker.planner.plan import DockerPlan, Group, plan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.planner.uninstall import Uninstall
@@ -250,10 +251,11 @@ class DockerController:
             return False
         snapshot, planned = self._last
         # --once does not wait for what has failed to be tried again: it ends and tells of it.
-        if self._executor.problems or self._proxy_sync.problems(snapshot):
+        failed = any(problem.fatal for problem in self._executor.problems)
+        if failed or self._proxy_sync.problems(snapshot):
             return True
         waiting = snapshot.state.busy or self._observer.waiting
-        return not waiting and not planned.groups and not self._silent(planned)
+        return not waiting and not _required(planned) and not self._silent(planned)
 
     def _silent(self, planned: DockerPlan) -> list[str]:
         """The proxies that are wanted and do not answer."""
@@ -271,7 +273,7 @@ class DockerController:
             for name in self._silent(planned)
             if f"proxy {name}" not in subjects
         ]
-        unfinished = planned.groups or planned.deferred or snapshot.state.busy
+        unfinished = _required(planned) or planned.deferred or snapshot.state.busy
         if unfinished and not problems:
             problems.append(Problem("operator", "not all was done in time: run this again"))
         return problems
@@ -283,6 +285,7 @@ class DockerController:
         """Take note of an event; None is a new connection: what happened before was missed."""
         if event is None:
             self._observer.mark_doubtful(None)
+            self._memory = replace(self._memory, engine_returned=True)
             self._loop.retry()
         elif container := engine_json.container_of(event):
             self._observer.mark_doubtful(container)
@@ -292,3 +295,8 @@ class DockerController:
     async def _close(self) -> None:
         await self._tasks.cancel()
         await self._proxies.close()
+
+
+def _required(planned: DockerPlan) -> list[Group]:
+    """The groups of a plan without which something is not as wanted."""
+    return [group for group in planned.groups if group.fatal]

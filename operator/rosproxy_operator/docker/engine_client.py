@@ -58,7 +58,16 @@ class DockerClient:
     def __init__(self) -> None:
         self.url = os.environ.get("DOCKER_HOST") or DEFAULT_SOCKET
         self._version: str | None = None
+        self._last_version = (0, 0)
         self._idle: list[Any] = []
+
+    @property
+    def deletes_udp_entries(self) -> bool:
+        """Whether the engine deletes conntrack entries for the UDP ports that it publishes.
+
+        Docker does since 23.0, whose API is 1.42 (github.com/moby/moby/pull/44742).
+        """
+        return self._last_version >= (1, 42)
 
     def containers(self) -> list[Json]:
         """All containers, whatever their state, as the engine lists them."""
@@ -124,6 +133,8 @@ class DockerClient:
         version = self._version or "auto"
         client = docker.APIClient(version=version, timeout=READ_TIMEOUT, **kwargs_from_env())
         self._version = client.api_version
+        major, _, minor = self._version.partition(".")
+        self._last_version = (int(major), int(minor))
         return client
 
     def _read_events(self, stream: Iterator[Json]) -> Iterator[Json]:

@@ -25,6 +25,7 @@ from rosproxy_operator.docker.planner.actions import (
     Connect,
     Create,
     CreateEar,
+    CreateFlush,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -37,6 +38,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
+from rosproxy_operator.docker.planner.flush import flush_config
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import Group
@@ -44,6 +46,7 @@ from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
     SECRET,
+    Creation,
     container_config,
     ear_config,
     master,
@@ -77,8 +80,12 @@ DONE: dict[type, tuple[str, ...]] = {
 }
 """Parts of the engine's error that mean there is nothing left to do; so does NoSuchObject."""
 
-LONGEST_RUN = 10.0
-"""Seconds after which a container that does one thing, in milliseconds, is given up."""
+LONGEST_RUN = 30.0
+"""Seconds after which a container that does one thing is given up.
+
+Setting a redirect takes milliseconds. Deleting entries takes 13 s where each of 1,000 ports has
+some.
+"""
 RUNNING = 0.03
 """Seconds between two checks whether it has ended."""
 
@@ -201,7 +208,7 @@ class Executor:
             except EngineError as error:
                 cure = f"; {group.cure}" if group.cure else ""
                 subject = _subject((group.key, group.subject))
-                problem = Problem(subject, f"{action}: {error}{cure}")
+                problem = Problem(subject, f"{action}: {error}{cure}", group.fatal)
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem
@@ -273,7 +280,7 @@ class DockerApplier:
         match action:
             case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
                 self._call_network(action, snapshot)
-            case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
+            case CreateSandbox() | Create() | CreateEar() | CreateRedirect() | CreateFlush():
                 self._create(action.name, self._config(action, snapshot), snapshot.state.image_id)
             case Start(name):
                 do("start", name)
@@ -316,15 +323,15 @@ class DockerApplier:
         if state["ExitCode"]:
             raise EngineError(f"ended with {state['ExitCode']}, docker logs {name} says why")
 
-    def _config(
-        self, action: CreateSandbox | Create | CreateEar | CreateRedirect, snapshot: DockerSnapshot
-    ) -> Json:
+    def _config(self, action: Creation, snapshot: DockerSnapshot) -> Json:
         if isinstance(action, CreateSandbox):
             return sandbox_config(action, self._settings)
         if isinstance(action, CreateEar):
             return ear_config(action, self._settings, snapshot.state.secret)
         if isinstance(action, CreateRedirect):
             return redirect_config(action, self._settings)
+        if isinstance(action, CreateFlush):
+            return flush_config(action, self._settings)
         secret, masters, key = snapshot.state.secret, snapshot.state.masters, action.key
         address = "" if key.is_ros2 else masters.get(master(key).host.lower(), "")
         return container_config(action, self._settings, secret, address)
@@ -340,7 +347,7 @@ class DockerApplier:
         # when it ends, which takes 2 s per network.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
-            if network not in (self._settings.uplink, "host"):  # an ear can't leave the latter
+            if network not in (self._settings.uplink, "host"):  # no container leaves the latter
                 self._do(Disconnect(name, network), snapshot)
         self._engine.do("remove_container", name, force=True)
 

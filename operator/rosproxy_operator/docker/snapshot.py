@@ -26,6 +26,7 @@ from rosproxy_operator.docker.planner.model import (
     STARTED,
     Container,
     EarContainer,
+    FlushContainer,
     HostState,
     Network,
     OwnContainer,
@@ -37,6 +38,7 @@ from rosproxy_operator.docker.planner.own_containers import forgery_reason, has_
 from rosproxy_operator.docker.planner.specs import (
     FORMER_TOKEN,
     ROLE_EAR,
+    ROLE_FLUSH,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
@@ -61,6 +63,7 @@ _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_PROXY: Proxy,
     ROLE_EAR: EarContainer,
     ROLE_REDIRECT: RedirectContainer,
+    ROLE_FLUSH: FlushContainer,
 }
 DOUBT = 1.0
 """Seconds for which a container is inspected with each look after something has happened to it."""
@@ -347,12 +350,10 @@ class DockerObserver:
             sandboxes=tuple(own_by_role[ROLE_SANDBOX]),
             ears=tuple(own_by_role[ROLE_EAR]),
             redirects=tuple(own_by_role[ROLE_REDIRECT]),
+            flushes=tuple(own_by_role[ROLE_FLUSH]),
             busy=frozenset(busy),
-            addresses=frozenset(
-                endpoint.get("IPAddress") or ""
-                for row in rows
-                for endpoint in engine_json.endpoints(row).values()
-            ),
+            deletes_udp_entries=self._engine.deletes_udp_entries,
+            addresses=_addresses(rows),
         )
 
     async def _resolve(self, state: HostState, names: Collection[str]) -> dict[str, str]:
@@ -374,6 +375,12 @@ class DockerObserver:
         variables = engine_json.environment(self._inspector.get(proxy.container.id))
         token = variables.get(FORMER_TOKEN) or proxy_token(proxy.key, state.secret)
         return ProxyAccess(admin, token, run) if address else None
+
+
+def _addresses(rows: Iterable[Json]) -> frozenset[str]:
+    """The addresses of all containers in the engine's list."""
+    endpoints = (endpoint for row in rows for endpoint in engine_json.endpoints(row).values())
+    return frozenset(endpoint.get("IPAddress") or "" for endpoint in endpoints)
 
 
 def foreign_ports(

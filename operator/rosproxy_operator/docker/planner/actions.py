@@ -140,6 +140,18 @@ class CreateRedirect(_CreateContainer, frozen=True):
         return f": {location} it leads {self.master} to the proxy at {self.proxy}"
 
 
+class CreateFlush(_CreateContainer, frozen=True):
+    """Create what deletes the host's conntrack entries for a sandbox's UDP ports, and ends."""
+
+    fingerprint: str = ""
+
+    def _details(self) -> str:
+        return (
+            f": it deletes the host's conntrack entries for UDP ports {self.range} of the "
+            f"{self.key.graph}"
+        )
+
+
 class Run(Action, frozen=True):
     """Start a container that does one thing, and wait until it has ended."""
 

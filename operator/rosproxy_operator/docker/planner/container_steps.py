@@ -32,6 +32,7 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.aliases import Naming, answers_to, needed_by
 from rosproxy_operator.docker.planner.duplicates import Selection, free_name, select
+from rosproxy_operator.docker.planner.instants import instant
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
     SERVING,
@@ -366,14 +367,7 @@ def _lost(kept: Container, home: _SandboxChoice) -> bool:
     # One that is restarting enters the sandbox's present namespace by itself.
     if not kept.started_at or not home.started_at or kept.state == "restarting":
         return False
-    return _instant(kept.started_at) < _instant(home.started_at)
-
-
-def _instant(text: str) -> tuple[str, str]:
-    """A time in the engine's words, so that it can be compared: their fractions vary in length."""
-    # Go's RFC3339Nano, in which the engine writes times, leaves out zeros at the end.
-    seconds, _, fraction = text.removesuffix("Z").partition(".")
-    return seconds, fraction.ljust(9, "0")
+    return instant(kept.started_at) < instant(home.started_at)
 
 
 def former_name(old: Container | None, name: str, taken: Collection[str]) -> str:

@@ -167,6 +167,18 @@ class RedirectContainer(OwnContainer):
         return self.container.state == "exited" and self.container.exit_code == 0
 
 
+class FlushContainer(OwnContainer):
+    """It has deleted the host's conntrack entries for a sandbox's UDP ports, and has ended.
+
+    It is kept as the record of that: ``started_at`` is when it ran last.
+    """
+
+    @property
+    def done(self) -> bool:
+        """Whether its last run did what it is for."""
+        return self.container.state == "exited" and self.container.exit_code == 0
+
+
 @dataclass(frozen=True, slots=True)
 class HostState:
     """A Docker host at one moment.
@@ -180,8 +192,9 @@ class HostState:
     addresses of the masters' hosts, by name, empty where unknown. ``busy`` are the names of own
     containers of which not everything is known yet, so that nothing can be done to them, and
     ``addresses`` those of all containers. ``secret`` is what the tokens of proxies are made of.
-    ``redirects`` are the records of rules in containers' networks; they are not among its ``own``,
-    as no proxy is made of them.
+    ``redirects`` are the records of rules in containers' networks, ``flushes`` those of deleted
+    conntrack entries; neither is among its ``own``, as no proxy is made of them.
+    ``deletes_udp_entries``: the engine itself deletes the entries that a flush would.
     """
 
     containers: tuple[Container, ...]
@@ -196,10 +209,12 @@ class HostState:
     sandboxes: tuple[Sandbox, ...] = ()
     ears: tuple[EarContainer, ...] = ()
     redirects: tuple[RedirectContainer, ...] = ()
+    flushes: tuple[FlushContainer, ...] = ()
     masters: Mapping[str, str] = field(default_factory=dict)
     busy: frozenset[str] = frozenset()
     addresses: frozenset[str] = frozenset()
     secret: str = field(default="", repr=False)
+    deletes_udp_entries: bool = False
 
     @property
     def own(self) -> tuple[OwnContainer, ...]:

@@ -23,10 +23,11 @@ from typing import Any
 
 from rosproxy_operator.common.ros2 import EAR_COMMAND
 from rosproxy_operator.docker.planner.specs import (
+    HELPER_USER,
     NFT,
     PROXY_COMMAND,
-    REDIRECT_USER,
     ROLE_EAR,
+    ROLE_FLUSH,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
@@ -34,6 +35,8 @@ from rosproxy_operator.docker.planner.specs import (
     USER,
     OwnLabels,
     ear_name,
+    flush_command,
+    flush_name,
     is_kernel_host,
     proxy_name,
     published_ports,
@@ -56,6 +59,7 @@ _COMMANDS = {
     ROLE_EAR: EAR_COMMAND,
     ROLE_REDIRECT: (NFT,),
 }
+_HELPERS = (ROLE_REDIRECT, ROLE_FLUSH)
 _SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
 
 
@@ -86,10 +90,12 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
     """
     if not has_own_name(own, name):
         return f"its name is not {_name(own)}"
-    user = REDIRECT_USER if own.role == ROLE_REDIRECT else USER
+    user = HELPER_USER if own.role in _HELPERS else USER
     if making.user != user:
         return f"its user is not {user}"
-    command = _COMMANDS[own.role]
+    if own.role == ROLE_FLUSH and making.command != flush_command(own.key, own.range):
+        return "its command is not the operator's"
+    command = _COMMANDS.get(own.role, making.command)
     of_image = own.role == ROLE_PROXY and making.image == image_id
     # What a redirect runs ends with its rules: they are in its fingerprint, and so in its name.
     actual = making.command[:1] if own.role == ROLE_REDIRECT else making.command
@@ -100,6 +106,7 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
         ROLE_PROXY: _odd_proxy(making.host),
         ROLE_EAR: _odd_ear(making.host),
         ROLE_REDIRECT: _odd_redirect(making.host),
+        ROLE_FLUSH: _odd_flush(making.host),
     }
     return next((f"its HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
 
@@ -107,7 +114,8 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
 def _name(own: OwnLabels) -> str:
     if own.role == ROLE_REDIRECT:
         return redirect_name(own.key, own.fingerprint)
-    return {ROLE_SANDBOX: sandbox_name, ROLE_EAR: ear_name}.get(own.role, proxy_name)(own.key)
+    names = {ROLE_SANDBOX: sandbox_name, ROLE_EAR: ear_name, ROLE_FLUSH: flush_name}
+    return names.get(own.role, proxy_name)(own.key)
 
 
 def _odd(host: Mapping[str, Any]) -> Iterator[str]:
@@ -161,13 +169,24 @@ def _odd_ear(host: Mapping[str, Any]) -> Iterator[str]:
 
 def _odd_redirect(host: Mapping[str, Any]) -> Iterator[str]:
     """It has NET_ADMIN in another container's network, and nothing else."""
+    yield from _odd_helper(host)
+    if not str(host.get("NetworkMode")).startswith("container:"):
+        yield "NetworkMode"
+
+
+def _odd_flush(host: Mapping[str, Any]) -> Iterator[str]:
+    """It has NET_ADMIN in the host's network, and nothing else."""
+    yield from _odd_helper(host)
+    if host.get("NetworkMode") != "host":
+        yield "NetworkMode"
+
+
+def _odd_helper(host: Mapping[str, Any]) -> Iterator[str]:
     yield from _odd(host)
     if [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()] != ["NET_ADMIN"]:
         yield "CapAdd"
     if host.get("SecurityOpt") != ["no-new-privileges:true"]:
         yield "SecurityOpt"
-    if not str(host.get("NetworkMode")).startswith("container:"):
-        yield "NetworkMode"
     yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
 
 

@@ -21,12 +21,13 @@ from rosproxy_operator.docker.planner.container_steps import (
 )
 from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
+from rosproxy_operator.docker.planner.flush import flush_steps
 from rosproxy_operator.docker.planner.label_peers import with_bounded_peers
 from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.redirect import redirect_steps
-from rosproxy_operator.docker.planner.specs import master, unresolved_master
+from rosproxy_operator.docker.planner.specs import master, proxy_name, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
 from rosproxy_operator.docker.settings import PlanSettings
 
@@ -43,12 +44,14 @@ class Group:
     each other. When an action fails, the rest of its group is left out, so that a proxy is only
     removed when its successor was created; but a failed Connect or Disconnect stops nothing else.
     ``cure`` is what users can do where one fails again and again, in words; empty for nothing.
+    ``fatal``: a failure keeps an object from what its user wants (`Problem`).
     """
 
     key: Key | None
     actions: tuple[Action, ...]
     subject: str = ""
     cure: str = ""
+    fatal: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +116,7 @@ def plan(
     problems += _deaf(observed, settings, live)
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))
-    groups = [*_possible_groups(observed, settings, desired, planned, naming)]
+    groups = [*_possible_groups(observed, settings, desired, planned, naming, memory)]
     deferred = tuple(group for group in groups if _waits(group, observed, settings.uplink))
     docker_plan = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
@@ -160,13 +163,28 @@ def _possible_groups(
     desired: Collection[Desired],
     planned: Mapping[Key, list[Action] | None],
     naming: Naming,
+    memory: DockerMemory,
 ) -> Iterator[Group]:
-    """All groups but those of keys of which a container is busy, and the redirects'."""
+    """All groups but those of keys of which a container is busy, and those of helpers."""
     busy = {own.key for own in observed.own if own.container.name in observed.busy}
     groups = _groups(observed, settings.uplink, desired, planned, naming)
     yield from (group for group in groups if group.key not in busy)
     for steps in redirect_steps(observed, settings, desired):
         yield Group(steps.key, steps.actions, f"container {steps.container}", steps.cure)
+    yield from flush_groups(observed, settings, desired, memory.outdated_flushes)
+
+
+def flush_groups(
+    observed: HostState,
+    settings: PlanSettings,
+    desired: Collection[Desired],
+    outdated: Mapping[str, str],
+) -> Iterator[Group]:
+    """The groups that delete conntrack entries; each key's other work does not wait for them."""
+    for flush in flush_steps(observed, settings, desired, outdated):
+        if flush.actions:
+            subject = f"conntrack entries for {proxy_name(flush.key)}"
+            yield Group(flush.key, flush.actions, subject, flush.cure, fatal=False)
 
 
 def _groups(
@@ -232,7 +250,8 @@ def _delays(
             yield settings.grace - (now - memory.absent[wanted.key])
         if wanted.live and any(c.state == "removing" or c.name in memory.refusals for c in present):
             yield SOON
-    if any(r.container.state == "removing" for r in observed.redirects):
+    helpers = (*observed.redirects, *observed.flushes)
+    if any(helper.container.state == "removing" for helper in helpers):
         yield SOON
     for member in docker_plan.members:
         sandboxes = [s.container for s in observed.sandboxes_of(member.key)]

@@ -37,10 +37,9 @@ from rosproxy_operator.docker.planner.model import (
     RedirectContainer,
 )
 from rosproxy_operator.docker.planner.specs import (
-    COMMON,
     NFT,
-    REDIRECT_USER,
     digest,
+    helper_config,
     master,
     own_labels,
     proxy_name,
@@ -63,8 +62,6 @@ table ip $table {
 }
 """)
 """The source address is chosen before dnat, which may lead to another network: so masquerade."""
-MEMORY, PIDS = 64 * 1024**2, 16
-"""Bounds of the container that sets the rules, bytes and threads: nft has 5 MiB, and one."""
 RedirectSite = tuple[Key, str]
 """A proxy's key, and the id of the container whose network a redirect is in."""
 
@@ -85,21 +82,10 @@ class RedirectSteps:
 def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for what sets a redirect's rules."""
     return {
-        "Image": settings.proxy_image,
-        "User": REDIRECT_USER,
+        **helper_config(settings, f"container:{action.target}"),
         "Entrypoint": [NFT],
         "Cmd": [_rules(action)],
-        "Healthcheck": {"Test": ["NONE"]},
         "Labels": own_labels(action),
-        "HostConfig": {
-            **COMMON,
-            "RestartPolicy": {"Name": "no"},
-            "CapAdd": ["NET_ADMIN"],
-            "Init": False,
-            "Memory": MEMORY,
-            "PidsLimit": PIDS,
-            "NetworkMode": f"container:{action.target}",
-        },
     }
 
 

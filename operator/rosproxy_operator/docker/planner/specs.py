@@ -26,6 +26,7 @@ from rosproxy_operator.common.ros2 import (
 from rosproxy_operator.docker.planner.actions import (
     Create,
     CreateEar,
+    CreateFlush,
     CreateRedirect,
     CreateSandbox,
 )
@@ -38,6 +39,7 @@ ROLE_SANDBOX = "ports"
 ROLE_PROXY = "proxy"
 ROLE_EAR = "ear"
 ROLE_REDIRECT = "redirect"
+ROLE_FLUSH = "flush"
 MASTER_URI = "io.rosproxy.master-uri"
 DOMAIN = "io.rosproxy.domain"
 ADVERTISE_HOST = "io.rosproxy.advertise-host"
@@ -71,6 +73,7 @@ _ROLES = {
     Create: ROLE_PROXY,
     CreateEar: ROLE_EAR,
     CreateRedirect: ROLE_REDIRECT,
+    CreateFlush: ROLE_FLUSH,
 }
 EAR_MEMORY, EAR_PIDS = 128 * 1024**2, 64
 """Bytes and threads of an ear, which has 30 MiB and one."""
@@ -79,8 +82,28 @@ SANDBOX_COMMAND = ("sleep", "infinity")
 PROXY_COMMAND = ("rosproxy", "run")
 """What the proxy's image does by itself (its Dockerfile): the operator gives no other command."""
 NFT = "/usr/sbin/nft"
-REDIRECT_USER = "0:0"
+FLUSH = r"""
+/usr/sbin/conntrack -L -p udp --orig-port-dst "$1" >/dev/null
+/usr/sbin/conntrack -L -p udp |
+  sed -n 's/^udp *17 [0-9]* src=[^ ]* dst=[^ ]* sport=[0-9]* dport=\([0-9]*\) .*/\1/p' |
+  sort -un |
+  while read -r port; do
+    if [ "$port" -ge "$1" ] && [ "$port" -le "$2" ]; then
+      /usr/sbin/conntrack -D -p udp --orig-port-dst "$port" >/dev/null || :
+    fi
+  done
+"""
+"""Deletes the conntrack entries, of IPv4 and IPv6, for the UDP ports from ``$1`` to ``$2``.
+
+The first line fails where this may not be done. Each ``conntrack -D`` reads the whole table, which
+takes 10 ms, so it is run only for ports that have entries.
+"""
+HELPER_USER = "0:0"
 """Root: its capabilities need no file capabilities, which no-new-privileges would defeat."""
+HELPER_MEMORY = 64 * 1024**2
+"""Bytes of memory that a helper may have: nft and conntrack take 5 MiB."""
+HELPER_PIDS = 16
+"""Threads that a helper may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +137,11 @@ def ear_name(key: Key) -> str:
 def redirect_name(key: Key, fingerprint: str) -> str:
     """The name of a container that sets a redirect to a key's proxy, by what it is made of."""
     return f"{proxy_name(key)}-redirect-{fingerprint[:12]}"
+
+
+def flush_name(key: Key) -> str:
+    """The name of the container that deletes conntrack entries for a key's UDP ports."""
+    return f"{proxy_name(key)}-flush"
 
 
 def is_proxy_name(name: str) -> bool:
@@ -212,7 +240,17 @@ def _read_key(labels: Mapping[str, str]) -> Key | None:
     return Key("", host, int(domain)) if is_domain else None
 
 
-def own_labels(action: CreateSandbox | Create | CreateEar | CreateRedirect) -> dict[str, str]:
+Creation = CreateSandbox | Create | CreateEar | CreateRedirect | CreateFlush
+"""An action that creates a container."""
+
+
+def flush_command(key: Key, ports: PortRange) -> tuple[str, ...]:
+    """What deletes the conntrack entries for the UDP ports that a key's sandbox publishes."""
+    published = own_range(key, ports)
+    return ("/bin/sh", "-ec", FLUSH, "flush", str(published.first), str(published.last))
+
+
+def own_labels(action: Creation) -> dict[str, str]:
     """The labels of a container, from which `read_own` reads it back."""
     key = action.key
     return {
@@ -279,6 +317,27 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
             "Sysctls": sysctls,
         },
         "NetworkingConfig": {"EndpointsConfig": {settings.uplink: {}}},
+    }
+
+
+def helper_config(settings: PlanSettings, network_mode: str) -> dict[str, Any]:
+    """What all helpers have of the body of the engine's ``POST /containers/create``.
+
+    A helper does one thing in a network namespace with NET_ADMIN, and ends.
+    """
+    return {
+        "Image": settings.proxy_image,
+        "User": HELPER_USER,
+        "Healthcheck": {"Test": ["NONE"]},
+        "HostConfig": {
+            **COMMON,
+            "RestartPolicy": {"Name": "no"},
+            "CapAdd": ["NET_ADMIN"],
+            "Init": False,
+            "Memory": HELPER_MEMORY,
+            "PidsLimit": HELPER_PIDS,
+            "NetworkMode": network_mode,
+        },
     }
 
 

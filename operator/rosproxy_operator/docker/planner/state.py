@@ -35,7 +35,9 @@ class DockerMemory:
     when nobody wants them. ``served`` is the range on which a proxy was last seen to serve,
     ``planned`` the one with which one is being created. ``refusals`` are by the name of the
     sandbox. ``taken`` are ports that the engine has refused, and when. ``names`` are those that
-    containers have or had (`remember_names`).
+    containers have or had (`remember_names`). ``engine_returned``: the engine was not there, or not
+    listened to, before the look. ``outdated_flushes`` are flushes that ran before that, by id, with
+    the time of their last run.
     """
 
     exited: Mapping[str, float] = field(default_factory=dict)
@@ -46,6 +48,8 @@ class DockerMemory:
     taken: Mapping[int, float] = field(default_factory=dict)
     moved: Mapping[Key, Move] = field(default_factory=dict)
     names: FormerNames = field(default_factory=dict)
+    engine_returned: bool = False
+    outdated_flushes: Mapping[str, str] = field(default_factory=dict)
 
     def port_taken(self, name: str, port: int | None, now: float) -> "DockerMemory":
         """Note that the engine could not start the sandbox ``name``: a port of it is taken."""
@@ -68,6 +72,7 @@ def after_look(
     idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
     keys = (observed.keys | set(memory.served)) - live
     absent = {key: memory.absent.get(key, now) for key in sorted(keys)}
+    flushes = {r.container.id: r.container.started_at for r in observed.flushes}
     wanted = live | {key for key, since in absent.items() if now - since < grace}
     return DockerMemory(
         exited=memory.exited,
@@ -78,6 +83,7 @@ def after_look(
         taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
         moved={key: move for key, move in memory.moved.items() if now - move.at < MOVED_FOR},
         names=remember_names(memory.names, present_names(observed), observed.containers),
+        outdated_flushes=flushes if memory.engine_returned else memory.outdated_flushes,
     )
 
 

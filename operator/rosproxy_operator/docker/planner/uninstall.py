@@ -17,7 +17,7 @@ from rosproxy_operator.docker.planner.actions import RemoveNetwork
 from rosproxy_operator.docker.planner.container_steps import removal_steps
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import SERVING, HostState
-from rosproxy_operator.docker.planner.plan import DockerPlan, Group
+from rosproxy_operator.docker.planner.plan import DockerPlan, Group, flush_groups
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
@@ -66,6 +66,7 @@ def _groups(observed: HostState, settings: PlanSettings) -> Iterator[Group]:
     busy = {own.key for own in observed.own if own.container.name in observed.busy}
     for steps in redirect_steps(observed, settings, ()):
         yield Group(steps.key, steps.actions, f"container {steps.container}")
+    yield from flush_groups(observed, settings, (), {})
     for key in sorted(observed.keys - busy):
         # One that is already being removed is asked for again: the network has to wait for its end.
         if actions := tuple(removal_steps(observed, key, REASON, again=True)):

@@ -16,7 +16,7 @@ class Handler(BaseHTTPRequestHandler):
     server: "FakeEngine"
 
     def answer(self) -> None:
-        path = re.sub(r"^/v1\.41|\?.*$", "", self.path)
+        path = re.sub(r"^/v1\.\d+|\?.*$", "", self.path)
         call = f"{self.command} {path}"
         length = int(self.headers.get("Content-Length") or 0)
         self.server.calls[call] = json.loads(self.rfile.read(length) or "null")

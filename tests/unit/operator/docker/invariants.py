@@ -11,6 +11,7 @@ from rosproxy_operator.docker.planner.model import STARTED, Key, Member
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_EAR,
+    ROLE_FLUSH,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
@@ -134,6 +135,7 @@ class Invariants:
                         self.check_names(member, member.networks & fine)
 
         self.check_redirects(live)
+        self.check_flushes()
         self.check_no_name_is_shared()
 
     def check_no_name_is_shared(self) -> None:
@@ -150,6 +152,14 @@ class Invariants:
                     for name in box.networks[network][1] | {box.name}
                 }
                 assert not (names - container_names) & others, network
+
+    def check_flushes(self) -> None:
+        """Each sandbox with UDP ports has its conntrack entries deleted since its last start."""
+        flushes = {own.key: box for box, own in self.own(role=ROLE_FLUSH)}
+        assert len(flushes) == len(self.boxes(role=ROLE_FLUSH)), "one record for each key"
+        for sandbox, own in self.own("running", role=ROLE_SANDBOX):
+            if sandbox.udp and self.engine.image:
+                assert flushes[own.key].started > sandbox.started
 
     def check_redirects(self, live: list[Member]) -> None:
         """Who gives the address of his master is led to his proxy, and nobody else is."""
@@ -201,7 +211,7 @@ class Invariants:
 
     def check_key(self, key: Key, wanted: set[str], made: Create) -> None:
         every = [(box, own) for box, own in self.own() if own.key == key]
-        own = [(box, own) for box, own in every if own.role != ROLE_REDIRECT]
+        own = [(box, own) for box, own in every if own.role not in (ROLE_REDIRECT, ROLE_FLUSH)]
         if any(box.state == "restarting" and box.role == ROLE_SANDBOX for box, _ in own):
             return
         roles = [own.role for _, own in own]

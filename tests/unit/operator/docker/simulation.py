@@ -10,6 +10,7 @@ from rosproxy_operator.docker.planner.actions import (
     Connect,
     Create,
     CreateEar,
+    CreateFlush,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -27,6 +28,7 @@ from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     EarContainer,
+    FlushContainer,
     HostState,
     Key,
     Network,
@@ -38,9 +40,11 @@ from rosproxy_operator.docker.planner.own_containers import has_own_name
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_EAR,
+    ROLE_FLUSH,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
+    Creation,
     OwnLabels,
     own_labels,
     published_ports,
@@ -180,6 +184,11 @@ class Engine:
                 for box, is_ in own
                 if is_ and is_.role == ROLE_EAR
             ),
+            flushes=tuple(
+                FlushContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+                for box, is_ in own
+                if is_ and is_.role == ROLE_FLUSH
+            ),
             redirects=tuple(
                 RedirectContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
@@ -221,7 +230,7 @@ class Engine:
         match action:
             case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
                 self._apply_to_network(action)
-            case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
+            case CreateSandbox() | Create() | CreateEar() | CreateRedirect() | CreateFlush():
                 self._create(action)
             case Run(name):
                 self._run(self.own(name))
@@ -281,7 +290,7 @@ class Engine:
     def named(self, name: str) -> list[Box]:
         return [box for box in self.boxes if box.name == name]
 
-    def _create(self, action: CreateSandbox | Create | CreateEar | CreateRedirect) -> None:
+    def _create(self, action: Creation) -> None:
         name, labels, uplink = action.name, own_labels(action), self.settings.uplink
         if self.named(name) or not self.image:
             raise Failed(f"can't create {name}")
@@ -294,6 +303,8 @@ class Engine:
             self.join(self.add(name, labels=labels, ports=tcp, udp=udp), uplink)
         elif isinstance(action, CreateEar):
             self.add(name, labels=labels, udp=frozenset({action.bind.port}), mode="host")
+        elif isinstance(action, CreateFlush):
+            self.add(name, labels=labels, mode="host")
         elif isinstance(action, CreateRedirect):
             if action.target not in {box.id for box in self.boxes}:
                 raise Failed("no such container")
@@ -310,7 +321,7 @@ class Engine:
             if name not in self.networks or network_id not in ("", self.networks[name].id):
                 raise Failed(f"network {name} not found")
         taken = self.conflicts(box)
-        if box.role == ROLE_REDIRECT:
+        if box.role in (ROLE_REDIRECT, ROLE_FLUSH):
             self._run(box)
             return
         if box.role != ROLE_EAR and taken:
@@ -325,7 +336,11 @@ class Engine:
         box.networks = {n: (self.networks[n].id, names) for n, (_, names) in box.networks.items()}
 
     def _run(self, box: Box) -> None:
-        """Set the rules in the namespace that there is now, or fail at that."""
+        """Do the one thing, in the namespace that there is now, or fail at that."""
+        if box.role == ROLE_FLUSH:
+            box.state = "exited"
+            box.started = next(self.ids)
+            return
         home = self.home(box)
         if home is None or home.state not in STARTED:
             raise Failed("cannot join network of a non running container")

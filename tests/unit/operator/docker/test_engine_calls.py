@@ -18,6 +18,7 @@ from rosproxy_operator.docker.planner.actions import (
     Connect,
     Create,
     CreateEar,
+    CreateFlush,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -67,6 +68,7 @@ ACTIONS: list[Action] = [
     Remove("box", "", stop=True),
     CreateRedirect("r", KEY, RANGE, "talker", "2026-01-01T10:00:00Z"),
     Run("box"),
+    CreateFlush("f", KEY, RANGE),
 ]
 
 
@@ -101,6 +103,16 @@ async def test_the_documentation_lists_exactly_what_is_called(engine: FakeEngine
     assert [
         call for call in engine.calls if not any(re.fullmatch(pattern, call) for pattern in listed)
     ] == []
+
+
+@pytest.mark.parametrize(("version", "deletes"), [("1.41", False), ("1.42", True), ("1.50", True)])
+def test_engines_since_23_delete_conntrack_entries(
+    version: str, deletes: bool, engine: FakeEngine
+) -> None:
+    engine.knows["/version"] = {"ApiVersion": version}
+    client = DockerClient()
+    assert client.containers() == []
+    assert client.deletes_udp_entries is deletes
 
 
 async def test_uninstall_removes_a_network_besides(engine: FakeEngine) -> None:

@@ -113,6 +113,13 @@ async def test_what_fails_ends_its_group_and_is_tried_again_later(host: Host) ->
     assert host.work.busy
 
 
+async def test_a_failure_that_keeps_nothing_from_anybody_is_a_warning(host: Host) -> None:
+    host.does[Start("a")] = EngineError("no")
+    await host.start(Group(ONE, (Start("a"),), "conntrack entries", fatal=False))
+    (problem,) = host.work.problems
+    assert not problem.fatal
+
+
 async def test_other_actions_are_tried_at_once(host: Host) -> None:
     host.does[Start("a")] = EngineError("no")
     await host.start(Group(ONE, (Start("a"),)))

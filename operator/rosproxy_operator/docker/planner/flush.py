@@ -1,0 +1,135 @@
+"""The host's conntrack entries for a sandbox's UDP ports, deleted after each start of the sandbox.
+
+A datagram from outside that comes while its port is not published makes a conntrack entry without
+DNAT. The kernel looks at NAT rules for the first datagram of an entry alone, and such an entry
+lasts as long as outside goes on sending. So later datagrams bypass the port that is published by
+then: they end at the host, or come from Docker's port proxy with the gateway's address as source.
+Docker deletes such entries by itself since 23.0 (moby, pull request 44742), and needs no flush.
+
+A container of the proxy's image deletes the entries. The container joins the host's network, has
+NET_ADMIN there, runs ``conntrack`` for the ports of the sandbox, and ends. An entry that is deleted
+in vain costs nothing: the next datagram makes another one.
+
+The ended container stays as the record of its last run, since the operator has no disk. The
+container runs again after each start of the sandbox, whether by the operator or by the engine, and
+when the engine has returned: with live-restore an engine publishes the ports of running sandboxes
+anew.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from msgspec.structs import replace
+
+from rosproxy_operator.docker.planner.actions import Action, CreateFlush, Remove, Run
+from rosproxy_operator.docker.planner.instants import instant
+from rosproxy_operator.docker.planner.model import Desired, FlushContainer, HostState, Key, Sandbox
+from rosproxy_operator.docker.planner.specs import (
+    digest,
+    flush_command,
+    flush_name,
+    helper_config,
+    own_labels,
+    own_range,
+)
+from rosproxy_operator.docker.settings import PlanSettings
+
+
+@dataclass(frozen=True, slots=True)
+class FlushSteps:
+    """The steps for the flush of one key. ``cure`` says what users can do where a step fails."""
+
+    key: Key
+    actions: tuple[Action, ...]
+    cure: str = ""
+
+
+def flush_config(action: CreateFlush, settings: PlanSettings) -> dict[str, Any]:
+    """The body of the engine's ``POST /containers/create`` for what deletes conntrack entries."""
+    command = flush_command(action.key, action.range)
+    return {
+        **helper_config(settings, "host"),
+        "Entrypoint": [command[0]],
+        "Cmd": [*command[1:]],
+        "Labels": own_labels(action),
+    }
+
+
+def flush_steps(
+    observed: HostState,
+    settings: PlanSettings,
+    desired: Iterable[Desired],
+    outdated: Mapping[str, str],
+) -> Iterator[FlushSteps]:
+    """The steps after which no sandbox has entries from before its ports were published.
+
+    ``outdated`` are records whose last run does not count, by id with the time of that run.
+    """
+    live = {wanted.key for wanted in desired if wanted.live}
+    records: dict[Key, list[FlushContainer]] = {}
+    for record in observed.flushes:
+        records.setdefault(record.key, []).append(record)
+    for key in sorted(live | records.keys()):
+        existing = records.get(key, [])
+        if any(r.container.state == "removing" for r in existing) or _is_busy(key, observed):
+            continue
+        is_published = bool(observed.sandboxes_of(key)) or key in live
+        if observed.deletes_udp_entries or not is_published:
+            gone = (Remove(r.container.name, "it is needed no more") for r in existing)
+            yield FlushSteps(key, tuple(gone))
+        elif key in live and (sandbox := _published(key, observed)):
+            steps = _steps(sandbox, existing, outdated, observed, settings)
+            yield FlushSteps(key, tuple(steps), _cure(sandbox))
+
+
+def _is_busy(key: Key, observed: HostState) -> bool:
+    """Whether not everything is known of a key's records or sandboxes."""
+    containers = [*observed.flushes, *observed.sandboxes]
+    return any(o.key == key and o.container.name in observed.busy for o in containers)
+
+
+def _published(key: Key, observed: HostState) -> Sandbox | None:
+    """The running sandbox of a key that publishes UDP ports; None without one."""
+    running = (s for s in observed.sandboxes_of(key) if s.container.state == "running")
+    return next((s for s in running if s.container.udp_ports), None)
+
+
+def _steps(
+    sandbox: Sandbox,
+    records: Iterable[FlushContainer],
+    outdated: Mapping[str, str],
+    observed: HostState,
+    settings: PlanSettings,
+) -> Iterator[Action]:
+    action = CreateFlush(flush_name(sandbox.key), sandbox.key, sandbox.range)
+    body = {**flush_config(action, settings), "Image": observed.image_id}
+    action = replace(action, fingerprint=digest(body))
+    usable = None
+    for record in records:
+        if record.fingerprint == action.fingerprint and record.container.state != "dead":
+            usable = record
+        elif observed.image_id:
+            yield Remove(record.container.name, "outdated")
+    if usable is None and observed.image_id:
+        yield action
+        yield Run(action.name)
+    elif usable and not _is_current(usable, sandbox, outdated):
+        yield Run(usable.container.name)
+
+
+def _is_current(record: FlushContainer, sandbox: Sandbox, outdated: Mapping[str, str]) -> bool:
+    """Whether a record's last run came after the ports of a sandbox were published."""
+    ran_at = record.container.started_at
+    is_later = instant(ran_at) > instant(sandbox.container.started_at)
+    return record.done and is_later and outdated.get(record.container.id) != ran_at
+
+
+def _cure(sandbox: Sandbox) -> str:
+    """How users delete the entries themselves."""
+    ports = own_range(sandbox.key, sandbox.range)
+    return (
+        "datagrams of nodes that went on sending while the ports were not published may bypass the "
+        f"ports. Run as root: for port in $(seq {ports.first} {ports.last}); do conntrack -D -p "
+        "udp --orig-port-dst $port; done"
+    )
