@@ -30,17 +30,6 @@ class PrivateEngine:
         with self.log.open("ab") as log:
             self._daemon = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         wait_until(self._answers, 60, self.log.read_text)
-        self._forget_flows()
-
-    def _forget_flows(self) -> None:
-        """Have the kernel forget which way datagrams went while no port was published.
-
-        Engines since 23.0 do (github.com/moby/moby/pull/44742). Debian 12 has 20.10, after whose
-        restart a flow that has gone on meanwhile does not reach the port any more.
-        """
-        command = ["nsenter", f"--net={self.namespace}", "conntrack", "-D", "-p", "udp"]
-        told = run(*command, check=False)  # it fails where there was none
-        assert "flow entries have been deleted" in told, told
 
     def end(self, number: int = signal.SIGTERM) -> None:
         """End the engine; it ends its containers unless it was started with --live-restore."""
