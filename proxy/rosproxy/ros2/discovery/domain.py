@@ -26,10 +26,9 @@ Every datagram may be forged. So
 - each source may make only so much discovery in a second, what it leads to included.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import Standing, cost
@@ -37,14 +36,12 @@ from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import LanRelay, Outgoing, sent_to
 from rosproxy.ros2.discovery.hidden_endpoints import has_changed
 from rosproxy.ros2.protocol.addressing import (
-    destination,
     destinations,
     for_all,
     may_be_discovery,
 )
 from rosproxy.ros2.protocol.envelope import unwrapped
 from rosproxy.ros2.protocol.relay_proof import Direction
-from rosproxy.ros2.protocol.reliable import acknack, heartbeats
 from rosproxy.ros2.protocol.rtps import (
     MAGIC,
     NO_VENDOR,
@@ -61,11 +58,10 @@ from rosproxy.ros2.registry.participants import (
     OutsideParticipant,
 )
 from rosproxy.ros2.rewriting.discovery import (
-    BuiltinWriter,
     DiscoveryMessage,
+    credited_messages,
     read_discovery,
     require_rewritable,
-    rewritten,
 )
 
 ANNOUNCED_AGAIN = 0.5
@@ -144,7 +140,7 @@ class Domain(DomainParticipants):
             return []
         sent = list[Outgoing]()
         try:
-            for message, received in _credited(datagram):
+            for message, received in credited_messages(datagram):
                 if by_relay and message.of_participant is None:
                     raise RtpsError("the LAN relay carries announcements of participants alone")
                 sent += self._heard_outside(message, source, by_relay, received, now)
@@ -251,17 +247,9 @@ class Domain(DomainParticipants):
         sent = self.settings.to_outside(self.own.observer.farewell())
         self.settings.hosts = hosts
         for insider in self.inside.by_prefix.values():
-            sent += self._unless_malformed(insider.address, partial(self._move, insider, now))
+            move = partial(self.rediscovery.move, insider, now)
+            sent += self._unless_malformed(insider.address, move)
         return sent
-
-    def _move(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """Lead the locators of a participant's announcement to the present hosts. RtpsError."""
-        message = read_discovery(insider.announcement)
-        insider.announcement = rewritten(message, self._at_present_host, lambda _: False)
-        return self.rediscovery.separate(insider, now)
-
-    def _at_present_host(self, _: int, locator: HostPort) -> HostPort:
-        return HostPort(self.settings.host_for(locator.host), locator.port)
 
     def retire(self, now: float) -> list[Outgoing]:
         """Have all inside and all outside forget each other, as no proxy takes over.
@@ -533,27 +521,9 @@ class Domain(DomainParticipants):
     ) -> list[Outgoing]:
         """What answers an announcement of a participant that was not heard before, at no peer's."""
         if source_vendor(message.datagram) == NO_VENDOR:
-            return self._answer_to_proxy(insider, message, source)
+            return self.own.answer_to_proxy(insider, message, source)
         text = "a participant that was not heard before, at an address that is no peer's"
         return self._drop("not_a_peer", source, text)
-
-    def _answer_to_proxy(
-        self, insider: InsideParticipant, message: DiscoveryMessage, source: str
-    ) -> list[Outgoing]:
-        """The answer to another proxy that asks a participant inside to prove that it receives.
-
-        The participant knows nothing of the participants of proxies outside, so it can't answer
-        itself. The answer is shorter than the question. Raises RtpsError.
-        """
-        spdp = message.of_participant
-        target = first_metatraffic(spdp, message.datagram, source) if spdp else None
-        asked = [h for h in heartbeats(message.datagram) if h.writer == BuiltinWriter.PUBLICATIONS]
-        if destination(message.datagram) != insider.prefix or not asked:
-            return []
-        answer = acknack(
-            insider.prefix, message.prefix, asked[0].writer, asked[0].first, (), 1, final=True
-        )
-        return sent_to(target, [answer])
 
     def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
         """A datagram that goes to participants outside, as far as they may be sent any."""
@@ -616,21 +586,8 @@ def _pass_on_each(
     """What is passed on of a datagram, and what goes back, of all who send in it. RtpsError."""
     passed = list[bytes]()
     back = list[Outgoing]()
-    for message, received in _credited(datagram):
+    for message, received in credited_messages(datagram):
         forwarded, replies = pass_on(message, received)
         passed += forwarded
         back += replies
     return passed, back
-
-
-def _credited(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]:
-    """Each participant's message in a datagram, and how many of the received bytes are its own.
-
-    The messages together may be longer than the datagram (`by_source`); the numbers together are
-    not, so no participant is sent more than came in its name. Raises RtpsError.
-    """
-    remaining = len(datagram)
-    for message in map(read_discovery, by_source(datagram)):
-        received = min(len(message.datagram), remaining)
-        remaining -= received
-        yield message, received

@@ -10,6 +10,7 @@ from functools import partial
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
+from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
@@ -17,8 +18,10 @@ from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.port_keeper import Keeper
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
+from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.reliable import acknack, heartbeats
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
 
 
 @dataclass(slots=True)
@@ -107,6 +110,24 @@ class OwnParticipants:
         rewrite = partial(self.outside.observed, outsider)
         questions = self._ask(self.settings.discovery_port, message, rewrite)
         return self.outside.allowed_questions(outsider, questions)
+
+    def answer_to_proxy(
+        self, insider: InsideParticipant, message: DiscoveryMessage, source: str
+    ) -> list[Outgoing]:
+        """The answer to another proxy that asks a participant inside to prove that it receives.
+
+        The participant knows nothing of the participants of proxies outside, so it can't answer
+        itself. The answer is shorter than the question. Raises RtpsError.
+        """
+        spdp = message.of_participant
+        target = first_metatraffic(spdp, message.datagram, source) if spdp else None
+        asked = [h for h in heartbeats(message.datagram) if h.writer == BuiltinWriter.PUBLICATIONS]
+        if destination(message.datagram) != insider.prefix or not asked:
+            return []
+        answer = acknack(
+            insider.prefix, message.prefix, asked[0].writer, asked[0].first, (), 1, final=True
+        )
+        return sent_to(target, [answer])
 
     def forget(self, prefix: bytes) -> None:
         """Forget what a participant that has gone has told."""

@@ -18,11 +18,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.participants import InsideParticipant
+from rosproxy.ros2.rewriting.discovery import read_discovery, rewritten
 
 APART_TIME = 0.4
 """Seconds in which a farewell arrives, and is taken in, on both sides."""
@@ -50,6 +52,15 @@ class Rediscovery:
         inwards = [sent for o in outsiders for sent in self.outside.farewell_to(o, insider, now)]
         return inwards + self.settings.to_outside(datagram)
 
+    def move(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+        """Announce a participant at the present addresses of the advertised host. RtpsError.
+
+        All outside have to meet it anew.
+        """
+        message = read_discovery(insider.announcement)
+        insider.announcement = rewritten(message, self._at_present_host, lambda _: False)
+        return self.separate(insider, now)
+
     def proceed(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
         """Part one that has waited, or introduce one that is apart for long enough. RtpsError."""
         if insider.parting_from is not None and self._may_part(insider.parting_from, now):
@@ -70,6 +81,9 @@ class Rediscovery:
         for insider in insiders:
             if insider.farewell_times is not None:
                 insider.farewell_times.pop(prefix, None)
+
+    def _at_present_host(self, _: int, locator: HostPort) -> HostPort:
+        return HostPort(self.settings.host_for(locator.host), locator.port)
 
     def _may_part(self, waits_from: float, now: float) -> bool:
         no_ear = self.settings.relay is None

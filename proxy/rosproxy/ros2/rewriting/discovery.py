@@ -36,6 +36,7 @@ from rosproxy.ros2.protocol.rtps import (
     RtpsError,
     Sample,
     apply,
+    by_source,
     has_checksum,
     samples,
     source_prefix,
@@ -178,6 +179,19 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
     if len(datagram) > LONGEST_OF_PARTICIPANT and message.of_participant is not None:
         raise RtpsError(f"a participant's announcement in {len(datagram)} bytes")
     return message
+
+
+def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]:
+    """Each participant's message in a datagram, and how many of the received bytes are its own.
+
+    The messages together may be longer than the datagram (`by_source`); the numbers together are
+    not, so no participant is sent more than came in its name. Raises RtpsError.
+    """
+    remaining = len(datagram)
+    for message in map(read_discovery, by_source(datagram)):
+        received = min(len(message.datagram), remaining)
+        remaining -= received
+        yield message, received
 
 
 def rewritten(
