@@ -255,7 +255,7 @@ class Domain(DomainParticipants):
         """Have all inside and all outside forget each other, as no proxy takes over.
 
         Participants may go on, and meet anew by a proxy that is started later. So both sides have
-        to forget (`Rediscovery`), and no dispose message may have `LAST_SEQUENCE`.
+        to forget (`Rediscovery`).
         """
         sent = list[Outgoing]()
         self.returning.forget({insider.address for insider in self.inside.by_prefix.values()})

@@ -23,9 +23,14 @@ from rosproxy.ros2.discovery.port_keeper import Keeper
 from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
-from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
+from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
-from rosproxy.ros2.registry.participants import InsideParticipant, LeaseKind, OutsideParticipant
+from rosproxy.ros2.registry.participants import (
+    InsideParticipant,
+    LeaseKind,
+    OutsideParticipant,
+    Participant,
+)
 
 
 @dataclass(slots=True)
@@ -94,13 +99,19 @@ class DomainParticipants:
         """Whether a participant inside keeps all the ports that it has, for the next process."""
         return self.own.keeper.keeps(participant.prefix, participant.ports)
 
-    def expire(self, now: float) -> None:
-        """Forget those that have not been heard for as long as they said."""
+    def expire(self, now: float) -> list[Outgoing]:
+        """Forget participants that have not been heard for as long as they said.
+
+        Return what outside is told. A participant on two networks may have lost the one at which it
+        was served, and is let in again at the other.
+        """
+        sent = list[Outgoing]()
         for insider in [p for p in self.inside.by_prefix.values() if p.until < now]:
-            self._forget_inside(insider)
+            sent += self._end_for(insider)
         for outsider in [p for p in self.outside.by_prefix.values() if p.until < now]:
             self._forget_outside(outsider)
         self.proofs.expire(now, self.inside.count_by_address, self.outside.count_by_address)
+        return sent
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:
         """End the participants at addresses inside where nobody is any more; what outside is told.
@@ -114,15 +125,20 @@ class DomainParticipants:
         return sent
 
     def _end_for(self, insider: InsideParticipant) -> list[Outgoing]:
-        """End a participant inside on its behalf; what outside is told."""
+        """End a participant inside on its behalf; what outside is told.
+
+        It may live, and come back by other ports. Outside has to meet it anew then.
+        """
+        ended = _farewell_of(insider)
         self._forget_inside(insider)
-        return self.settings.to_outside(farewell(insider.prefix, insider.vendor, LAST_SEQUENCE))
+        self.returning.displace(insider.prefix)
+        return self.settings.to_outside(ended)
 
     def _end_outside(
         self, outsider: OutsideParticipant, inside: Iterable[InsideParticipant]
     ) -> list[Outgoing]:
         """Forget a participant outside, and tell some inside that it has ended."""
-        ended = farewell(outsider.prefix, outsider.vendor, LAST_SEQUENCE)
+        ended = _farewell_of(outsider)
         told = list(inside) if outsider.is_introduced else []
         self._forget_outside(outsider)
         return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
@@ -162,10 +178,7 @@ class DomainParticipants:
         """
         text = f"{insider.guid_prefix} gives back a port that another participant has claimed"
         self.refused("port_claim", insider.address, text)
-        number = next_number(insider.announcement) if insider.announcement else LAST_SEQUENCE
-        self._forget_inside(insider)
-        self.returning.displace(insider.prefix)
-        return self.settings.to_outside(farewell(insider.prefix, insider.vendor, number))
+        return self._end_for(insider)
 
     def _forget_inside(self, insider: InsideParticipant) -> None:
         self.inside.forget(insider)
@@ -182,3 +195,13 @@ class DomainParticipants:
     def _drop(self, reason: str, source: str, text: str) -> list[Outgoing]:
         self.refused(reason, source, text)
         return []
+
+
+def _farewell_of(participant: Participant) -> bytes:
+    """The dispose message of a participant that may come back.
+
+    The number is the next one after that of its last announcement: Fast DDS takes no older sample
+    of the same writer (StatelessReader.cpp), so a greater one would keep it out for good.
+    """
+    number = next_number(participant.announcement) if participant.announcement else 1
+    return farewell(participant.prefix, participant.vendor, number)

@@ -33,7 +33,7 @@ class ReturningParticipants:
 
     At one address as many may wait as there may be participants. ``former`` are the ports of those
     that knew the proxy at another address, or with another range, by prefix, until they have gone.
-    ``displaced`` are those that had to give back a port since the start.
+    ``displaced`` are those that the proxy has ended, and that may live: the last ones.
     Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp,
     PDPSimple::updateInfoMatchesEDP): both must meet all outside anew.
     """
@@ -44,7 +44,7 @@ class ReturningParticipants:
     proofs: AddressProofs
     waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
     former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
-    displaced: set[bytes] = field(default_factory=set)
+    displaced: dict[bytes, None] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
 
     def is_waiting(self, prefix: bytes, source: str) -> bool:
@@ -143,14 +143,15 @@ class ReturningParticipants:
         return prefix in self.former or prefix in self.displaced
 
     def displace(self, prefix: bytes) -> None:
-        """Note that a participant has lost a port, and with it all that is known of it."""
-        if len(self.displaced) < MOST_WAITING:
-            self.displaced.add(prefix)
+        """Note that a participant has lost its ports, and with them all that is known of it."""
+        if len(self.displaced) >= MOST_WAITING:
+            del self.displaced[next(iter(self.displaced))]
+        self.displaced[prefix] = None
 
     def forget_participant(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
         self.former.pop(prefix, None)
-        self.displaced.discard(prefix)
+        self.displaced.pop(prefix, None)
         self.keeper.forget(prefix)
         self.ports.forget_claims(prefix)
 

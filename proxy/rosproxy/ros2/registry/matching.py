@@ -24,8 +24,8 @@ from rosproxy.ros2.protocol.ros_names import ros_name, ros_type
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 
 MOST_LOOKED_AT = 10_000
-"""Readers and writers of a side that are looked at, in 0.1 s at most; a participant of ROS 2 has some
-tens. The addresses of the side take turns."""
+"""Readers and writers of a side that are looked at, in 0.1 s at most. A participant of ROS 2 has
+some tens. The addresses of the side take turns."""
 MOST_COMPARED = 20_000
 """Pairs that are compared at a time. The addresses inside take turns, and in the turns of each of
 them its readers and writers; each meets those outside in the order of their addresses' turns."""

@@ -170,7 +170,7 @@ class DomainServer:
         """Let in participants that have waited, and forget those that have gone."""
         self._release()
         self._open_and_send(self.domain.settle(self._now()))
-        self.domain.expire(self._now())
+        self._send(self.domain.expire(self._now()))
         self._sync_stand_ins()
         self._tell_changes()
 

@@ -12,9 +12,9 @@ from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import BURST, STEP, cost
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
+from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
-from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
@@ -29,6 +29,7 @@ from tests.unit.ros2.discovery.domains import (
     NEAR,
     NOW,
     OTHER,
+    RANGE,
     ROBOT,
     STRANGER,
     A,
@@ -441,6 +442,7 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
     domain = make_domain()
     meet(domain), meet(domain, B, OTHER)
     taken = domain.ports.pool.free
+    announced = domain.inside.by_prefix[A].announcement
 
     sent = domain.gone({INSIDE})
 
@@ -450,12 +452,44 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
     assert (announcement.ended, announcement.sample.prefix, announcement.sample.sequence) == (
         True,
         A,
-        LAST_SEQUENCE,
+        next_number(announced),
     )
     assert source_vendor(ended) == A[:2]
     assert [*domain.inside.by_prefix] == [B]
     assert domain.ports.pool.free == taken + 2
     assert domain.gone({INSIDE}) == []
+
+
+@pytest.mark.parametrize("is_told", [False, True], ids=["expires", "told"])
+def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
+    is_told: bool,
+) -> None:
+    """It was ended without a word to outside, or with a number that it never reaches."""
+    domain = make_domain()
+    meet(domain)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    domain.rediscovery.ear_heard = True
+    first = domain.inside.by_prefix[A].announcement
+    elsewhere = spdp(A, OTHER)
+    assert not to(domain.heard_inside(elsewhere, OTHER, NOW), ROBOT), "it is served at the first"
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 15)
+    ended = domain.gone({INSIDE}) if is_told else domain.expire(NOW + 21)
+    (farewell_of_first,) = to(ended, ROBOT)
+    (announcement,) = read_discovery(farewell_of_first).announcements
+    assert announcement.ended
+    assert announcement.sample.sequence == next_number(first)
+
+    domain.heard_inside(elsewhere, OTHER, NOW + 22)
+    parted = domain.settle(NOW + 22)
+    (forgets_robot,) = to(parted, OTHER)
+    assert source_prefix(forgets_robot) == B
+    assert read_discovery(forgets_robot).announcements[0].ended
+    met = domain.settle(NOW + 22 + APART_TIME)
+    (again,) = to(met, ROBOT)
+    assert source_prefix(again) == A
+    ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
+    assert {locator.port for locator in reached_at(again)} == ports
+    assert [source_prefix(datagram) for datagram in to(met, OTHER)] == [B]
 
 
 def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
@@ -471,9 +505,9 @@ def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
     (outward,) = read_discovery(ended).announcements
     (inward,) = (read_discovery(datagram).announcements[0] for datagram in to(sent, INSIDE))
     assert (outward.ended, outward.sample.prefix) == (True, A)
-    assert outward.sample.sequence == next_number(announced) < LAST_SEQUENCE
+    assert outward.sample.sequence == next_number(announced)
     assert (inward.ended, inward.sample.prefix) == (True, B)
-    assert inward.sample.sequence < LAST_SEQUENCE
+    assert inward.sample.sequence == next_number(spdp(B, ROBOT))
     assert not domain.inside.by_prefix
     assert domain.retire(NOW) == []
 
