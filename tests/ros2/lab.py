@@ -121,6 +121,15 @@ class Lab:
                 asking.request("GET", path)
                 return asking.getresponse().read()
 
+    def tell(self, path: str, **body: object) -> dict[str, int]:
+        """What the proxy answers when an operator tells it something."""
+        with self.place(self.proxy_role).entered():
+            asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
+            with closing(asking):
+                asking.request("POST", path, json.dumps(body))
+                answer: dict[str, int] = json.loads(asking.getresponse().read())
+        return answer
+
     def tool(self, command: str, *names: str, fails: bool = False) -> str:
         """What a command prints that looks at the proxy, where that runs."""
         argv = [sys.executable, "-m", "rosproxy", command, *names]
