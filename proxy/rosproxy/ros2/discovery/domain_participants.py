@@ -76,6 +76,7 @@ class DomainParticipants:
         )
         inside = InsideParticipants(settings, ports, refused, proofs)
         outside = OutsideParticipants(settings, refused, proofs)
+        settings.participants_at = outside.count_by_address.__getitem__
         returning = ReturningParticipants(settings, ports, keeper, proofs)
         fragments = FragmentStores()
         participants = OwnParticipants(

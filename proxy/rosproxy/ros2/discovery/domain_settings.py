@@ -13,7 +13,10 @@ from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST = 250, 7400, 7410
 """DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
 PARTICIPANTS_TRIED = 32
-"""How many well-known ports of a peer are told of participants inside: each program has one."""
+"""How many well-known ports of a peer are told of participants inside: each program has one. Where
+many participants are known, twice as many ports are told, up to `MOST_TRIED`."""
+MOST_TRIED = 120
+"""The well-known ports of a domain; the next ones belong to the next domain (9.6.2.3)."""
 NEXT_PORTS = 2
 """How many more well-known ports are used than participants are known at an address."""
 
@@ -84,7 +87,8 @@ class DomainSettings:
     those outside that are told of participants inside, with port 0 at their well-known ports;
     ``relay`` is the program that passes announcements on to the LAN.
     ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
-    ``is_inside`` tells whether an address lies in an inside network.
+    ``is_inside`` tells whether an address lies in an inside network. ``participants_at`` counts the
+    participants outside that are known at an address.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
     ``keeper_key`` proves which ports participants had (`port_keeper.keeper_key`).
     """
@@ -100,6 +104,7 @@ class DomainSettings:
     peers: tuple[HostPort, ...] = ()
     relay: LanRelay | None = None
     keeper_key: bytes = field(default=b"", repr=False)
+    participants_at: Callable[[str], int] = lambda _: 0
 
     @property
     def host(self) -> str:
@@ -130,7 +135,7 @@ class DomainSettings:
         """A datagram for all to whom participants inside are announced: the LAN and all peers."""
         sent = self.to_lan(datagram)
         for peer in self.peers:
-            targets = [peer] if peer.port else self.well_known(peer.host)
+            targets = [peer] if peer.port else self.well_known_of_peer(peer.host)
             sent += [Outgoing(target, datagram) for target in targets]
         return sent
 
@@ -144,6 +149,11 @@ class DomainSettings:
         """Where the first participants of a host are told of others (9.6.2.3)."""
         ports = range(self.unicast_port, self.unicast_port + 2 * count, 2)
         return [HostPort(host, port) for port in ports]
+
+    def well_known_of_peer(self, host: str) -> list[HostPort]:
+        """Where the participants of a peer are told of others."""
+        count = min(2 * self.participants_at(host), MOST_TRIED)
+        return self.well_known(host, max(PARTICIPANTS_TRIED, count))
 
     def is_peer(self, address: str) -> bool:
         """Whether an address is a peer's."""

@@ -30,8 +30,8 @@ from rosproxy.ros2.discovery.domain_settings import (
     MOST_OUTSIDE_UNPROVEN,
     MOST_PER_HOST,
     MOST_PER_UNPROVEN,
+    MOST_TRIED,
     NEXT_PORTS,
-    PARTICIPANTS_TRIED,
     DomainSettings,
     Outgoing,
     Refused,
@@ -215,7 +215,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             if peer.port:
                 targets = [peer]
             elif not count:
-                targets = self.settings.well_known(peer.host)
+                targets = self.settings.well_known_of_peer(peer.host)
             else:
                 targets = self._met_at(peer.host, count)
             sent += [Outgoing(target, datagram) for target in targets]
@@ -223,7 +223,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
     def _met_at(self, host: str, count: int) -> list[HostPort]:
         met = (p.metatraffic for p in self.by_prefix.values() if p.address == host)
-        next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, PARTICIPANTS_TRIED))
+        next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, MOST_TRIED))
         return list(dict.fromkeys([*next_ports, *filter(None, met)]))
 
     def is_met(self, source: str) -> bool:

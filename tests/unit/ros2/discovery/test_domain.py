@@ -409,6 +409,29 @@ def test_an_announcement_is_repeated_where_a_peers_participants_are() -> None:
     assert targets_of(domain, spdp(bytes([7]) * 12, INSIDE, 7420), NOW + 6) == everywhere
 
 
+def test_a_peer_with_many_participants_is_told_at_more_ports() -> None:
+    """A robot had 46 of them, and 32 were met."""
+    domain = make_domain(peers=())
+    domain.settings.peers = (HostPort(ROBOT, 0),)
+
+    def ports_told() -> set[int]:
+        announced = domain.own.announced_outside()
+        return {sent.target.port for sent in announced if sent.target.host == ROBOT}
+
+    def meet_robots(count: int) -> None:
+        for number in range(count):
+            prefix = b"\x01\x0f" + number.to_bytes(10, "big")
+            domain.heard_outside(spdp(prefix, ROBOT, 7410 + 2 * number), ROBOT, NOW)
+
+    assert ports_told() == set(range(7410, 7410 + 2 * 32, 2))
+    meet_robots(32)
+    assert ports_told() == set(range(7410, 7410 + 2 * 64, 2))
+    meet_robots(46)
+    assert ports_told() == set(range(7410, 7410 + 2 * 92, 2))
+    meet_robots(200)
+    assert max(ports_told()) < 7650, "the next ports are those of the next domain"
+
+
 @pytest.mark.parametrize("outside", [False, True])
 def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
     """Cyclone DDS answers the observer's announcement with its own, which names the observer."""
