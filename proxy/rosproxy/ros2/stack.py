@@ -327,7 +327,9 @@ class Ros2:
             for peer, addresses in zip(peers, found, strict=True)
         }
         addresses_of_all = tuple(chain.from_iterable(self._addresses_of_peers.values()))
-        self._peer_addresses = frozenset(peer.host for peer in addresses_of_all)
+        hosts = (peer.host for peer in addresses_of_all)
+        # In a trial on one machine both sides may have one address.
+        self._peer_addresses = frozenset(host for host in hosts if not addresses.is_loopback(host))
         for server in self.servers:
             server.ask_outside(addresses_of_all)
 

@@ -105,6 +105,16 @@ async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
     assert ros2._is_inside("192.0.2.9")
 
 
+async def test_a_peer_on_loopback_may_be_inside_as_well() -> None:
+    """In a trial on one machine both sides may have one address."""
+    told: dict[str, Any] = {"ros": ("2",), "advertise_host": "127.0.0.1"}
+    told |= {"ros2_peer": ("127.0.0.1:7410",), "inside_network": ("127.0.0.1/32",)}
+    ros2 = Ros2(Runtime(parse_settings(told)))
+    ros2.servers.append(cast(DomainServer, Listening()))
+    await ros2._refresh()
+    assert ros2._is_inside("127.0.0.1")
+
+
 LAN = ip_network("192.0.2.0/24")
 BRIDGE = ip_network("172.30.0.0/24")
 
