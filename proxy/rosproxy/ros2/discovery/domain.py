@@ -300,6 +300,7 @@ class Domain(DomainParticipants):
         """Let in a participant inside, unless its prefix is that of a participant outside."""
         if not self.owners.yields_to_inside(message.prefix, source):
             outsider = self.outside.by_prefix[message.prefix]
+            self.returning.forget_participant(message.prefix)
             text = f"GUID prefix {outsider.guid_prefix} belongs to a participant outside, at "
             return self._drop("prefix", source, text + outsider.address)
         sent = self._give_prefix_to_inside(message.prefix, source)

@@ -395,3 +395,15 @@ def test_what_the_lan_relay_hears_of_itself_is_no_claim() -> None:
     (announced,) = [d for d in to(meet(domain), EAR.host) if source_prefix(d) == A]
     assert domain.heard_outside(carried(HOST, announced), EAR.host, NOW) == []
     assert not reasons_of(domain)
+
+
+def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
+    """It waits, answers the keeper, and is refused, since a peer's participant has the prefix."""
+    domain = restarted()
+    domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), EAR.host, SETTLING)
+    come(domain, A, INSIDE, 1, SETTLING)
+    assert A in domain.own.keeper.number_by_prefix
+    domain.settle(SETTLING + ANSWER_TIME)
+    assert A not in domain.inside.by_prefix
+    assert reasons_of(domain)["prefix"]
+    assert A not in domain.own.keeper.number_by_prefix
