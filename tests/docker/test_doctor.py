@@ -3,6 +3,7 @@
 import json
 import urllib.request
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,32 @@ def test_what_has_ended_is_nothing_wrong(process: Process, net: Inside, named: R
         wait_until(lambda: wrong(asking) == (0, []), 60, lambda: str(wrong(asking)))
         said = docker("exec", the_proxy().name, "rosproxy", "doctor")
         assert "1 of 1 answer; those that have ended still hold" in said
+    finally:
+        process.stop()
+        remove_proxies()
+
+
+def test_a_removed_container_is_nothing_wrong(process: Process, net: Inside, named: Robot) -> None:
+    """While its port is still kept."""
+    process.start()
+    try:
+        network = net.network()
+        stays = net.node(network, "roscpp", "sub", "--topic", "/out")
+        node = net.node(network, "rospy", "pub", "--topic", "/out")
+        for made in (stays, node):
+            wait_until(partial(named.knows_proxied, made.node), 60, made.log.read)
+        stays.log.wait_for("")
+        asking = Process(process._directory, names={named.name: named.address})
+        asking.options = process.options
+
+        docker("rm", "--force", node.name)
+
+        held = "1 of 1 answer; those that have ended still hold 1 port"
+        doctor = ("exec", the_proxy().name, "rosproxy", "doctor")
+        wait_until(lambda: held in docker(*doctor, check=False), 25, asking.logs)
+        assert not [f for f in wrong(asking)[1] if node.node in str(f)]
+        wait_until(lambda: node.node not in json.dumps(page()), 20, lambda: json.dumps(page()))
+        assert held in docker(*doctor, check=False)
     finally:
         process.stop()
         remove_proxies()

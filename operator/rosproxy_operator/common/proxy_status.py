@@ -41,5 +41,11 @@ def leases(status: ProxyStatus) -> Leases:
 
 
 def inside_addresses(status: ProxyStatus) -> frozenset[str]:
-    """The addresses where a proxy has nodes or participants."""
-    return frozenset((*nodes_by_address(status), *participants_by_address(status)))
+    """The addresses where a proxy has nodes or participants.
+
+    Nodes that the proxy has unregistered count, too: they may be silent, and come back. The proxy
+    shows them as faults until it is told that their container is gone.
+    """
+    host_ports = (parse_host_port(node.address) for node in status.nodes if not node.has_ended)
+    nodes = (plain_address(host_port.host) for host_port in host_ports if host_port is not None)
+    return frozenset((*nodes, *participants_by_address(status)))

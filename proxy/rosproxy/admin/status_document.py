@@ -189,7 +189,12 @@ class EndpointStatus(msgspec.Struct, frozen=True):
     @property
     def given_up(self) -> bool:
         """Whether the proxy has unregistered it, because it was gone."""
-        return self.state == "cleaned"
+        return self.state == "cleaned" or self.has_ended
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether an operator has told that its container is gone: it is no fault."""
+        return self.state == "ended"
 
 
 class LayerStatus(msgspec.Struct, frozen=True):

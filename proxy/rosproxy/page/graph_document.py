@@ -15,7 +15,7 @@ from rosproxy.admin.status_document import EndpointStatus, ProxyStatus, StandInS
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SystemState
 from rosproxy.net.addresses import is_loopback
 from rosproxy.page import domain_graph
-from rosproxy.page.judgement import JudgedFacts, inside_nodes
+from rosproxy.page.judgement import JudgedFacts, inside_nodes, without_ended
 from rosproxy.page.measures import Key, Measures
 from rosproxy.page.page_document import (
     BROKEN,
@@ -69,7 +69,9 @@ def graph_document(
     ``now`` is in monotonic seconds, as the counters' times, and ``epoch`` when those began, in
     seconds since the epoch.
     """
-    judged = judged or JudgedFacts(DoctorFacts(status=status))
+    judged = without_ended(judged or JudgedFacts(DoctorFacts(status=status)), status)
+    present = tuple(endpoint for endpoint in status.nodes if not endpoint.has_ended)
+    status = msgspec.structs.replace(status, nodes=present)
     nodes, links = domain_graph.graph(status)
     left_out = 0
     if status.settings.for_ros1:

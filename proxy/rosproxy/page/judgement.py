@@ -4,6 +4,8 @@ A round of questions takes a while in which nodes start and end. So the proxy is
 after it, and what holds by both is said.
 """
 
+from collections.abc import Collection, Mapping
+
 import msgspec
 from msgspec.structs import replace
 
@@ -87,6 +89,43 @@ def _wrong(facts: DoctorFacts) -> list[DoctorFinding]:
     return [finding for finding in findings if finding.severity >= Severity.WARNING]
 
 
+def without_ended(judged: JudgedFacts, status: ProxyStatus) -> JudgedFacts:
+    """The judgement without nodes whose container is gone, as a newer ``status`` knows.
+
+    A node of the same name that is registered elsewhere stays.
+    """
+    ended_endpoints = [endpoint for endpoint in status.nodes if endpoint.has_ended]
+    ended_uris = {endpoint.advertised_uri for endpoint in ended_endpoints}
+    known = judged.facts.nodes
+    ended = {
+        name
+        for endpoint in ended_endpoints
+        for name in endpoint.nodes
+        if name not in known or known[name].uri in ended_uris
+    } - inside_nodes(status).keys()
+    if not ended:
+        return judged
+    system = judged.facts.system
+    facts = replace(
+        judged.facts,
+        nodes={name: node for name, node in known.items() if name not in ended},
+        graph=SystemState(
+            publishers=_without_names(system.publishers, ended),
+            subscribers=_without_names(system.subscribers, ended),
+            services=_without_names(system.services, ended),
+        ),
+    )
+    nodes = {name: finding for name, finding in judged.nodes.items() if name not in ended}
+    pairs = {key: finding for key, finding in judged.pairs.items() if ended.isdisjoint(key[1:])}
+    return replace(judged, facts=facts, nodes=nodes, pairs=pairs)
+
+
+def _without_names(table: Mapping[str, list[str]], names: Collection[str]) -> dict[str, list[str]]:
+    kept = {key: [name for name in row if name not in names] for key, row in table.items()}
+    return {key: row for key, row in kept.items() if row}
+
+
 def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
-    """The nodes inside, by their names."""
-    return {name: endpoint for endpoint in status.nodes for name in endpoint.nodes}
+    """The nodes inside, by their names; without those whose container is gone."""
+    present = [endpoint for endpoint in status.nodes if not endpoint.has_ended]
+    return {name: endpoint for endpoint in present for name in endpoint.nodes}

@@ -118,7 +118,7 @@ class Ros1State(Collector):
         """The nodes that do not answer, by name, for whoever is on call."""
         text = "Inside nodes that do not answer, by name."
         gauge = GaugeMetricFamily("rosproxy_nodes_down", text, labels=["node"])
-        down = [endpoint for endpoint in self._context.registry if endpoint.is_down]
+        down = [e for e in self._context.registry if e.is_down and not e.health.has_ended]
         names = [name for endpoint in down for name in endpoint.caller_ids]
         for name, count in self._down.tally(names).items():
             gauge.add_metric([name], count)

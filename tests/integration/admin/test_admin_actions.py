@@ -190,6 +190,26 @@ async def test_a_container_that_is_gone(
     assert await greet(proxy.lease(alive), topic_header("/news"))
 
 
+@pytest.mark.parametrize("was_unregistered", [False, True])
+async def test_a_node_whose_container_is_gone_is_no_fault(
+    was_unregistered: bool, make_proxy: MakeProxy, node: FakeNode
+) -> None:
+    """Also one that has hung for so long before that the proxy has unregistered it."""
+    hasty = {"cleanup_after": 0.05, "probe_interval": 0.05, "probe_timeout": 0.05, "linger": 60.0}
+    proxy = await make_proxy(**(hasty if was_unregistered else PATIENT))
+    await node.publish(proxy.master)
+    endpoint = proxy.endpoint(node)
+    node.hang = True
+    if was_unregistered:
+        await until(lambda: endpoint.state == "cleaned", "the proxy unregisters it")
+    else:
+        await node.stop()
+    await until(lambda: proxy.metric("nodes_down", node=node.name), "it is missed")
+    await news(proxy, gone=[NODE])
+    await until(lambda: endpoint.state == "ended", "it is known to have ended")
+    assert not proxy.metric("nodes_down", node=node.name)
+
+
 async def test_a_node_that_hangs_is_not_waited_for(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:

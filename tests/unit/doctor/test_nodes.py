@@ -61,6 +61,14 @@ def test_what_has_ended_is_no_node_that_does_not_answer(state: str) -> None:
     ]
 
 
+def test_a_node_whose_container_is_gone_is_no_fault() -> None:
+    gone = make_node(nodes=["/other"], uri="http://10.0.0.5:40009/", port=45009, state="ended")
+    findings = check(make_facts(status=make_status(gone, make_node())))
+    assert [(f.severity, f.text) for f in findings if f.subject != "nodes at the master"] == [
+        (Severity.OK, "1 of 1 answer; those that have ended still hold 1 port for up to 30 s")
+    ]
+
+
 @pytest.mark.parametrize("state", ["refused", "silent", "cleaned"])
 def test_one_that_is_not_back_is_told(state: str) -> None:
     gone = make_node(nodes=["/other"], uri="http://10.0.0.5:40009/", port=45009, state=state)

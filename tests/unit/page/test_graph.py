@@ -107,6 +107,24 @@ def test_a_node_that_comes_or_goes_while_all_are_asked_is_well(is_late: bool) ->
     assert [*judge(lasting, None, lasting.proxy).nodes] == ["/talker"]
 
 
+def test_a_node_whose_container_is_gone_is_not_shown() -> None:
+    """The proxy was judged while the node had just failed."""
+    failing = make_node(state="failing", services=["/add"], parameters=["/rate"])
+    judgement = judged(status=make_status(failing))
+    assert judgement.nodes
+    ended = make_status(make_node(state="ended", services=["/add"], parameters=["/rate"]))
+    document = made(judgement, ended)
+    assert document["nodes"].keys() == {"rosproxy", "master", "/listener"}
+    assert not document["links"]
+
+
+def test_a_node_that_is_registered_elsewhere_by_now_is_shown() -> None:
+    moved = replace(talker(), uri="http://192.168.0.9:35002/", inside=None)
+    judgement = judged(nodes=by_name(moved, listener()))
+    document = made(judgement, make_status(make_node(state="ended")))
+    assert document["nodes"]["/talker"]["lane"] == "robot"
+
+
 def test_a_node_that_is_wrong_is_the_first_cause_on_its_links() -> None:
     gone = listener(attempt=Attempt(ReachOutcome.REFUSED), report=None)
     silent = talker(report=SlaveReport(STRING))

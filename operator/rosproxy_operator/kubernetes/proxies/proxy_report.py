@@ -7,6 +7,7 @@ from rosproxy.telemetry.refusals import DENIED, WOULD_BE_DENIED, problem_subject
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_status import (
+    inside_addresses,
     leases,
     nodes_by_address,
     participants_by_address,
@@ -48,6 +49,7 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
         refusal=refusal,
         problems=tuple(short(f"{p.subject}: {p.text}") for p in status.problems if _counts(p)),
         range_probe=replace(status.range_probe, age=0.0) if status.range_probe else None,
+        unregistered_addresses=inside_addresses(status) - nodes.keys() - participants.keys(),
     )
 
 

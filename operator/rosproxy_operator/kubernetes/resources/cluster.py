@@ -115,6 +115,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     ``refusal`` why it does not take its policy. ``participants`` are the GUID prefixes of those of
     ROS 2, ``leases`` their ports. One without ROS 1 has no master, which counts as reached.
     ``range_probe`` is, without its age, whether outside reaches its ports; None: not tried yet.
+    ``unregistered_addresses`` are those of nodes that were silent for long, and may come back.
     """
 
     answered: bool
@@ -127,11 +128,12 @@ class ProxyReport(msgspec.Struct, frozen=True):
     participants: Mapping[str, tuple[str, ...]] = {}
     leases: Mapping[str, tuple[int, ...]] = {}
     range_probe: RangeProbeStatus | None = None
+    unregistered_addresses: frozenset[str] = frozenset()
 
     @property
     def addresses(self) -> frozenset[str]:
         """Where it has ROS nodes or participants."""
-        return frozenset((*self.nodes, *self.participants))
+        return self.unregistered_addresses | {*self.nodes, *self.participants}
 
 
 class Obstacle(msgspec.Struct, frozen=True):

@@ -67,11 +67,15 @@ def _present_and_ended(
 ) -> tuple[list[EndpointStatus], list[EndpointStatus]]:
     """The nodes that are there, or ought to be, and those that have ended as nodes do.
 
-    What has ended has nothing registered any more, or is back under the same name at another
-    address: its container was restarted. It has its port for a while.
+    A node has ended if its container is gone, if it has nothing registered any more, or if it is
+    back under the same name at another address. An ended node has its port for a while.
     """
     answering = {name for node in nodes if node.state in ("ok", "new") for name in node.nodes}
-    ended = [n for n in nodes if n.state in _ENDED and answering.issuperset(n.nodes)]
+    ended = [
+        node
+        for node in nodes
+        if node.has_ended or (node.state in _ENDED and answering.issuperset(node.nodes))
+    ]
     return [node for node in nodes if node not in ended], ended
 
 

@@ -25,7 +25,7 @@ MOST_FORMER_CALLERS = 64
 MOST_NAMED = 3
 """Node names of one endpoint that a message gives: one as a rule, several where a port was used
 again by another node."""
-STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "unverified")
+STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "ended", "unverified")
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,9 @@ class Health:
 
     @property
     def state(self) -> str:
-        """One word for status: ok, new, failing, refused, silent or cleaned."""
+        """One word for status: ok, new, failing, refused, silent, cleaned or ended."""
+        if self.has_ended:
+            return "ended"
         if self.cleaned:
             return "cleaned"
         if self.down:

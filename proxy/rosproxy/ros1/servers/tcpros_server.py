@@ -296,7 +296,7 @@ class InsideNode:
     def note_failure(self, name: str) -> None:
         """Tell of a node that is registered, and whose TCPROS server can't be reached."""
         endpoint = self._endpoint
-        if not endpoint.registrations:
+        if not endpoint.registrations or endpoint.health.has_ended:
             return
         text = f"no TCPROS connection to it for {name or '?'}"
         if is_loopback(endpoint.node.host):

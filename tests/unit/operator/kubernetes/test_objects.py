@@ -289,6 +289,7 @@ def test_what_a_proxy_answers():
 
     assert (proxy_report.answered, proxy_report.master_up, proxy_report.error) == (True, True, "")
     assert proxy_report.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
+    assert proxy_report.addresses == {"10.244.1.5", "10.244.1.6", "fd00::5"}
     assert proxy_report.topics == {"/chatter", "/rosout"}
     assert proxy_report.problems == (
         "/talker: does not answer",
