@@ -86,6 +86,12 @@ def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
     return tuple(network for networks in by_interface.values() for network in networks)
 
 
+def default_gateways() -> frozenset[str]:
+    """The gateways of this machine's default routes, of IPv4."""
+    routes = [line.split() for line in _lines("/proc/net/route")[1:]]
+    return frozenset(_quad(gateway) for _, target, gateway, *_ in routes if target == "00000000")
+
+
 def _quad(digits: str) -> str:
     # /proc/net/route shows an address as a number in the host's byte order: little-endian here.
     return socket.inet_ntoa(bytes.fromhex(digits)[::-1])

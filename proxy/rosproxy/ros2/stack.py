@@ -29,7 +29,12 @@ from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net import addresses, proxy_signs
 from rosproxy.net.addresses import HostPort, Network
-from rosproxy.net.interfaces import address_into, address_towards, interface_networks
+from rosproxy.net.interfaces import (
+    address_into,
+    address_towards,
+    default_gateways,
+    interface_networks,
+)
 from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
@@ -337,9 +342,11 @@ class Ros2:
         own_networks = {network: address_into(network) for network in interface_networks()}
         self.networks = self._settings.inside_networks or networks_inside(own_networks, self._hosts)
         own_addresses = {address_into(network) for network in self.networks}
+        gateways = default_gateways()
         for server in self.servers:
             # The way into a network that the proxy is not in begins at an address outside of it.
             server.join(address for address in own_addresses if self._is_inside(address))
+            server.note_gateways(gateways)
 
     async def _sample_rates(self) -> None:
         now = self._runtime.now()

@@ -21,7 +21,9 @@ QUIET = 60.0
 """Seconds in which a source is not logged again for the same reason."""
 OVER_AFTER = 300.0
 """Seconds without a refusal after which the status shows the last one no longer."""
-OF_STARTS = frozenset({"not_a_peer", "unproven", "unknown_participant", "no_locator"})
+OF_STARTS = frozenset(
+    {"not_a_peer", "hidden_source", "unproven", "unknown_participant", "no_locator"}
+)
 """Reasons that nodes of ROS 2 give at each start, for a second or two: a datagram of a participant
 overtakes the announcement of that participant."""
 PATIENCE = 10.0

@@ -188,6 +188,12 @@ def test_what_was_refused_lately_is_told() -> None:
     assert ("refused", "refused: not a peer") not in told
 
 
+def test_an_engine_that_hides_who_sends_is_an_error() -> None:
+    hidden = ProblemStatus(10.0, "refused: hidden source", "from 172.18.0.1: it is the gateway")
+    told = diagnose_domain(BOTH, problems=(hidden,))
+    assert told["refused", "refused: hidden source"][0] is Severity.ERROR
+
+
 def test_nothing_is_heard_of_zenoh() -> None:
     told = diagnose_domain(DomainStatus(peers=("10.0.0.9",)))["inside", "domain 0"][1]
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in told

@@ -4,7 +4,15 @@ from ipaddress import ip_network
 
 import pytest
 
-from rosproxy.net.interfaces import address_into, route_towards
+from rosproxy.net import interfaces
+from rosproxy.net.interfaces import address_into, default_gateways, route_towards
+
+ROUTES = """\
+Iface Destination Gateway  Flags RefCnt Use Metric Mask     MTU Window IRTT
+eth0  00000000    010013AC 0003  0      0   0      00000000 0   0      0
+eth0  000013AC    00000000 0001  0      0   0      0000FFFF 0   0      0
+eth1  000012AC    00000000 0001  0      0   0      0000FFFF 0   0      0
+"""
 
 
 @pytest.mark.parametrize("network", ["127.0.0.0/8", "127.0.0.1/32", "127.0.0.0/31"])
@@ -21,3 +29,8 @@ def test_the_route_to_an_own_address_begins_there_and_takes_packets_of_loopback(
 
 def test_there_is_no_route_to_what_is_no_address() -> None:
     assert route_towards("?").source == "127.0.0.1"
+
+
+def test_the_gateway_of_the_default_route(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interfaces, "_lines", lambda _: ROUTES.splitlines())
+    assert default_gateways() == {"172.19.0.1"}

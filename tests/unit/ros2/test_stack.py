@@ -74,6 +74,9 @@ class Listening:
     def join(self, addresses: Iterable[str]) -> None:
         """The networks do not matter here."""
 
+    def note_gateways(self, gateways: frozenset[str]) -> None:
+        """Nor do their gateways."""
+
 
 async def test_names_are_looked_up_again_and_hold_while_no_name_server_answers(
     monkeypatch: pytest.MonkeyPatch,

@@ -22,12 +22,18 @@ OTHER_DOMAIN = "domain"
 """The check for a participant on a network inside that is in another domain."""
 OWN_MACHINE = "range"
 """The check for a participant on a network inside that announces itself on its own machine."""
+HIDDEN = "refused: hidden source"
 _REFUSED = {
     "refused: no locator": (
         "tcp: unset FASTDDS_BUILTIN_TRANSPORTS there; loopback: ROS_AUTOMATIC_DISCOVERY_RANGE="
         "SUBNET; elsewhere: it is behind NAT, put a proxy there; missing: give it UDPv4"
     ),
     "refused: not a peer": "give its address as --ros2-peer, if it is to meet those inside",
+    HIDDEN: (
+        "rootless Docker: DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for its service; "
+        "Docker Desktop: use an engine on Linux; Docker before 23.0: as root on the host "
+        "conntrack -D -p udp. docs/guide/troubleshooting.md has more"
+    ),
     "refused: participants": "rosproxy status lists them; docs/reference/limits.md has the bounds",
 }
 """What mends what the proxy has refused, by the subject of the problem."""
@@ -43,7 +49,9 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
             finding for heard in facts.heard_participants for finding in _heard(heard, domains)
         ]
     findings += [
-        warning("refused", problem.subject, problem.text, _REFUSED[problem.subject])
+        (error if problem.subject == HIDDEN else warning)(
+            "refused", problem.subject, problem.text, _REFUSED[problem.subject]
+        )
         for problem in facts.proxy.problems
         if domains and problem.subject in _REFUSED and problem.age < RECENT
     ]

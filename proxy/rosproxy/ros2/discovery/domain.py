@@ -336,7 +336,8 @@ class Domain(DomainParticipants):
         if not by_relay and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
-            return self._drop("not_a_peer", source, "an announcement; the address is no peer's")
+            self.outside.refuse_stranger(source, "an announcement; the address is no peer's")
+            return []
         if self.owners.is_inside(message.prefix):
             return self._claimed_by_outside(message, source, received, now)
         return self._announced_outside(message, source, received, now)
@@ -524,7 +525,8 @@ class Domain(DomainParticipants):
         if source_vendor(message.datagram) == NO_VENDOR:
             return self.own.answer_to_proxy(insider, message, source)
         text = "a participant that was not heard before, at an address that is no peer's"
-        return self._drop("not_a_peer", source, text)
+        self.outside.refuse_stranger(source, text)
+        return []
 
     def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
         """A datagram that goes to participants outside, as far as they may be sent any."""

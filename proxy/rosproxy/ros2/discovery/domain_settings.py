@@ -80,7 +80,7 @@ class LanRelay:
 
 @dataclass(slots=True)
 class DomainSettings:
-    """The settings of a domain; ``hosts`` and ``peers`` may change.
+    """The settings of a domain; ``hosts``, ``peers`` and ``gateways`` may change.
 
     ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
     each family; a participant is led to that of its own family, if there is one. ``peers`` are
@@ -88,7 +88,8 @@ class DomainSettings:
     ``relay`` is the program that passes announcements on to the LAN.
     ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
     ``is_inside`` tells whether an address lies in an inside network. ``participants_at`` counts the
-    participants outside that are known at an address.
+    participants outside that are known at an address. ``gateways`` are those of the proxy's
+    default routes.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
     ``keeper_key`` proves which ports participants had (`port_keeper.keeper_key`).
     """
@@ -105,6 +106,7 @@ class DomainSettings:
     relay: LanRelay | None = None
     keeper_key: bytes = field(default=b"", repr=False)
     participants_at: Callable[[str], int] = lambda _: 0
+    gateways: frozenset[str] = frozenset()
 
     @property
     def host(self) -> str:

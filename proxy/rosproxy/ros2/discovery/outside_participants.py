@@ -58,6 +58,10 @@ from rosproxy.ros2.rewriting.discovery import (
     rewritten,
 )
 
+HIDDEN_SOURCE = (
+    "it is the gateway of the proxy's own network: the engine sends datagrams of outside on with "
+    "this address, so that the proxy does not know who sent them"
+)
 FAREWELL_INTERVAL = 2.0
 """Seconds after which a participant inside is told again to forget one outside, until they meet."""
 
@@ -234,8 +238,19 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Whether nothing from an address is read, since no participant is known there."""
         if self.is_met(source):
             return False
-        self.refused("not_a_peer", source, "the address is no peer's, and nobody was heard there")
+        self.refuse_stranger(source, "the address is no peer's, and nobody was heard there")
         return True
+
+    def refuse_stranger(self, source: str, text: str) -> None:
+        """Refuse discovery from an address of which the proxy does not know a participant.
+
+        Docker's userland proxy and RootlessKit's port driver `builtin` send datagrams on with the
+        address of the network's gateway.
+        """
+        if source in self.settings.gateways:
+            self.refused("hidden_source", source, HIDDEN_SOURCE)
+        else:
+            self.refused("not_a_peer", source, text)
 
     def may_announce(self, message: DiscoveryMessage, source: str, observer: bytes) -> bool:
         """Whether a participant outside may announce itself to the proxy directly.

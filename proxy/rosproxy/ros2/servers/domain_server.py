@@ -128,6 +128,10 @@ class DomainServer:
         for address in self._groups.join(addresses):
             self._observe(address)
 
+    def note_gateways(self, gateways: frozenset[str]) -> None:
+        """Note the gateways of the proxy's default routes."""
+        self.domain.settings.gateways = gateways
+
     def ask_outside(self, peers: tuple[HostPort, ...]) -> None:
         """Use these peers from now on; those that are new are asked to announce themselves."""
         if peers != self.domain.settings.peers:

@@ -86,6 +86,15 @@ def test_a_process_at_the_relays_address_is_not_the_relay(how: str) -> None:
     assert not domain.rediscovery.ear_heard
 
 
+def test_an_engine_that_hides_who_sends_is_named() -> None:
+    domain = make_domain()
+    reasons = watched(domain)
+    domain.settings.gateways = frozenset({STRANGER})
+    assert domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
+    assert domain.heard_outside(spdp(B, EAR.host), EAR.host, NOW) == []
+    assert reasons == ["hidden_source", "not_a_peer"]
+
+
 def test_a_proof_from_another_address_is_not_looked_at() -> None:
     domain = make_domain()
     reasons = watched(domain)
