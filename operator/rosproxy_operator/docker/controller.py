@@ -34,7 +34,7 @@ from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.engine_client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, FormerSocket, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
-from rosproxy_operator.docker.host_document import host_document
+from rosproxy_operator.docker.host_document import host_document, just_started
 from rosproxy_operator.docker.operator_sign import publish_sign
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import HostState
@@ -164,7 +164,10 @@ class DockerController:
             await self._close()
 
     async def documents(self) -> dict[str, Document | str]:
-        """What the live pages of all proxies show, or why one can't be asked."""
+        """What the live pages of all proxies show, or why one can't be asked.
+
+        A proxy that has just been started is left out until it answers.
+        """
         if self._last is None:
             return {}
         snapshot = self._last[0]
@@ -174,7 +177,10 @@ class DockerController:
             for proxy in snapshot.state.proxies
             if proxy.container.state not in ("created", "running")
         }
-        return {**stopped, **await self._proxies.documents(endpoints)}
+        answers = await self._proxies.documents(endpoints)
+        silent = {name for name, answer in answers.items() if isinstance(answer, str)}
+        starting = silent & just_started(snapshot.state, time.time())
+        return stopped | {name: answers[name] for name in answers if name not in starting}
 
     async def status(self) -> Json:
         """What a new look sees and plans, and what proxies say now. Raises LookFailed."""

@@ -8,7 +8,7 @@ where the proxy is. What mends a proxy is said in labels and options of the oper
 import asyncio
 from collections.abc import Iterator, Sequence
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.doctor.rules.participant import OTHER_DOMAIN, OWN_MACHINE
 from rosproxy.telemetry.text import plural
 from rosproxy_operator.common.proxy_client import Json
@@ -22,6 +22,8 @@ AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""
 _CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
 """What may follow from what: the kinds of subjects, first causes first."""
+_BEING_MADE = ("absent", "created")
+"""States of a proxy's container while an operator makes the proxy."""
 _ADDRESS = "label rosproxy.advertise-host=ADDRESS on its containers, or --advertise-host"
 CURES = {
     "advertised host": _ADDRESS,
@@ -49,8 +51,11 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
                 return [warning("proxy", f"proxy {name}", text, f"docker logs {name}")]
         return read_findings(f"proxy {name}", output, CURES)
 
-    running = [proxy["name"] for proxy in status["proxies"] if proxy["state"] == "running"]
-    findings_by_proxy = await asyncio.gather(*map(ask, running))
+    told = {problem["subject"] for problem in status["problems"]}
+    running = [proxy for proxy in status["proxies"] if proxy["state"] == "running"]
+    # A silent proxy without a problem has just been started.
+    asked = [p["name"] for p in running if p["reachable"] or f"proxy {p['name']}" in told]
+    findings_by_proxy = await asyncio.gather(*map(ask, asked))
     served = served_participants(status)
     return [
         *host_findings(status),
@@ -76,15 +81,19 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
     for problem in problems:
         report = error if problem["fatal"] else warning
         yield report(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
+    # What an operator that runs could not do is among the problems.
+    runs = bool(status["operator"])
     for proxy in status["proxies"]:
         if proxy["state"] != "running":
+            report = note if runs and proxy["state"] in _BEING_MADE else error
             text = f"its container is {proxy['state']}"
             fix = f"docker logs {proxy['name']}; is the operator running?"
-            yield error("proxy", f"proxy {proxy['name']}", text, fix)
+            yield report("proxy", f"proxy {proxy['name']}", text, fix)
     if status["actions"]:
         text = f"{plural(len(status['actions']), 'step')} yet to be done, the first: "
         fix = "start the operator if it does not run; rosproxy-operator docker plan shows them"
-        yield warning("operator", "operator", text + status["actions"][0], fix)
+        report = note if runs else warning
+        yield report("operator", "operator", text + status["actions"][0], fix)
     members = {c["name"] for c in status["containers"] if c["proxy"]}
     if members:
         text = f"{plural(len(members), 'container')} with a proxy"

@@ -23,6 +23,8 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 ProxyStatuses = Mapping[str, ProxyStatus]
 """The status of each proxy that answers, by the name of its container."""
+STARTING = 8.0
+"""Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
 SETTLED = 15.0
 """Seconds after the start of a container and of its proxy in which no participant is missed."""
 
@@ -46,7 +48,7 @@ def host_document(
     statuses = {name: answer for name, answer in answers.items() if isinstance(answer, ProxyStatus)}
     problems = [*problems]
     subjects = {problem.subject for problem in problems}
-    silent = [answer for answer in answers.values() if isinstance(answer, Problem)]
+    silent = _silent(answers, observed, now)
     problems += [problem for problem in silent if problem.subject not in subjects]
     problems += _unheard(planned.members, observed, statuses, now)
     subjects = {problem.subject for problem in problems}
@@ -148,6 +150,26 @@ def _redirects(
         for member in members
         if member.redirected_master and member.container.alive
     }
+
+
+def just_started(observed: HostState, now: float) -> frozenset[str]:
+    """The names of the proxies that may be silent yet; ``now`` is Unix time."""
+    containers = (proxy.container for proxy in observed.proxies)
+    ages = {container.name: now - _unix_time(container.started_at) for container in containers}
+    # The engine may run on a machine whose clock is ahead.
+    return frozenset(name for name, age in ages.items() if 0 <= age < STARTING)
+
+
+def _silent(
+    answers: Mapping[str, ProxyStatus | Problem], observed: HostState, now: float
+) -> list[Problem]:
+    """Why proxies do not answer, but for those that have just been started."""
+    starting = just_started(observed, now)
+    return [
+        answer
+        for name, answer in answers.items()
+        if isinstance(answer, Problem) and name not in starting
+    ]
 
 
 def _unheard(

@@ -21,6 +21,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
+from rosproxy_operator.docker.host_document import STARTING
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, network_facts
 from rosproxy_operator.docker.settings import PlanSettings
@@ -30,8 +31,6 @@ log = logging.getLogger(__name__)
 
 PAUSES = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until a proxy is asked again that did not answer; the last is repeated."""
-STARTING = 8.0
-"""Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
 
 
 class ProxyUpdater:

@@ -94,6 +94,12 @@ def test_nobody_uses_the_proxy() -> None:
     assert "ROS_MASTER_URI=http://PROXY:11311" in finding.fix
 
 
+def test_a_proxy_that_has_just_started_misses_no_node_yet() -> None:
+    young = {**make_status(), "uptime": node_rules.FIRST_NODE - 0.1}
+    findings = check(make_facts(status=young, nodes={}))
+    assert [f.severity for f in findings if f.check == "inside node"] == [Severity.INFO]
+
+
 @pytest.mark.parametrize(("host", "state"), [("127.0.0.1", "refused"), ("localhost", "ok")])
 def test_a_node_that_listens_on_loopback_only(host: str, state: str) -> None:
     """A roscpp node answers probes all the same: only its TCPROS server is on loopback."""

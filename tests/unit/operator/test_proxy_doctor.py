@@ -68,6 +68,7 @@ def test_causes_of_a_host_come_before_what_follows_from_them() -> None:
         "proxies": [{"name": "p", "state": "exited"}],
         "containers": [{"name": "a", "proxy": "p"}],
         "actions": ["create p"],
+        "operator": None,
     }
     findings = list(host_findings(status))
     assert [finding.subject for finding in findings] == [
@@ -81,6 +82,30 @@ def test_causes_of_a_host_come_before_what_follows_from_them() -> None:
         "operator",
         "host",
     ]
+
+
+@pytest.mark.parametrize(
+    ("operator", "state", "severity"),
+    [
+        ("http://127.0.0.1:11313", "absent", Severity.INFO),
+        ("http://127.0.0.1:11313", "created", Severity.INFO),
+        ("http://127.0.0.1:11313", "exited", Severity.ERROR),
+        (None, "absent", Severity.ERROR),
+    ],
+)
+def test_a_proxy_that_an_operator_is_making_is_no_fault(
+    operator: str | None, state: str, severity: Severity
+) -> None:
+    status = {
+        "problems": [],
+        "proxies": [{"name": "p", "state": state}],
+        "containers": [],
+        "actions": ["start p"],
+        "operator": operator,
+    }
+    proxy, steps, *_ = host_findings(status)
+    assert proxy.severity is severity
+    assert steps.severity is (Severity.INFO if operator else Severity.WARNING)
 
 
 def rosproxy(**status: object) -> dict[str, object]:
@@ -151,9 +176,13 @@ def test_a_participant_of_another_domains_proxy_is_not_missed(
     container = {"name": "talker", "proxy": "p5", "participants": [{"guid_prefix": "01.0f.aa"}]}
     status = {
         "problems": [],
-        "proxies": [{"name": "p0", "state": "running"}],
+        "proxies": [
+            {"name": "p0", "state": "running", "reachable": True},
+            {"name": "p1", "state": "running", "reachable": False},
+        ],
         "containers": [container],
         "actions": [],
+        "operator": None,
     }
 
     class Host:
@@ -167,4 +196,5 @@ def test_a_participant_of_another_domains_proxy_is_not_missed(
     monkeypatch.setattr(docker_doctor, "DockerClient", Engine)
     subjects = [finding.subject for finding in docker_doctor.examine(cast(HostStatus, Host()), [])]
     assert "proxy p0: 01.0f.bb" in subjects
+    assert not any("p1" in subject for subject in subjects), "it has just been started"
     assert "proxy p0: 01.0f.aa" not in subjects

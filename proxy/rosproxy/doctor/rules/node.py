@@ -17,6 +17,8 @@ from rosproxy.telemetry.text import plural, quoted
 INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
 TWO_PROXIES = "two proxies"
 _ENDED = ("refused", "silent", "failing", "cleaned")
+FIRST_NODE = 10.0
+"""Seconds after the proxy's start in which no node is missed: an operator starts it with them."""
 CLEANUP = "rosnode cleanup (answer y)"
 # The host name of a container that was given none (moby daemon/container.go).
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
@@ -54,7 +56,8 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
         yield ok(INSIDE, "inside nodes", text)
     elif facts.status is not None:
         text = "none has registered through the proxy"
-        yield warning(INSIDE, "inside nodes", text, _start_inside(facts, "them"))
+        report = warning if facts.proxy.uptime >= FIRST_NODE else note
+        yield report(INSIDE, "inside nodes", text, _start_inside(facts, "them"))
     if facts.graph is not None:
         faulty = {f.subject for f in findings if f.severity is Severity.ERROR}
         faults = len(faulty & set(facts.nodes))

@@ -203,7 +203,8 @@ def test_the_doctor_prints_the_command_as_a_warning() -> None:
     (group,) = groups(published())
     text = f"{group.actions[-1]}: ended with 1; {group.cure}"
     problem = {"subject": group.subject, "text": text, "fatal": group.fatal}
-    status = {"problems": [problem], "proxies": [], "actions": [], "containers": []}
+    status: dict[str, Any] = {"problems": [problem], "proxies": [], "actions": []}
+    status |= {"containers": [], "operator": None}
     (finding,) = host_findings(status)
     assert finding.severity is Severity.WARNING
     assert "conntrack -D -p udp --orig-port-dst $port" in finding.text

@@ -7,7 +7,8 @@ import pytest
 
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus, ProxyStatus
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.docker.host_document import SETTLED, host_document
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.host_document import SETTLED, STARTING, host_document
 from rosproxy_operator.docker.planner.model import Attachment, Key
 from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name
@@ -88,6 +89,21 @@ def told_of_talker(
         state, made, (), {proxy_name(DOMAIN): status}, SETTINGS, STARTED + age + 1
     )
     return [problem["text"] for problem in document["problems"]]
+
+
+@pytest.mark.parametrize(
+    ("age", "is_told"), [(-3600.0, True), (1.0, False), (STARTING - 0.1, False), (STARTING, True)]
+)
+def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) -> None:
+    """An engine whose clock is ahead hides no silence."""
+    running = proxy(KEY)
+    own = replace(running.container, name="p", started_at=STARTED_AT)
+    state = observed(proxies=[replace(running, container=own)])
+    made = planned(state, SETTINGS, DockerMemory(), 0.0)
+    silence = Problem("proxy p", "its admin endpoint refuses connections")
+    document = host_document(state, made, (), {"p": silence}, SETTINGS, STARTED + age)
+    told = [problem["text"] for problem in document["problems"]]
+    assert (silence.text in told) is is_told
 
 
 @pytest.mark.parametrize(
