@@ -1,0 +1,73 @@
+"""Settings of a container that lead past the proxy: what is told, followed word by word."""
+
+import json
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from tests.docker.controller import Controller
+from tests.docker.engine import docker, wait_until
+from tests.docker.inside import ENABLE
+from tests.docker.ros2 import OPTIONS, THERE, Inside2, Outside, wait_for_line
+
+STATIC_PEERS = f"unset the variable and add the label rosproxy.peers='{THERE}'"
+DISCOVERY_SERVER = "ROS_DISCOVERY_SERVER", "192.0.2.1:11811"
+EXTERNAL_ADDRESS = (
+    "CYCLONEDDS_URI",
+    "<CycloneDDS><Domain><General><ExternalNetworkAddress>192.0.2.1</ExternalNetworkAddress>"
+    "</General></Domain></CycloneDDS>",
+)
+
+
+@pytest.fixture(autouse=True)
+def _nodes_end(lan: Outside) -> Iterator[None]:
+    yield
+    lan.end()
+
+
+def names(controller: Controller, variable: str, cure: str) -> bool:
+    """Whether a finding of the doctor names a variable, and what to do."""
+    text = controller.command("doctor", "--json", check=False)
+    findings = json.loads(text[text.index("{") :])["findings"]
+    told = [f"{finding['text']}: {finding['fix']}" for finding in findings]
+    return any(variable in text and cure in text for text in told)
+
+
+@pytest.mark.parametrize(
+    ("vendor", "name", "value", "cure"),
+    [
+        ("jazzy", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
+        ("kilted", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
+        ("cyclone", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
+        ("jazzy", *DISCOVERY_SERVER, "unset it"),
+        ("jazzy", "ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF", "or write SUBNET"),
+        ("jazzy", "FASTDDS_BUILTIN_TRANSPORTS", "SHM", "or write UDPv4"),
+        ("cyclone", *EXTERNAL_ADDRESS, "let it use the network that it shares with the proxy"),
+    ],
+)
+def test_a_setting_that_leads_past_the_proxy(
+    vendor: str,
+    name: str,
+    value: str,
+    cure: str,
+    start_controller: Callable[..., Controller],
+    lan: Outside,
+    inside2: Inside2,
+) -> None:
+    """Without the LAN's multicast for ROS_STATIC_PEERS, which are there in its place."""
+    is_by_peers = cure == STATIC_PEERS
+    controller = start_controller(*OPTIONS, *(("--ros2-lan", "none") if is_by_peers else ()))
+    network = inside2.made.network()
+    reader = lan.node("jazzy", "sub", "/out")
+    node = inside2.node(network, vendor, "pub", "/out", options=("--env", f"{name}={value}"))
+
+    wait_until(lambda: names(controller, name, cure), 60, controller.logs)
+    assert "got hello" not in reader.log.read()
+
+    docker("rm", "--force", node.name)
+    written = cure.partition("write ")[2]
+    options = ("--env", f"{name}={written}") if written else ()
+    labels = (ENABLE, f"rosproxy.peers={THERE}") if is_by_peers else (ENABLE,)
+    inside2.node(network, vendor, "pub", "/out", options=options, labels=labels)
+    wait_for_line(reader.log, "^got hello ")
+    wait_until(lambda: controller.problems() == "", 20, controller.problems)
