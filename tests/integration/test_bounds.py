@@ -356,7 +356,7 @@ async def test_a_compressed_reply_is_not_inflated(proxy, master):
 
 
 async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
-    monkeypatch.setattr("rosproxy.admin.admin_server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(proxy.app._admin._runner.server, "most", 3)
     address = proxy.settings.admin.host, proxy.settings.admin.port
     ask = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
     async with connect(address) as first, connect(address) as second, connect(address) as third:
@@ -370,7 +370,7 @@ async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
 
 
 async def test_so_are_those_that_come_in_one_moment(proxy, monkeypatch):
-    monkeypatch.setattr("rosproxy.admin.admin_server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(proxy.app._admin._runner.server, "most", 3)
     address = proxy.settings.admin.host, proxy.settings.admin.port
     with ExitStack() as stack:  # all before the proxy has its turn
         conns = [stack.enter_context(socket.create_connection(address)) for _ in range(20)]

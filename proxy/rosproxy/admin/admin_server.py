@@ -14,12 +14,10 @@ Status and metrics are costly: callers share what is made (`shared_document`), a
 """
 
 import asyncio
-import contextlib
 import hashlib
 import hmac
 import json
 import logging
-import socket
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -35,9 +33,10 @@ from rosproxy.admin.shared_document import SharedDocument
 from rosproxy.admin.status_changes import StatusChanges, StatusSnapshot
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort, is_loopback, plain_address
+from rosproxy.net.bounded_server import BoundedServer
 from rosproxy.net.fair_slots import FairSlots, NoSlot
 from rosproxy.net.http_client import CallFailed, TooLong, read_bounded
-from rosproxy.net.sockets import BACKLOG, end_if_stalled
+from rosproxy.net.sockets import BACKLOG
 
 log = logging.getLogger(__name__)
 
@@ -50,14 +49,7 @@ MOST_REPLIES = 16
 """Replies with the status or the metrics that are under way."""
 MOST_REPLIES_EACH = 4
 """The same to one address: an operator, Prometheus and a person have one each."""
-SEND_BUFFER = 64 * 1024
-"""Bytes that the kernel keeps of a reply; Linux takes twice as many (socket(7), SO_SNDBUF).
-
-By default it keeps up to 4 MB, whatever the reader takes.
-"""
 JSON = {"Content-Type": "application/json; charset=utf-8"}
-IDLE_TIMEOUT = 75.0
-"""Seconds in which the next request must have arrived, the first one as well."""
 BODY_TIMEOUT = 10.0
 """Seconds in which the body of a POST must have arrived."""
 FORBIDDEN = (
@@ -105,7 +97,7 @@ class AdminServer:
 
     async def start(self, listener: HostPort) -> None:
         """Listen. Raises OSError."""
-        self._runner = web.ServerRunner(_BoundedServer(self._answer))
+        self._runner = web.ServerRunner(BoundedServer(self._answer, MOST_CONNECTIONS))
         await self._runner.setup()
         # A caller that finds the queue full tries again after 1 s: too late for a health check.
         await web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG).start()
@@ -244,38 +236,6 @@ async def _tell_health(_request: web.BaseRequest) -> web.Response:
 def _address(request: web.BaseRequest) -> str:
     """The address that a request comes from."""
     return plain_address(request.remote or "")
-
-
-class _BoundedServer(web.Server):
-    """Serves MOST_CONNECTIONS from one address at most."""
-
-    def __init__(self, answer: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]) -> None:
-        # Nothing is inflated: a small body may become a very large one.
-        super().__init__(
-            answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT, auto_decompress=False
-        )
-
-    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Take a connection in, and end the oldest one of its source if that has too many."""
-        sock = transport.get_extra_info("socket")
-        end_if_stalled(sock)
-        with contextlib.suppress(OSError):
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        source = _source(handler)
-        same_source = [c for c in self.connections if _source(c) == source]
-        open_connections = [c for c in same_source if c.transport is not None]
-        if len(open_connections) >= MOST_CONNECTIONS:  # those that end stay until the next turn
-            oldest = open_connections[0]
-            # Closing alone keeps what the reader has not taken until the kernel gives it up.
-            if oldest.transport is not None:
-                oldest.transport.abort()
-            oldest.force_close()
-        super().connection_made(handler, transport)
-
-
-def _source(handler: web.RequestHandler) -> object:
-    """The address that a connection comes from."""
-    return handler.peername[0] if handler.peername else None
 
 
 def _read_json(body: bytes) -> Any:
