@@ -1,11 +1,12 @@
 """The operator's own endpoint: /healthz, /readyz, /metrics, /status, and its proxies' live page.
 
-As at a proxy's endpoint, no path answers by a name that a stranger may have registered.
+As at a proxy's endpoint, no path answers by a name that a stranger may have registered, an address
+has a few connections, and callers that ask for the metrics at the same time share one reply.
 """
 
 import socket
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 
 from aiohttp import web
@@ -13,15 +14,22 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.admin.host_rule import is_own_host, refusal
+from rosproxy.admin.replies import send_shared
+from rosproxy.admin.shared_document import SharedDocument
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.bounded_server import BoundedServer
+from rosproxy.net.sockets import BACKLOG
 from rosproxy.page.routes import Page
 from rosproxy.page.visitors import Visitors
 from rosproxy.setting_kinds import SettingError
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.proxy_client import Json
 
+MOST_CONNECTIONS = 32
+"""Connections from one address: the kubelet, Prometheus and a browser have some each."""
+
 Check = Callable[[], str | None]
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 GetStatus = Callable[[], Awaitable[Json]]
 """Makes the document at ``/status``; raises LookFailed."""
 
@@ -41,22 +49,24 @@ class HealthServer:
         status: GetStatus | None = None,
     ) -> None:
         self._page = page
-        app = web.Application(middlewares=[_refuse_strangers_names])
-        for (method, path), handler in page.routes.items():
-            app.router.add_route(method, path, handler)
-        app.router.add_get("/healthz", partial(_check, alive))
-        app.router.add_get("/readyz", partial(_check, ready))
-        app.router.add_get("/metrics", partial(_show, metrics))
+        self._exposition = SharedDocument(lambda: generate_latest(metrics))
+        routes: dict[tuple[str, str], Handler] = {
+            **page.routes,
+            ("GET", "/healthz"): partial(_check, alive),
+            ("GET", "/readyz"): partial(_check, ready),
+            ("GET", "/metrics"): partial(_show, self._exposition),
+        }
         if status is not None:
             visitors = Visitors(None, time.monotonic, local=True)
-            app.router.add_get("/status", partial(_tell, status, visitors))
-        self._runner = web.AppRunner(app, access_log=None)
+            routes["GET", "/status"] = partial(_tell, status, visitors)
+        self._runner = web.ServerRunner(BoundedServer(partial(_answer, routes), MOST_CONNECTIONS))
 
     async def start(self, listener: HostPort) -> None:
         """Listen. Raises SettingError if the address can't be bound."""
         await self._runner.setup()
         try:
-            await web.TCPSite(self._runner, listener.host, listener.port).start()
+            site = web.TCPSite(self._runner, listener.host, listener.port, backlog=BACKLOG)
+            await site.start()
         except OSError as error:
             text = f"{listener} can't be bound: {error.strerror}"
             raise SettingError("--admin-bind", text) from None
@@ -64,29 +74,39 @@ class HealthServer:
     async def stop(self) -> None:
         """Stop listening."""
         await self._page.close()
+        self._exposition.close()
         await self._runner.cleanup()
 
 
-@web.middleware
-async def _refuse_strangers_names(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Answer no request by a name that a stranger may have registered; see `host_rule`."""
+async def _answer(
+    routes: Mapping[tuple[str, str], Handler], request: web.BaseRequest
+) -> web.StreamResponse:
     host = request.headers.get("Host", "")
-    if is_own_host(host, {socket.gethostname().lower()}):
+    # A stranger may have registered any other name; see `host_rule`.
+    if not is_own_host(host, {socket.gethostname().lower()}):
+        return web.Response(status=403, text=refusal(host))
+    method = "GET" if request.method == "HEAD" else request.method
+    handler = routes.get((method, request.path))
+    if handler is not None:
         return await handler(request)
-    return web.Response(status=403, text=refusal(host))
+    allowed = {verb for verb, path in routes if path == request.path}
+    if not allowed:
+        return web.Response(status=404, text="404: Not Found")
+    headers = {"Allow": ",".join(sorted(allowed))}
+    return web.Response(status=405, text="405: Method Not Allowed", headers=headers)
 
 
-async def _check(check: Check, request: web.Request) -> web.Response:
+async def _check(check: Check, _request: web.BaseRequest) -> web.Response:
     reason = check()
     return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
 
-async def _show(metrics: CollectorRegistry, request: web.Request) -> web.Response:
-    body = generate_latest(metrics)
-    return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE_LATEST})
+async def _show(exposition: SharedDocument[bytes], request: web.BaseRequest) -> web.StreamResponse:
+    headers = {"Content-Type": CONTENT_TYPE_LATEST}
+    return await send_shared(request, [await exposition.newest()], headers)
 
 
-async def _tell(status: GetStatus, visitors: Visitors, request: web.Request) -> web.Response:
+async def _tell(status: GetStatus, visitors: Visitors, request: web.BaseRequest) -> web.Response:
     if not visitors.may_look(request):
         return web.Response(status=403, text="the status is for this machine's own loopback\n")
     try:

@@ -15,7 +15,11 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import kopf
+from aiohttp import web
 
+from rosproxy.net.bounded_server import BoundedServer
+from rosproxy.net.sockets import BACKLOG
+from rosproxy_operator.common.health_server import MOST_CONNECTIONS
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
@@ -129,29 +133,33 @@ class ClusterServing:
         if self._ending.is_set():
             return
         namespaces = self._settings.namespaces
-        # kopf's own stop flag would hold it up for seconds when it ends for another reason.
-        await kopf.operator(
-            registry=self._handlers(),
-            standalone=True,
-            # kopf would ask for the user's name otherwise, and an image's user has none.
-            identity=cast(Any, "rosproxy-operator"),
-            liveness_endpoint=f"http://{self._settings.liveness}/healthz",
-            clusterwide=not namespaces,
-            namespaces=namespaces,
-        )
+        liveness = web.ServerRunner(BoundedServer(self._tell_liveness, MOST_CONNECTIONS))
+        await liveness.setup()
+        try:
+            bind = self._settings.liveness
+            await web.TCPSite(liveness, bind.host, bind.port, backlog=BACKLOG).start()
+            # kopf's own stop flag would hold it up for seconds when it ends for another reason.
+            await kopf.operator(
+                registry=self._handlers(),
+                standalone=True,
+                # kopf would ask for the user's name otherwise, and an image's user has none.
+                identity=cast(Any, "rosproxy-operator"),
+                clusterwide=not namespaces,
+                namespaces=namespaces,
+            )
+        finally:
+            await liveness.cleanup()
+
+    async def _tell_liveness(self, _request: web.BaseRequest) -> web.Response:
+        """Answer the kubelet. kopf's own liveness endpoint has no bound of connections."""
+        reason = self._controller.dead()
+        return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
     def _handlers(self) -> kopf.OperatorRegistry:
-        handlers, controller = kopf.OperatorRegistry(), self._controller
+        handlers = kopf.OperatorRegistry()
         kopf.on.startup(registry=handlers, id="startup")(self.configure)
         # As long as there are no credentials, kopf is not to end for it.
         kopf.on.login(registry=handlers, backoff=5.0)(kopf.login_via_client)
-
-        @kopf.on.probe(registry=handlers, id="alive")
-        async def alive(**_: Any) -> str:
-            if reason := controller.dead():
-                # Anything else would be tried again for a minute before the probe is answered.
-                raise kopf.PermanentError(reason)
-            return "ok"
 
         if self._webhook:
             _register_webhook(handlers, self._webhook[0])

@@ -1,24 +1,30 @@
 """The status that a running operator tells, and who asks it."""
 
+import asyncio
 import json
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from typing import Any
 
 import aiohttp
 import pytest
 from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import generate_latest
 
 from examples.demo.fake_http import free_ports
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common import health_server
 from rosproxy_operator.common.control_loop import LookFailed
-from rosproxy_operator.common.health_server import HealthServer
+from rosproxy_operator.common.health_server import MOST_CONNECTIONS, HealthServer
 from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.docker import host_status
 from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.docker.settings import PlanSettings
+from tests.integration.net import connect, exchange
 from tests.integration.proxy import Proxy
 
+ASK = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
 SETTINGS = PlanSettings()
 DOCUMENT = {"version": __version__, "uplink": "0-rosproxy", "actions": ["start container x"]}
 
@@ -124,3 +130,49 @@ async def test_a_strangers_name_is_refused_at_every_path(operator: RunningOperat
                 assert "does not answer by this name" in await refused.text()
             async with session.get(f"{url}{path}", headers={"Host": "localhost:1"}) as good:
                 assert good.status == 200
+
+
+async def test_an_address_has_a_few_connections(operator: RunningOperator) -> None:
+    """Any pod of a cluster could take all files that the operator may open."""
+    address = operator.address.host, operator.address.port
+    async with AsyncExitStack() as stack:
+        other = await stack.enter_async_context(connect(address, "127.0.6.2"))
+        wires = [
+            await stack.enter_async_context(connect(address, "127.0.6.1"))
+            for _ in range(MOST_CONNECTIONS + 1)
+        ]
+        assert await wires[0].outcome() == "closed"
+        for wire in (other, *wires[1:]):
+            await wire.send(ASK)
+            assert (await wire.reply()).status == 200
+
+
+async def test_callers_that_ask_at_once_share_one_reply_with_the_metrics(
+    operator: RunningOperator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hundreds of requests for the metrics kept the kubelet's probe waiting for seconds."""
+    made = 0
+
+    def counted(registry: CollectorRegistry) -> bytes:
+        nonlocal made
+        made += 1
+        return generate_latest(registry)
+
+    monkeypatch.setattr(health_server, "generate_latest", counted)
+    address = operator.address.host, operator.address.port
+    ask = ASK.replace(b"/healthz", b"/metrics")
+    sources = [f"127.0.5.{number}" for number in range(16)]
+    replies = await asyncio.gather(*(exchange(address, ask, source) for source in sources))
+    assert {reply.status for reply in replies} == {200}
+    assert 0 < made < len(sources) / 2
+
+
+@pytest.mark.parametrize(
+    ("verb", "path", "status"),
+    [("HEAD", "/healthz", 200), ("POST", "/metrics", 405), ("GET", "/nothing", 404)],
+)
+async def test_other_requests(operator: RunningOperator, verb: str, path: str, status: int) -> None:
+    address = operator.address.host, operator.address.port
+    async with connect(address) as wire:
+        await wire.send(f"{verb} {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        assert (await wire.reply(head=verb == "HEAD")).status == status

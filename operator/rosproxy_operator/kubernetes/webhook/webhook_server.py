@@ -13,18 +13,33 @@ from collections.abc import AsyncIterator
 import kopf
 from aiohttp import web
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.net.bounded_server import IDLE_TIMEOUT
+from rosproxy.net.budget import Budget, Charge, OverBudget
+from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import KeyPair
 from rosproxy_operator.kubernetes.webhook.injector import NOT_WIRED
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation
+from rosproxy_operator.kubernetes.webhook.tls_listener import TlsListener
 
 log = logging.getLogger(__name__)
 
 CHECK = 0.5
 """Seconds between two looks whether there is another certificate to serve."""
-MOST = 8 * 2**20
-"""Bytes of a request: the API server takes objects of 3 MiB, and a review holds two of them."""
+MOST = 4 * 2**20
+"""Bytes of a request: the API server takes objects of 3 MiB. The review of a new pod holds one.
+
+k8s.io/apiserver, pkg/server/config.go: MaxRequestBodyBytes.
+"""
+MOST_HELD = 96 * 2**20
+"""Bytes of all requests that are read and answered at the same time, with `VALUE_SIZE`."""
+MOST_HELD_OF_SOURCE = 32 * 2**20
+"""The same of one address. A review of 20 KB counts as 80 KB."""
+VALUE_SIZE = 100
+"""Bytes that a value of a JSON document takes in memory, besides its text."""
+BODY_TIMEOUT_S = 10.0
+"""Seconds in which a body must have arrived. An API server sends one at once."""
 ENDING = 2.0
 """Seconds that requests have to be answered when serving ends."""
 
@@ -62,11 +77,20 @@ class WebhookServer:
         certificates.load(context, pair)
         application = _application(fn)
         application.on_response_prepare.append(self._prepare)
-        runner = web.AppRunner(application, access_log=None, shutdown_timeout=ENDING)
+        runner = web.AppRunner(
+            application,
+            access_log=None,
+            shutdown_timeout=ENDING,
+            keepalive_timeout=IDLE_TIMEOUT,
+            # Nothing is inflated: a small body may become a very large one.
+            auto_decompress=False,
+        )
         await runner.setup()
+        assert runner.server is not None  # noqa: S101 - `setup` has made it
+        listener = TlsListener(runner.server, context)
         try:
             bind = self._bind
-            await web.TCPSite(runner, bind.host, bind.port, ssl_context=context).start()
+            listener.start(bind)
             log.info("wiring pods at https://%s", bind)
             self._serving = True
             # For kopf's own webhook configuration, of which there is none (`admission.managed`).
@@ -74,6 +98,7 @@ class WebhookServer:
             await self._exchange(context, pair)
         finally:
             self._serving = False
+            await listener.close()
             await runner.cleanup()
 
     async def _prepare(self, _: web.Request, response: web.StreamResponse) -> None:
@@ -94,26 +119,50 @@ class WebhookServer:
 
 
 def _application(fn: kopf.WebhookFn) -> web.Application:
-    async def serve(request: web.Request) -> web.Response:
-        try:
-            review = json.loads(await request.text())
-            uid = review["request"]["uid"]
-        except (ValueError, TypeError, KeyError):
-            return web.Response(status=400, text="this is no AdmissionReview\n")
-        try:
-            return web.json_response(await fn(review, webhook=request.match_info["id"]))
-        except Exception as error:  # the pod passes as it is
-            log.warning("a pod at admission: %r", error)
-            warning = f"{NOT_WIRED}the operator failed: {error!r}"[:200]
-            response = {"uid": uid, "allowed": True, "warnings": [warning]}
-            return web.json_response(
-                {
-                    "apiVersion": review.get("apiVersion", "admission.k8s.io/v1"),
-                    "kind": review.get("kind", "AdmissionReview"),
-                    "response": response,
-                }
-            )
+    held = Budget(MOST_HELD, MOST_HELD_OF_SOURCE, "bytes of reviews")
 
-    application = web.Application(client_max_size=MOST)
+    async def serve(request: web.Request) -> web.Response:
+        with Charge(held, plain_address(request.remote or "")) as charge:
+            try:
+                body = await _read_body(request, charge)
+            except OverBudget as error:
+                return web.Response(status=503, text=f"{error}\n")
+            except TooLong as error:
+                return web.Response(status=413, text=f"{error}\n")
+            except TimeoutError:
+                text = f"the body took over {BODY_TIMEOUT_S:g} s\n"
+                return web.Response(status=408, text=text)
+            return await _answer(fn, body, request.match_info["id"])
+
+    application = web.Application()
     application.router.add_post("/{id}", serve)
     return application
+
+
+async def _read_body(request: web.Request, charge: Charge) -> bytes:
+    """The body of a request, charged. Raises OverBudget, TooLong, TimeoutError."""
+    async with asyncio.timeout(BODY_TIMEOUT_S):
+        body = await read_bounded(request.content, MOST, charge.add)
+    charge.add(VALUE_SIZE * sum(map(body.count, (b"{", b"[", b","))))
+    return body
+
+
+async def _answer(fn: kopf.WebhookFn, body: bytes, webhook: str) -> web.Response:
+    try:
+        review = json.loads(body)
+        uid = review["request"]["uid"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return web.Response(status=400, text="this is no AdmissionReview\n")
+    try:
+        return web.json_response(await fn(review, webhook=webhook))
+    except Exception as error:  # the pod passes as it is
+        log.warning("a pod at admission: %r", error)
+        warning = f"{NOT_WIRED}the operator failed: {error!r}"[:200]
+        response = {"uid": uid, "allowed": True, "warnings": [warning]}
+        return web.json_response(
+            {
+                "apiVersion": review.get("apiVersion", "admission.k8s.io/v1"),
+                "kind": review.get("kind", "AdmissionReview"),
+                "response": response,
+            }
+        )

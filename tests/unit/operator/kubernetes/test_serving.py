@@ -18,6 +18,7 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.health_server import MOST_CONNECTIONS
 from rosproxy_operator.common.operator_metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import serving
@@ -163,14 +164,25 @@ async def test_it_watches_nothing(running: Running) -> None:
 
 async def test_liveness_is_the_controllers(running: Running) -> None:
     await until_alive(running)
-    assert await running.health() == (200, '{"alive": "ok"}')
+    assert await running.health() == (200, "ok\n")
 
 
 async def test_a_hung_controller_is_not_alive(running: Running) -> None:
     await until_alive(running)
     running.controller.reason = "the event loop has not run for 30 s"
-    status, _ = await running.health()
-    assert status == 500
+    assert await running.health() == (503, "the event loop has not run for 30 s\n")
+
+
+async def test_an_address_has_a_few_connections_to_liveness(running: Running) -> None:
+    """Any pod could take all memory and all files of the operator by connections."""
+    wires = [
+        await asyncio.open_connection("127.0.0.1", running.liveness)
+        for _ in range(MOST_CONNECTIONS + 1)
+    ]
+    assert await wires[0][0].read() == b""
+    assert (await running.health())[0] == 200
+    for _, writer in wires:
+        writer.transport.abort()
 
 
 def put_rosproxy(server: ApiServer) -> None:
