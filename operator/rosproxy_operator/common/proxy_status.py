@@ -1,43 +1,60 @@
 """What the operator reads from a proxy's ``/status``, for any engine.
 
-The document itself is `rosproxy.admin.status_document`; it holds what ROS nodes say of themselves,
-so no size in it is to be trusted.
+The document itself is `rosproxy.admin.status_document`. It holds what ROS nodes say of themselves,
+and the proxy may be in hostile hands. So no size in it is to be trusted, and nothing that another
+proxy refuses gets to that proxy.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
+from itertools import islice
 
+from rosproxy.admin.requests import is_guid_prefix
 from rosproxy.admin.status_document import EndpointStatus, ParticipantStatus, ProxyStatus
 from rosproxy.net.addresses import parse_host_port, plain_address
 
 Leases = Mapping[str, tuple[int, ...]]
 """The ports of participants, in the order of their locators, by GUID prefix."""
+MOST_LEASED = 512
+"""Participants whose ports are kept: a proxy has as many inside (docs/reference/limits.md)."""
+MOST_PORTS = 16
+"""Ports that are kept of one participant: it has no more."""
+_LAST_PORT = 65535
 
 
 def nodes_by_address(status: ProxyStatus) -> Mapping[str, tuple[EndpointStatus, ...]]:
     """A proxy's nodes by the address where they are; without those that it has given up."""
-    nodes: dict[str, tuple[EndpointStatus, ...]] = {}
+    nodes: defaultdict[str, list[EndpointStatus]] = defaultdict(list)
     for node in status.nodes:
         host_port = parse_host_port(node.address)
         if host_port is not None and not node.given_up:
-            address = plain_address(host_port.host)
-            nodes[address] = (*nodes.get(address, ()), node)
-    return nodes
+            nodes[plain_address(host_port.host)].append(node)
+    return {address: tuple(group) for address, group in nodes.items()}
 
 
 def participants_by_address(status: ProxyStatus) -> Mapping[str, tuple[ParticipantStatus, ...]]:
     """A proxy's participants of ROS 2 that are inside, by the address where they are."""
-    participants: dict[str, tuple[ParticipantStatus, ...]] = {}
+    participants: defaultdict[str, list[ParticipantStatus]] = defaultdict(list)
     for domain in status.domains:
         for participant in domain.inside:
-            address = plain_address(participant.address)
-            participants[address] = (*participants.get(address, ()), participant)
-    return participants
+            participants[plain_address(participant.address)].append(participant)
+    return {address: tuple(group) for address, group in participants.items()}
 
 
 def leases(status: ProxyStatus) -> Leases:
-    """The ports of a proxy's participants inside."""
-    participants = (p for group in participants_by_address(status).values() for p in group)
-    return {p.guid_prefix: tuple(lease.port for lease in p.leases) for p in participants}
+    """The ports of a proxy's participants inside, as the next proxy takes them."""
+    readable = (
+        participant
+        for domain in status.domains
+        for participant in domain.inside
+        if is_guid_prefix(participant.guid_prefix)
+    )
+    return {
+        participant.guid_prefix: tuple(
+            lease.port for lease in participant.leases[:MOST_PORTS] if lease.port <= _LAST_PORT
+        )
+        for participant in islice(readable, MOST_LEASED)
+    }
 
 
 def inside_addresses(status: ProxyStatus) -> frozenset[str]:

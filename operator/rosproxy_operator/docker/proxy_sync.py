@@ -181,7 +181,8 @@ class DockerProxySync:
     def update(self, snapshot: DockerSnapshot, members: Collection[Member]) -> None:
         """Begin to tell every running proxy what a look has found."""
         for name, (updater, task) in list(self._running.items()):
-            if snapshot.access.get(name) != updater.access:
+            # A task that has ended by an error of ours is begun anew, as the log says why.
+            if snapshot.access.get(name) != updater.access or task.done():
                 task.cancel()
                 del self._running[name]
                 if updater.leases:

@@ -49,9 +49,12 @@ class AdminClient:
 
     def status(self) -> "ProxyStatus":
         """What ``/status`` says. Raises AdminError."""
-        from rosproxy.admin.status_document import read_status  # noqa: PLC0415 - health starts fast
+        from rosproxy.admin import status_document  # noqa: PLC0415 - health starts fast
 
-        return read_status(self.status_json())
+        try:
+            return status_document.read_status(self.status_json())
+        except status_document.NotAStatus as error:
+            raise AdminError(f"{self.url}/status can't be read: {error}") from None
 
     def probe(self) -> "RangeProbe":
         """Let the proxy find out whether its range can be reached. Raises AdminError."""

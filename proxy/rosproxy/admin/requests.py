@@ -18,6 +18,7 @@ Body = TypeVar("Body", bound=msgspec.Struct)
 # Not the narrower rule of DNS: names of containers have underscores as well.
 _NAME = re.compile(r"[\w.-]{1,253}")
 _PREFIX = re.compile(r"[0-9a-f]{2}(\.[0-9a-f]{2}){11}")
+"""A GUID prefix as `/status` writes it."""
 MOST_PEERS = 1024
 """Peers that a proxy can be told of: each is told of every participant inside."""
 _LONGEST = 150
@@ -97,7 +98,7 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         msgspec.structs.force_setattr(self, "gone", gone)
         msgspec.structs.force_setattr(self, "moved", moved)
         for prefix in self.former:
-            if not _PREFIX.fullmatch(prefix):
+            if not is_guid_prefix(prefix):
                 raise ValueError(f"former: keys must be GUID prefixes, not {prefix[:40]!r}")
         if len(self.peers or ()) > MOST_PEERS:
             raise ValueError(f"peers: must be {MOST_PEERS} at most")
@@ -145,6 +146,11 @@ class RangeProbe(msgspec.Struct, frozen=True):
     """The answer to ``POST /probe``."""
 
     probes: tuple[PortProbe, ...] = ()
+
+
+def is_guid_prefix(text: str) -> bool:
+    """Whether a text is a GUID prefix, such as ``01.0f.45.d1.3c.00.a7.12.00.00.00.00``."""
+    return _PREFIX.fullmatch(text) is not None
 
 
 def read_probe(answer: object) -> RangeProbe:

@@ -12,6 +12,7 @@ Times are in seconds, rates in bytes per second; ``sent`` is what went outside.
 
 import json
 from contextlib import suppress
+from functools import cache
 from types import UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -24,6 +25,12 @@ Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
 Rate = Annotated[float, msgspec.Meta(ge=0, le=1e18)]
 Names = tuple[str, ...]
 Document = TypeVar("Document", bound=msgspec.Struct)
+MOST_ROWS = 50_000
+"""JSON objects in a document that is read. One has 21 bytes at least, in a status of 1 MiB."""
+
+
+# msgspec raises the latter for half of a surrogate pair, which json.loads takes.
+_UNFIT = (msgspec.ValidationError, UnicodeEncodeError)
 
 
 class NotAStatus(ValueError):
@@ -371,8 +378,25 @@ def parse_status(text: str | bytes) -> ProxyStatus:
 
 
 def read_status(document: object) -> ProxyStatus:
-    """The status in decoded JSON; never raises."""
+    """The status in decoded JSON. Raises NotAStatus if it has more than MOST_ROWS objects."""
+    if _has_too_many_rows(document):
+        raise NotAStatus(f"a status of more than {MOST_ROWS} objects")
     return _convert_leniently(document, ProxyStatus)
+
+
+def _has_too_many_rows(document: object) -> bool:
+    rows = 0
+    pending = [document]
+    while pending:
+        value = pending.pop()
+        if isinstance(value, dict):
+            rows += 1
+            if rows > MOST_ROWS:
+                return True
+            pending.extend(value.values())
+        elif isinstance(value, list):
+            pending.extend(value)
+    return False
 
 
 def to_json(document: msgspec.Struct) -> dict[str, Any]:
@@ -386,13 +410,17 @@ def _convert_leniently(value: object, kind: type[Document]) -> Document:
     # Nearly always all of it fits, and one step in C is enough.
     try:
         return msgspec.convert(value, kind)
-    except msgspec.ValidationError:
+    except _UNFIT:
         raw_fields = value if isinstance(value, dict) else {}
     fields = {}
-    for field in msgspec.structs.fields(kind):
-        with suppress(KeyError, msgspec.ValidationError):
+    for field in _fields(kind):
+        with suppress(KeyError, *_UNFIT):
             fields[field.name] = _convert_field(raw_fields[field.encode_name], field.type)
     return kind(**fields)
+
+
+_fields = cache(msgspec.structs.fields)
+"""The fields of a struct: to find them takes a hundred times as long as to convert one."""
 
 
 def _convert_field(value: Any, kind: Any) -> Any:

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import (
+    MOST_ROWS,
     ConnectionStatus,
     EndpointStatus,
     NotAStatus,
@@ -70,6 +71,25 @@ def test_what_does_not_fit_leaves_the_rest_alone() -> None:
     assert [c.name for c in node.connections] == ["/chatter", "/b"]
     assert node.data_plane is not None
     assert node.data_plane.port is None
+
+
+@pytest.mark.parametrize(
+    "odd", ['{"settings": {"udp": "\\ud800"}}', '{"settings": {"\\ud800": 1}}']
+)
+def test_half_of_a_surrogate_pair_leaves_the_rest_alone(odd: str) -> None:
+    """The operator's task for that proxy ended by it."""
+    assert parse_status(odd) == ProxyStatus()
+
+
+def test_a_document_of_too_many_rows_is_not_read() -> None:
+    """One in hostile hands had a million in 4 MB, and reading them took the operator minutes."""
+    full: dict[str, Any] = {"settings": {}, "nodes": [{}] * (MOST_ROWS - 2)}
+    assert len(parse_status(json.dumps(full)).nodes) == MOST_ROWS - 2
+    full["nodes"] = [{}] * (MOST_ROWS - 1)
+    with pytest.raises(NotAStatus, match="more than 50000 objects"):
+        parse_status(json.dumps(full))
+    with pytest.raises(NotAStatus):
+        read_status({"domains": [{"inside": [{}] * MOST_ROWS}]})
 
 
 def test_names_hold_whatever_a_node_says() -> None:

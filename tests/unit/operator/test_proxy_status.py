@@ -1,7 +1,18 @@
 """What is made of a proxy's /status."""
 
-from rosproxy.admin.status_document import read_status
-from rosproxy_operator.common.proxy_status import inside_addresses, nodes_by_address
+from typing import Any
+
+from rosproxy.admin.requests import ContainerNews, read_body
+from rosproxy.admin.status_document import MOST_ROWS, read_status
+from rosproxy_operator.common.proxy_status import (
+    MOST_LEASED,
+    inside_addresses,
+    leases,
+    nodes_by_address,
+    participants_by_address,
+)
+
+PREFIX = "01.0f.45.d1.3c.00.a7.12.00.00.00.00"
 
 
 def test_the_addresses_of_nodes() -> None:
@@ -29,3 +40,41 @@ def test_the_proxy_hears_of_each_node_whose_container_is_gone_once() -> None:
         {"address": "nonsense"},
     ]
     assert inside_addresses(read_status({"nodes": nodes})) == {"172.18.0.6", "172.18.0.7"}
+
+
+def inside(*participants: dict[str, Any]) -> dict[str, Any]:
+    return {"domains": [{"inside": [*participants]}]}
+
+
+def test_all_may_be_at_one_address() -> None:
+    """For each one the tuple of all before was copied: 40,000 took the operator 12 seconds."""
+    half = MOST_ROWS // 2 - 2
+    nodes = [{"address": "172.18.0.6:4001"}] * half
+    status = read_status(inside(*[{"address": "172.18.0.7"}] * half) | {"nodes": nodes})
+    assert [len(group) for group in nodes_by_address(status).values()] == [half]
+    assert [len(group) for group in participants_by_address(status).values()] == [half]
+
+
+def test_ports_that_the_next_proxy_would_refuse_are_not_kept() -> None:
+    """It refused all that it was told with them: who may use it, for as long as it ran."""
+    leased = [{"port": port} for port in (0, 11401, 65536, 2**63 - 1)]
+    status = read_status(
+        inside(
+            {"guid_prefix": PREFIX, "leases": leased},
+            {"guid_prefix": "", "leases": leased},
+            {"guid_prefix": PREFIX.upper(), "leases": leased},
+            {"guid_prefix": f"{PREFIX}\n", "leases": leased},
+        )
+    )
+    former = leases(status)
+    assert former == {PREFIX: (0, 11401)}
+    body = {"former": {prefix: list(ports) for prefix, ports in former.items()}}
+    assert read_body(body, ContainerNews).former == former
+
+
+def test_ports_are_kept_up_to_a_bound() -> None:
+    """More than a megabyte of them was refused as well."""
+    prefixes = [number.to_bytes(12, "big").hex(".") for number in range(2000)]
+    each = [{"guid_prefix": prefix, "leases": [{"port": 1}] * 20} for prefix in prefixes]
+    kept = leases(read_status(inside(*each)))
+    assert (len(kept), {len(ports) for ports in kept.values()}) == (MOST_LEASED, {16})

@@ -28,6 +28,7 @@ from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, both, container, observed
 
 WHERE = HostPort("172.30.0.2", 11312)
+PREFIX = "01.0f.45.d1.3c.00.a7.12.00.00.00.00"
 FIRST, SECOND = ProxyAccess(WHERE, "token", "run 1"), ProxyAccess(WHERE, "token", "run 2")
 
 
@@ -137,7 +138,7 @@ async def test_it_is_told_anew_at_each_look_and_to_each_run_of_the_proxy(tasks: 
 
 @pytest.mark.parametrize(
     ("ports", "told"),
-    [(RANGE, {}), (PortRange(11400, 11500), {}), (PortRange(11402, 11440), {"01.0f": (11401,)})],
+    [(RANGE, {}), (PortRange(11400, 11500), {}), (PortRange(11402, 11440), {PREFIX: (11401,)})],
 )
 async def test_a_proxy_that_had_to_leave_its_ports_is_told_who_had_some(
     ports: PortRange, told: Mapping[str, Sequence[int]], tasks: Tasks
@@ -145,7 +146,7 @@ async def test_a_proxy_that_had_to_leave_its_ports_is_told_who_had_some(
     proxies = Proxies()
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
     participant = ParticipantStatus(
-        guid_prefix="01.0f", address="172.18.0.5", leases=(LocatorStatus(port=11401),)
+        guid_prefix=PREFIX, address="172.18.0.5", leases=(LocatorStatus(port=11401),)
     )
     proxies.known_status = ProxyStatus(domains=(DomainStatus(inside=(participant,)),))
     seen, members = look("172.18.0.5")
@@ -167,7 +168,7 @@ async def test_a_proxy_that_says_too_much_is_told_what_is_new_by_what_it_said_la
     proxies = Proxies()
     sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
     participant = ParticipantStatus(
-        guid_prefix="01.0f", address="172.18.0.5", leases=(LocatorStatus(port=11401),)
+        guid_prefix=PREFIX, address="172.18.0.5", leases=(LocatorStatus(port=11401),)
     )
     proxies.known_status = ProxyStatus(domains=(DomainStatus(inside=(participant,)),))
     seen, members = look("172.18.0.5")
@@ -185,7 +186,7 @@ async def test_a_proxy_that_says_too_much_is_told_what_is_new_by_what_it_said_la
         await asyncio.sleep(0)
 
     updater, _ = sync._running[name]
-    assert updater.leases == {"01.0f": (11401,)}
+    assert updater.leases == {PREFIX: (11401,)}
     assert updater.error is proxies.unreadable
     arrived = {row["address"] for body in proxies.bodies for row in body.get("arrived", ())}
     assert "172.18.0.6" in arrived
@@ -244,3 +245,20 @@ async def test_without_its_policy_nobody_new_is_let_in(
     assert await proxies.next() == ["172.18.0.5"]
     problem = silence("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
     assert (problem.subject, problem.text, problem.fatal) == ("proxy p", "knows no policies", True)
+
+
+async def test_what_ends_the_task_of_a_proxy_ends_it_until_the_next_look(
+    tasks: Tasks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The proxy was told nothing more, for as long as it ran."""
+    proxies = Proxies()
+    proxies.known_status = ProxyStatus()
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
+    with monkeypatch.context() as broken:
+        broken.setattr(proxy_sync, "inside_addresses", lambda _: 1 / 0)
+        sync.update(*look("172.18.0.5"))
+        _, task = next(iter(sync._running.values()))
+        await asyncio.wait([task])
+    proxies.heard.clear()
+    sync.update(*look("172.18.0.6"))
+    assert await proxies.next() == ["172.18.0.6"]
