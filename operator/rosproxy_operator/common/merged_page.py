@@ -52,7 +52,7 @@ def read_document(text: str) -> Document:
     """The document in a proxy's answer. Raises ValueError."""
     try:
         document = msgspec.json.decode(text, type=Document)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ValueError(str(error)) from None
     return _shortened(document)
 

@@ -11,6 +11,7 @@ import aiohttp
 import msgspec
 
 from rosproxy.access.layers import PolicyLayer, layers_as_json
+from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status, read_status
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import TooLong, read_bounded
@@ -22,11 +23,13 @@ WITHIN = 3.0
 """Seconds that a proxy has to answer."""
 PAGES_AT_ONCE = 8
 """Proxies that are asked for their page at the same time."""
-LONGEST = 16 * 1024 * 1024
+LONGEST = 64 * 1024
 """Bytes of an answer at most. A proxy in hostile hands can't mislead its operator: no redirect is
 followed, and nothing is decompressed."""
-LONGEST_STATUS = 4 * 1024 * 1024
-"""The same of a status, which has 1 MiB at most: reading one keeps all other proxies waiting."""
+LONGEST_STATUS = MOST_BYTES + LONGEST
+"""The same of a status: reading one keeps all other proxies waiting."""
+LONGEST_PAGE = 16 * 1024 * 1024
+"""The same of the page's document."""
 WITHIN_PAGE = 12.0
 """The same where it makes the page's document first, for which it may take ten."""
 WITHIN_MASTER = 40.0
@@ -93,7 +96,9 @@ class ProxyClient:
     async def document(self, admin: HostPort, token: str) -> Document:
         """What a proxy's live page shows."""
         try:
-            text = await self._ask("GET", admin, "/graph", token, within=WITHIN_PAGE)
+            text = await self._ask(
+                "GET", admin, "/graph", token, within=WITHIN_PAGE, longest=LONGEST_PAGE
+            )
         except ProxyError as error:
             if error.status == 404:
                 text = "it has no live page: its image is that of a former release"
@@ -232,7 +237,7 @@ def _kept_alive(info: aiohttp.AddrInfoType) -> socket.socket:
 def _read(text: str, admin: HostPort) -> Json:
     try:
         return msgspec.json.decode(text, type=Json)
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, RecursionError):
         raise _no_rosproxy(admin) from None
 
 

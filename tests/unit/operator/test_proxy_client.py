@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 from aiohttp import web
 
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common import proxy_client
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
@@ -82,3 +83,37 @@ async def test_what_is_no_text_is_no_answer(evil: Evil, client: ProxyClient) -> 
     evil.answer = lambda: web.Response(body=b"\xff\xfe", content_type="application/json")
     with pytest.raises(ProxyError, match="as a rosproxy does"):
         await client.status(evil.admin)
+
+
+async def test_an_answer_without_a_bottom_is_no_answer(evil: Evil, client: ProxyClient) -> None:
+    """It ended the operator's task for that proxy, and the live page of all proxies."""
+    deep = "[" * 100_000
+    evil.answer = lambda: web.Response(text=f'{{"nodes": {{}}, "links": {{}}, "x": {deep}')
+    admin = evil.admin
+    for asking in (
+        client.status(admin),
+        client.changes(admin, "token", "", 0.0),
+        client.document(admin, "token"),
+    ):
+        with pytest.raises(ProxyError, match="as a rosproxy does"):
+            await asking
+    evil.answer = lambda: web.Response(text=deep[: proxy_client.LONGEST])
+    for telling in (client.containers(admin, "token", {}), client.retire(admin, "token")):
+        with pytest.raises(ProxyError, match="as a rosproxy does"):
+            await telling
+    page = await client.documents({"evil": (admin, ""), "gone": (HostPort("127.0.0.1", 1), "")})
+    assert [type(answer) for answer in page.values()] == [str, str]
+
+
+async def test_an_answer_to_news_is_short(evil: Evil, client: ProxyClient) -> None:
+    evil.answer = lambda: web.Response(text=f'{{"moved": "{"x" * proxy_client.LONGEST}"}}')
+    with pytest.raises(ProxyError, match="with more than 65536 bytes"):
+        await client.containers(evil.admin, "token", {})
+
+
+@pytest.mark.parametrize(
+    "text", ['{"settings": {"udp": "\\ud800"}}', '{"settings": {"\\ud800": 1}}']
+)
+async def test_half_of_a_surrogate_pair(evil: Evil, client: ProxyClient, text: str) -> None:
+    evil.answer = lambda: web.Response(text=text)
+    assert await client.status(evil.admin) == ProxyStatus()
