@@ -28,8 +28,8 @@ LONGEST = 64 * 1024
 followed, and nothing is decompressed."""
 LONGEST_STATUS = MOST_BYTES + LONGEST
 """The same of a status: reading one keeps all other proxies waiting."""
-LONGEST_PAGE = 16 * 1024 * 1024
-"""The same of the page's document."""
+LONGEST_PAGE = 8 * 1024 * 1024
+"""The same of the page's document, whose nodes and links have 5 MiB."""
 WITHIN_PAGE = 12.0
 """The same where it makes the page's document first, for which it may take ten."""
 WITHIN_MASTER = 40.0

@@ -4,13 +4,15 @@ Both versions of ROS and both operators make such a document; the page knows no 
 what nodes call themselves and things, shortened, and harmless only as text.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
+from rosproxy.admin.status_bounds import encode
 from rosproxy.telemetry.text import brief
 
 ROBOT, HOST, CONTAINER = "robot", "host", "container"
@@ -19,6 +21,10 @@ OK, UNKNOWN, WARNING, BROKEN = "ok", "unknown", "warning", "broken"
 """States of nodes and links."""
 MOST_NODES, MOST_LINKS, MOST_FINDINGS = 1500, 3000, 50
 """How many are shown; the rest is counted."""
+MOST_NODE_BYTES = 1024 * 1024
+MOST_LINK_BYTES = 4 * MOST_NODE_BYTES
+"""Bytes of all nodes that are shown, and of all links, as JSON in ASCII. The document is made each
+second. With names of 50 characters, and nothing wrong, all of them have 2 MB."""
 LONGEST = 300
 """Characters of a name."""
 LONGEST_TEXT = 1000
@@ -27,6 +33,7 @@ QUIET = frozenset({"/rosout", "/rosout_agg", "/tf", "/tf_static", "/parameter_ev
 """Topics that nearly every node has: hidden until they are asked for."""
 _QUIET_SERVICES = ("/get_loggers", "/set_logger_level")
 Json = dict[str, Any]
+Row = TypeVar("Row", bound=msgspec.Struct)
 
 
 class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -87,7 +94,8 @@ def document(
     left_out: int = 0,
 ) -> Json:
     """All of it within bounds; ``left_out``: how many links are not even among these."""
-    by_key = {link.key: link for link in links}
+    nodes = {shown_name(key): node for key, node in nodes.items()}
+    by_key = {link.key: link for link in map(_shown_link, links)}
     worst = [f for f in findings if f.severity >= Severity.WARNING]
     worst.sort(key=lambda f: -f.severity)
     shown_nodes, shown = within_bounds(nodes, by_key)
@@ -111,15 +119,30 @@ def within_bounds(
     broken = [links[key] for key in order if links[key].state == BROKEN]
     important = {end for link in broken for end in (link.source, link.target)}
     important |= {key for key, node in nodes.items() if node.state == BROKEN}
-    first = (
-        sorted(nodes, key=lambda key: key not in important) if len(nodes) > most_nodes else nodes
-    )
-    shown_nodes = {key: nodes[key] for key in islice(first, most_nodes)}
+    first = sorted(nodes, key=lambda key: key not in important)
+    by_importance = ((key, nodes[key]) for key in islice(first, most_nodes))
+    shown_nodes = dict(_fitting(by_importance, MOST_NODE_BYTES))
     targets = {"", *shown_nodes}
     complete = (
-        key for key in order if links[key].source in shown_nodes and links[key].target in targets
+        (key, links[key])
+        for key in order
+        if links[key].source in shown_nodes and links[key].target in targets
     )
-    return shown_nodes, {key: links[key] for key in islice(complete, most_links)}
+    return shown_nodes, dict(_fitting(islice(complete, most_links), MOST_LINK_BYTES))
+
+
+def _fitting(rows: Iterable[tuple[str, Row]], room: int) -> Iterator[tuple[str, Row]]:
+    """The first rows with their keys, as many as have ``room`` bytes together."""
+    for keyed in rows:
+        room -= len(encode(keyed))
+        if room < 0:
+            return
+        yield keyed
+
+
+def _shown_link(link: PageLink) -> PageLink:
+    """A link with its ends as the nodes are called in the document."""
+    return replace(link, source=shown_name(link.source), target=shown_name(link.target))
 
 
 class PageFinding(msgspec.Struct, frozen=True):

@@ -1,5 +1,6 @@
 """The document of a proxy for ROS 1: lanes, ways, measures, and what is wrong where it is wrong."""
 
+import json
 from typing import Any
 
 import pytest
@@ -7,13 +8,23 @@ from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import error
 from rosproxy.admin.status_document import ProxyStatus, read_status
-from rosproxy.doctor.facts import Attempt, DoctorFacts, ReachOutcome, SlaveReport, SystemState
+from rosproxy.doctor.facts import (
+    Attempt,
+    DoctorFacts,
+    NodeFacts,
+    ReachOutcome,
+    SlaveReport,
+    SystemState,
+)
 from rosproxy.page.graph_document import graph_document, relayed
 from rosproxy.page.judgement import JudgedFacts, judge, topics_to_ask_about
 from rosproxy.page.measures import Measures
 from rosproxy.page.page_document import (
     LONGEST,
+    LONGEST_TEXT,
+    MOST_LINK_BYTES,
     MOST_LINKS,
+    MOST_NODE_BYTES,
     MOST_NODES,
     PageLink,
     PageNode,
@@ -315,3 +326,30 @@ def test_of_too_many_nodes_the_broken_ones_stay() -> None:
     assert made["left_out"] == 9
     ends_elsewhere = PageLink("topic", "/chatter", "/n0", "/nobody")
     assert document({}, nodes, [ends_elsewhere], ())["links"] == {}
+
+
+def test_a_document_has_few_bytes_whatever_nodes_call_themselves() -> None:
+    """200 names of 100,000 characters made 60 MB of it each second, and the operator read none."""
+    names = [f"/{number}{'é' * 100_000}" for number in range(50)]
+    facts = judged().facts
+    graph = SystemState({"/chatter": ["/talker"]}, {"/chatter": names})
+    nodes = {name: NodeFacts(name) for name in names}
+    shown = made(JudgedFacts(replace(facts, graph=graph, nodes=nodes)))
+    assert len(json.dumps(shown)) < 50 * 6 * 5 * LONGEST
+    assert len(shown["links"]) == 50
+    assert all(link["target"] in shown["nodes"] for link in shown["links"].values())
+
+
+def test_of_long_rows_what_is_broken_stays() -> None:
+    text = "é" * LONGEST_TEXT
+    nodes = {f"/{n}{'é' * LONGEST}": PageNode("robot", text=text) for n in range(MOST_NODES)}
+    nodes["/last"] = PageNode("robot", state="broken")
+    links = [PageLink("topic", f"/{n}", "/last", text=text, fix=text) for n in range(MOST_LINKS)]
+    links.append(PageLink("topic", "/x", "/last", state="broken"))
+    shown = document({}, nodes, links, ())
+    assert len(json.dumps(shown["nodes"])) <= MOST_NODE_BYTES
+    assert len(json.dumps(shown["links"])) <= MOST_LINK_BYTES
+    assert "/last" in shown["nodes"]
+    assert next(iter(shown["links"].values()))["state"] == "broken"
+    rows = len(shown["nodes"]) + len(shown["links"]) + shown["left_out"]
+    assert rows == len(nodes) + len(links)
