@@ -1,6 +1,7 @@
 """Which Kubernetes Events (core/v1) are made: each of them once, however often it is planned."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 
@@ -24,6 +25,11 @@ QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""
 MOST = 50
 """Warnings that are made at once; the others have their turn at the next look."""
+MOST_TEXTS = 10
+"""Texts of one reason about one thing that came and went in `QUIET` seconds; others have to wait.
+
+A proxy in hostile hands chooses what its errors say, and so does a master.
+"""
 MOST_RESULTS = 20
 """Events of one kind about what is done to a RosProxy's proxies at once; one more sums up."""
 LONGEST = 1024
@@ -53,18 +59,27 @@ def warnings(
 ) -> NewEvents:
     """Warning Events for problems that were not there before.
 
-    One that comes and goes all the time is told once. After a restart of the operator all are
+    One that comes and goes all the time is told once, and one whose text changes all the time
+    MOST_TEXTS times in QUIET seconds. After a restart of the operator all are
     told again: who makes the Events counts those that are there already.
 
     Only findings that are about an object become Events. ``reported`` is that of the last look, or
     nothing; ``now`` is on its clock, in seconds.
     """
     findings = dict.fromkeys(f for f in problems if f.about)
-    new = [f for f in findings if f not in reported]
-    late = set(new[MOST:])
     recent = {f: then for f, then in reported.items() if now - then < QUIET}
+    gone = Counter(_kind(f) for f in recent if f not in findings)
+    new = [f for f in findings if f not in reported]
+    changing = {f for f in new if gone[_kind(f)] >= MOST_TEXTS}
+    told = [f for f in new if f not in changing][:MOST]
+    late = {*new}.difference(told)
     current = {f: now for f in findings if f not in late}
-    return NewEvents(tuple(_warning(f) for f in new[:MOST]), {**recent, **current})
+    return NewEvents(tuple(map(_warning, told)), {**recent, **current})
+
+
+def _kind(finding: ClusterFinding) -> tuple[object, ...]:
+    """What findings have in common that tell of the same thing in other words."""
+    return finding.of, finding.about, finding.subject, finding.reason
 
 
 def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:

@@ -4,6 +4,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
     DeleteProxy,
+    Emit,
     PatchStatus,
     SetImage,
 )
@@ -12,7 +13,9 @@ from rosproxy_operator.kubernetes.status.events import (
     LONGEST,
     MOST,
     MOST_RESULTS,
+    MOST_TEXTS,
     QUIET,
+    NewEvents,
     event_body,
     results,
     warnings,
@@ -99,6 +102,21 @@ def test_many_problems_have_their_turn():
 
     assert (len(first.emits), len(second.emits)) == (MOST, 5)
     assert warnings(many, second.reported, 2.0).emits == ()
+
+
+def test_a_problem_whose_text_changes_all_the_time_makes_few_events():
+    """A proxy in hostile hands had an Event made each half second, for as long as it liked."""
+    told = NewEvents()
+    emits = list[Emit]()
+    for second in range(10 * int(QUIET)):
+        told = warnings([finding(str(second))], told.reported, float(second))
+        emits += told.emits
+    assert len(emits) <= 10 * (MOST_TEXTS + 1)
+    assert len(told.reported) <= MOST_TEXTS + 1
+
+    other = ClusterFinding("node node2", "no ports", reason="PortsExhausted", of=ARM, about=OF_ARM)
+    told = warnings([other], told.reported, 10 * QUIET)
+    assert [emit.message for emit in told.emits] == ["node node2: no ports"]
 
 
 def test_a_message_is_not_longer_than_the_api_server_takes():
