@@ -106,7 +106,8 @@ def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
             text += f": {'; '.join(ports.held_by)}"
             fix = "give one of the two another --port-range (ROSPROXY_PORT_RANGE), published too"
         else:
-            fix = f"ss -ltnp 'sport >= :{first} and sport <= :{last}'; or another --port-range"
+            sockets = quoted(f"sport >= :{first} and sport <= :{last}")
+            fix = f"ss -ltnp {sockets}; or another --port-range"
         yield warning("ports", "ports", text, fix)
     if not free:
         text = f"none is free, {used} used: no further node gets in"

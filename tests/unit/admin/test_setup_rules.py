@@ -1,5 +1,7 @@
 """Whether outside can reach a proxy as it was set up."""
 
+import shlex
+
 import pytest
 
 from rosproxy.admin.doctor_finding import Severity
@@ -73,3 +75,11 @@ def test_another_proxy_on_the_range_is_named() -> None:
     told = next(iter(few_ports(ports)))
     assert "held by other programs: another rosproxy (x)" in told.text
     assert "another --port-range" in told.fix
+
+
+def test_what_a_proxy_calls_its_range_is_no_command() -> None:
+    """A proxy in hostile hands ended the quote that stood in the cure, and began a command."""
+    ports = PortsStatus("1' ; touch pwned #-2", "1-9", free=5, blocked=4)
+    told = next(iter(few_ports(ports)))
+    command = told.fix.partition("; or another --port-range")[0]
+    assert shlex.split(command) == ["ss", "-ltnp", "sport >= :1' ; touch pwned # and sport <= :2"]
