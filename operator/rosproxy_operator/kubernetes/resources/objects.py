@@ -5,7 +5,9 @@ is missing is as if it were empty.
 """
 
 from collections.abc import Iterator
+from itertools import islice
 
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
@@ -46,6 +48,15 @@ ROS2_VARIABLES = frozenset(
     }
 )
 """Those by which it is told what a pod can't have of ROS 2."""
+MOST_LABELS = 128
+"""Labels that are kept of a pod, those of rosproxy.io first. All pods of the cluster are kept in
+memory, and the API server takes pods with a megabyte of labels."""
+MOST_CONTAINERS = 64
+"""Containers that are kept of a pod, and values of ROS_MASTER_URI, for the same reason."""
+LONGEST_TEXT = 2048
+"""Characters that are kept of a variable, an annotation or an image: a URI has no more."""
+_LONGEST_LIST = 16 * 1024
+"""Characters that are read of the list of namespaces that a master's Service agrees to."""
 
 
 def node(obj: Json) -> ClusterNode:
@@ -69,11 +80,12 @@ def node(obj: Json) -> ClusterNode:
 def pod(obj: Json) -> Pod:
     """A pod. At admission it may have no name, uid, node and address."""
     meta, spec, status = submap(obj, "metadata"), submap(obj, "spec"), submap(obj, "status")
-    wired = text_at(submap(meta, "annotations"), names.MASTER_URI)
+    wired = _short(text_at(submap(meta, "annotations"), names.MASTER_URI))
+    masters = islice(map(_short, _masters(spec)), MOST_CONTAINERS)
     return Pod(
         id=name_of(meta),
         uid=text_at(meta, "uid"),
-        labels=texts_at(meta, "labels"),
+        labels=_kept_labels(meta),
         node=text_at(spec, "nodeName"),
         phase=text_at(status, "phase") or "Pending",
         ip=text_at(status, "podIP"),
@@ -81,10 +93,10 @@ def pod(obj: Json) -> Pod:
         udp_ports=frozenset(_host_ports(spec, "UDP")),
         host_network=spec.get("hostNetwork") is True,
         deleting=is_deleted(meta),
-        own_masters=tuple(uri for uri in _masters(spec) if not wired or uri != wired),
+        own_masters=tuple(uri for uri in masters if not wired or uri != wired),
         wired_master_uri=wired,
-        static_peers=text_at(submap(meta, "annotations"), names.STATIC_PEERS),
-        containers=tuple(map(_container, submaps(spec, "containers"))),
+        static_peers=_short(text_at(submap(meta, "annotations"), names.STATIC_PEERS)),
+        containers=tuple(map(_container, submaps(spec, "containers")[:MOST_CONTAINERS])),
         ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),
         controller=_controller(meta),
         misspelt=misspelt_names(meta, "pods"),
@@ -190,7 +202,7 @@ def policy(obj: Json) -> ProxyPolicy | None:
 
 def allowed_from(service: Json) -> frozenset[str]:
     """The namespaces whose RosProxies may name a Service as their master; ``*`` for all."""
-    text = text_at(submap(service, "metadata", "annotations"), names.ALLOW_FROM)
+    text = text_at(submap(service, "metadata", "annotations"), names.ALLOW_FROM)[:_LONGEST_LIST]
     namespaces = (namespace.strip() for namespace in text.split(","))
     return frozenset(n for n in namespaces if n == "*" or is_label(n))
 
@@ -215,11 +227,23 @@ def _container(obj: Json) -> PodContainer:
     variables = {
         name: VALUE_AT_RUNTIME
         if variable.get("valueFrom") is not None
-        else text_at(variable, "value")
+        else _short(text_at(variable, "value"))
         for variable in submaps(obj, "env")
         if (name := text_at(variable, "name")) in ROS2_VARIABLES
     }
-    return PodContainer(text_at(obj, "image"), variables)
+    return PodContainer(_short(text_at(obj, "image")), variables)
+
+
+def _kept_labels(meta: Json) -> dict[str, str]:
+    labels = texts_at(meta, "labels")
+    if len(labels) <= MOST_LABELS:
+        return labels
+    own_first = sorted(labels, key=lambda name: (not name.startswith(f"{names.GROUP}/"), name))
+    return {name: labels[name] for name in own_first[:MOST_LABELS]}
+
+
+def _short(text: str) -> str:
+    return bounded(text, LONGEST_TEXT)
 
 
 def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
