@@ -22,7 +22,7 @@ Objects go in and out as JSON: the client's models would drop fields that are ne
 import contextlib
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
@@ -53,7 +53,10 @@ WATCHED_FOR = 300
 SILENT: Timeout = (3.0, 90.0)
 """Seconds to connect for a watch, and without a word on it: a bookmark comes every minute."""
 PAGE = 500
-"""Objects in one answer to a list."""
+"""Objects in one answer to a list, if they have no more than `LONGEST_PAGE` together."""
+LONGEST_PAGE = 16 * 1024 * 1024
+"""Bytes of such an answer. 500 pods have 5 MB as a rule, but the API server takes one of 1.5 MB
+(etcd, --max-request-bytes), and any user that creates pods could fill the operator's memory."""
 TRIES = 4
 """How often a request is sent that the API server puts off (429)."""
 LONGEST_PAUSE = 10.0
@@ -119,9 +122,16 @@ class Page(msgspec.Struct, frozen=True):
     ``version`` is that of the whole list: a watch goes on from there.
     """
 
-    items: list[JsonObject]
+    items: Iterable[JsonObject]
     version: str
     continue_token: str
+
+
+class _Listing(msgspec.Struct, frozen=True):
+    """A part of a list, as the API server answers."""
+
+    items: list[msgspec.Raw]
+    metadata: dict[str, Any] = {}
 
 
 class Event(msgspec.Struct, frozen=True):
@@ -209,13 +219,31 @@ class Api:
         return self._places if kind in (PLURAL, POLICIES) else ("",)
 
     def page(self, kind: str, place: str, token: str = "") -> Page:
-        """A part of the list of a kind, as it is now. Raises ApiExpired, too."""
-        query = {"limit": str(PAGE), **_watched(kind), "continue": token}
-        listing = self._ask("GET", _path(kind, place), query)
-        meta = submap(listing, "metadata")
-        return Page(
-            self._items(listing), text_at(meta, "resourceVersion"), text_at(meta, "continue")
-        )
+        """A part of the list of a kind, as it is now. Raises ApiExpired, too.
+
+        Its items are decoded one at a time: decoded, they take ten times as much memory.
+        """
+        limit, path = PAGE, _path(kind, place)
+        data = None
+        while data is None:
+            query = {"limit": str(limit), **_watched(kind), "continue": token}
+            longest = LONGEST_PAGE if limit > 1 else None
+            data = self._data("GET", path, query, longest=longest)
+            limit = max(limit // 8, 1)
+        try:
+            listing = msgspec.json.decode(data, type=_Listing)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            raise self._no_server(path) from None
+        meta = listing.metadata
+        version, next_token = text_at(meta, "resourceVersion"), text_at(meta, "continue")
+        return Page(self._decoded(listing.items, path), version, next_token)
+
+    def _decoded(self, items: Iterable[msgspec.Raw], path: str) -> Iterator[JsonObject]:
+        for item in items:
+            try:
+                yield msgspec.json.decode(item, type=JsonObject)
+            except (msgspec.DecodeError, UnicodeDecodeError):
+                raise self._no_server(path) from None
 
     def watch(self, kind: str, place: str, version: str) -> Watch:
         """What happens to a kind after a version of its list. Raises ApiExpired, too."""
@@ -223,7 +251,8 @@ class Api:
         query |= _watched(kind) | {"timeoutSeconds": str(WATCHED_FOR)}
         answer = self._send("GET", _path(kind, place), query, within=SILENT)
         if answer.status != 200:
-            raise refusal(int(answer.status), str(answer.reason or ""), self._body(answer))
+            body = self._body(answer) or b""
+            raise refusal(int(answer.status), str(answer.reason or ""), body)
         return Watch(answer.response)
 
     def list_fresh(
@@ -278,7 +307,7 @@ class Api:
     def _items(self, listing: JsonObject) -> list[JsonObject]:
         items = listing.get("items")
         if not isinstance(items, list):
-            raise ApiUnavailable(f"what answers at {self.server} is no API server")
+            raise self._no_server()
         return [item for item in items if isinstance(item, dict)]
 
     def _ask(
@@ -289,14 +318,30 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> JsonObject:
-        answer = self._send_with_retries(method, path, query, body, within)
-        data = self._body(answer)
-        if not 200 <= answer.status <= 299:
-            raise refusal(int(answer.status), str(answer.reason or ""), data)
+        data = self._data(method, path, query, body, within) or b""
         try:
             return msgspec.json.decode(data, type=JsonObject)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            raise ApiUnavailable(f"what answers at {self.server}{path} is no API server") from None
+            raise self._no_server(path) from None
+
+    def _no_server(self, path: str = "") -> ApiUnavailable:
+        return ApiUnavailable(f"what answers at {self.server}{path} is no API server")
+
+    def _data(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Json | list[Json] | None = None,
+        within: Timeout = WITHIN,
+        longest: int | None = None,
+    ) -> bytes | None:
+        """The body of the answer; None if it has more than ``longest`` bytes."""
+        answer = self._send_with_retries(method, path, query, body, within)
+        data = self._body(answer, longest)
+        if data is not None and not 200 <= answer.status <= 299:
+            raise refusal(int(answer.status), str(answer.reason or ""), data)
+        return data
 
     def _send_with_retries(
         self,
@@ -352,9 +397,17 @@ class Api:
         except (HTTPError, ApiException, ConfigException, OSError) as error:
             raise self._away(error) from error
 
-    def _body(self, answer: Any) -> bytes:
+    def _body(self, answer: Any, longest: int | None = None) -> bytes | None:
+        """The body of an answer; None if it has more than ``longest`` bytes."""
         try:
-            return bytes(answer.read())
+            # The answer to a caller that is put off has been read before.
+            if longest is None or answer.data is not None:
+                return bytes(answer.read())
+            data = bytes(answer.response.read(longest + 1))
+            if len(data) <= longest:
+                return data
+            answer.response.close()
+            return None
         except (HTTPError, OSError) as error:
             raise self._away(error) from error
 

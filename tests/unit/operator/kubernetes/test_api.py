@@ -1,8 +1,10 @@
 """The API server is asked by the real client, over HTTP; errors say what to do."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -32,7 +34,7 @@ def pod(name: str, **labels: str) -> dict[str, object]:
     return {"metadata": {"name": name, "labels": labels}, "spec": {"nodeName": "node1"}}
 
 
-def names(listed: list[dict[str, dict[str, str]]]) -> set[str]:
+def names(listed: Iterable[dict[str, Any]]) -> set[str]:
     return {o["metadata"]["name"] for o in listed}
 
 
@@ -137,7 +139,7 @@ async def test_an_api_server_that_is_away_and_back(
         await in_thread(late.page, "nodes", "")
     assert type(caught.value) is ApiUnavailable
     async with listening(other, port):
-        assert (await in_thread(late.page, "nodes", "")).items == []
+        assert [*(await in_thread(late.page, "nodes", "")).items] == []
         late.close()
 
 
@@ -152,10 +154,39 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
 async def test_what_does_not_answer_in_json_is_away(
     api: Api, monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
-    answer = SimpleNamespace(status=200, reason="OK", read=lambda: text, getheader=lambda *_: "")
+    answer = SimpleNamespace(
+        status=200, reason="OK", data=text, read=lambda: text, getheader=lambda *_: ""
+    )
     monkeypatch.setattr(api._client, "call_api", lambda *_, **__: answer)
+
+    def listed() -> None:
+        list(api.page("nodes", "").items)
+
     with pytest.raises(ApiUnavailable, match="/api/v1/nodes is no API server"):
-        await in_thread(api.page, "nodes", "")
+        await in_thread(listed)
+
+
+async def test_a_page_of_large_objects_is_asked_for_in_parts(
+    server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """500 pods of a megabyte each were read at once: the operator ended by it, at each start."""
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.api_client.LONGEST_PAGE", 30_000)
+    large = {f"a{number}": "x" * 60 for number in range(100)}
+    for number in range(9):
+        server.put("pods", pod(f"p{number}", **large))
+    server.put("pods", pod("q", **{f"a{number}": "x" * 60 for number in range(1000)}))
+
+    def listed() -> set[str]:
+        found, token = set[str](), ""
+        while True:
+            page = api.page("pods", "", token)
+            found |= names(page.items)
+            token = page.continue_token
+            if not token:
+                return found
+
+    assert await in_thread(listed) == {"q", *(f"p{number}" for number in range(9))}
+    assert {"500", "62", "7", "1"} == {query["limit"] for query in server.asked("GET", "pods")}
 
 
 def test_no_cluster_is_one_line_that_says_what_to_do(
