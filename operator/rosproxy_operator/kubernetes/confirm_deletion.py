@@ -46,16 +46,21 @@ def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
     if target is None:
         raise StateChanged(f"pod {action.id}")
     _check_node(api, target.node, observed)
-    raw_pods = api.list_fresh("pods", "", f"spec.nodeName={target.node}")
-    current = [pod for pod in map(_pod, raw_pods) if _matters(pod, action.of)]
+    version = ""
+    current: list[Pod] = []
+    for obj in api.each("pods", "", f"spec.nodeName={target.node}"):
+        pod = _pod(obj)
+        if _matters(pod, action.of):
+            current.append(pod)
+        if pod.uid == action.uid:
+            version = _version(obj)
     expected = (
         pod for pod in observed.pods if pod.node == target.node and _matters(pod, action.of)
     )
     if _by_uid(current) != _by_uid(expected):
         raise StateChanged(f"the pods on node {target.node}")
-    if target.pod.node != target.node:
-        return ""  # it is not on that node yet, so it is not in this list
-    return next((_version(obj) for obj in raw_pods if _uid(obj) == action.uid), "")
+    # One that is not on that node yet is not in this list.
+    return version if target.pod.node == target.node else ""
 
 
 def _check_rosproxy(api: Api, name: Name, observed: ClusterSnapshot) -> bool:
@@ -119,10 +124,6 @@ def _by_uid(pods: Iterable[Pod]) -> dict[str, object]:
         pod.uid: (pod.labels, pod.ended, pod.deleting, pod.every_port, pod.host_network)
         for pod in pods
     }
-
-
-def _uid(obj: Json) -> str:
-    return text_at(submap(obj, "metadata"), "uid")
 
 
 def _version(obj: Json) -> str:

@@ -218,15 +218,17 @@ class Api:
         """
         return self._places if kind in (PLURAL, POLICIES) else ("",)
 
-    def page(self, kind: str, place: str, token: str = "") -> Page:
+    def page(self, kind: str, place: str, token: str = "", fields: str = "") -> Page:
         """A part of the list of a kind, as it is now. Raises ApiExpired, too.
 
-        Its items are decoded one at a time: decoded, they take ten times as much memory.
+        ``fields`` is a selector. The items are decoded one at a time: decoded, they take ten times
+        as much memory.
         """
         limit, path = PAGE, _path(kind, place)
         data = None
         while data is None:
             query = {"limit": str(limit), **_watched(kind), "continue": token}
+            query["fieldSelector"] = fields
             longest = LONGEST_PAGE if limit > 1 else None
             data = self._data("GET", path, query, longest=longest)
             limit = max(limit // 8, 1)
@@ -237,6 +239,16 @@ class Api:
         meta = listing.metadata
         version, next_token = text_at(meta, "resourceVersion"), text_at(meta, "continue")
         return Page(self._decoded(listing.items, path), version, next_token)
+
+    def each(self, kind: str, place: str, fields: str) -> Iterator[JsonObject]:
+        """The objects that a selector fits, as they are now, one at a time; as `page`."""
+        token = ""
+        while True:
+            page = self.page(kind, place, token, fields)
+            yield from page.items
+            token = page.continue_token
+            if not token:
+                return
 
     def _decoded(self, items: Iterable[msgspec.Raw], path: str) -> Iterator[JsonObject]:
         for item in items:

@@ -188,6 +188,11 @@ async def test_a_page_of_large_objects_is_asked_for_in_parts(
     assert await in_thread(listed) == {"q", *(f"p{number}" for number in range(9))}
     assert {"500", "62", "7", "1"} == {query["limit"] for query in server.asked("GET", "pods")}
 
+    def each() -> set[str]:
+        return names(api.each("pods", "", "spec.nodeName=node1"))
+
+    assert await in_thread(each) == await in_thread(listed)
+
 
 def test_no_cluster_is_one_line_that_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
