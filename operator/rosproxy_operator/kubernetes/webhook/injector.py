@@ -110,7 +110,12 @@ class Injector:
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
         pod = objects.pod(body)
-        readable, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
+        namespace = pod.id.namespace
+        # Without a namespace the API server would list the RosProxies of all. An API server names
+        # one for each pod (k8s.io/apiserver, EnsureObjectNamespaceMatchesRequestNamespace), but any
+        # pod can ask.
+        listed = self._api.rosproxies(namespace, SOON) if namespace else []
+        readable, unusable = rosproxies(listed)
         usable = [r for r in readable.values() if not r.deleting]
         rosproxy = select_rosproxy(pod, usable)
         if isinstance(rosproxy, RosProxy):

@@ -321,6 +321,15 @@ async def test_a_pod_that_nobody_takes_is_told(running: Running) -> None:
     assert "warnings" not in answer
 
 
+async def test_for_a_pod_without_a_namespace_nothing_is_listed(running: Running) -> None:
+    """A caller had the operator list the RosProxies of all namespaces, for each request."""
+    pod = pod_obj("talker", INJECT)
+    del pod["metadata"]["namespace"]
+    answer = await running.admit(pod)
+    assert "no RosProxy in namespace" in answer["warnings"][0]
+    assert not running.server.asked("GET", "rosproxies")
+
+
 async def test_a_mistake_of_ours_admits_the_pod(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
