@@ -173,6 +173,36 @@ def test_members_that_python_would_take_in_place_of_others_are_refused() -> None
             see(MulticallWatch(PLAIN.__contains__), broken)
 
 
+@pytest.mark.parametrize(
+    "markup",
+    ["<!--{}-->", "<?pi {}?>", "<value{}></value>", "<value a='{}'></value>"],
+)
+def test_a_multicall_with_markup_that_does_not_end_is_refused(markup: str) -> None:
+    """A comment of 60 MB took as much memory, and a tag with attributes twenty times as much."""
+    body = multicall([element("setParam", "/n", "/key", [])])
+    before, after = body.split(b"<data>\n</data>")
+
+    def padded(size: int) -> bytes:
+        return before + b"<data>" + markup.format(" " * size).encode() + b"</data>" + after
+
+    see(MulticallWatch(PLAIN.__contains__), padded(1000))
+    with pytest.raises(XmlRpcError, match=f"more than {passing.LONGEST_MARKUP} bytes"):
+        see(MulticallWatch(PLAIN.__contains__), padded(200_000), 10_000)
+
+
+@pytest.mark.parametrize("tag", ["<n{}/>", "<n a{}=''/>"])
+def test_a_multicall_with_many_names_of_elements_is_refused(tag: str) -> None:
+    """The parser keeps each name until the end: a million took 200 MB."""
+    body = multicall([element("setParam", "/n", "/key", [])])
+    odd = "".join(tag.format(number) for number in range(2000)).encode()
+    assert body.count(b"<data>\n</data>") == 1
+    with pytest.raises(XmlRpcError, match="names of elements and attributes"):
+        see(
+            MulticallWatch(PLAIN.__contains__),
+            body.replace(b"<data>\n</data>", b"<data>" + odd + b"</data>"),
+        )
+
+
 @pytest.mark.parametrize("cut", [50, 200, -5])
 def test_a_multicall_that_is_cut_is_refused(cut: int) -> None:
     body = multicall([element("setParam", "/n", "/key", 1)] * 3)

@@ -265,6 +265,30 @@ def test_the_number_of_elements_is_bounded(odd: str) -> None:
         xmlrpc.parse_call(body, Limits(1000, 6))
 
 
+ATTRIBUTES = "".join(f" a{number}=''" for number in range(100))
+
+
+@pytest.mark.parametrize("content", [" " * xmlrpc.LONGEST_TAG, ATTRIBUTES * 10, " a='>'" * 1000])
+@pytest.mark.parametrize("name", ["value", "größe"])
+def test_the_length_of_a_tag_is_bounded(name: str, content: str) -> None:
+    """One of 4 MiB took 460 MB: 100 bytes for each byte, and 200 for each attribute."""
+    with pytest.raises(XmlRpcError, match=f"a tag of more than {xmlrpc.LONGEST_TAG} bytes"):
+        xmlrpc.parse_call(raw_call(f"<{name}{content}>x</{name}>"))
+
+
+def test_long_texts_and_comments_are_no_tags() -> None:
+    text = "it's " * xmlrpc.LONGEST_TAG
+    body = raw_call(f"<value a='{'x' * 1000}>'>{text}<!-- {text}--><?pi {text}?>\"</value>")
+    assert xmlrpc.parse_call(body).params[0].text == f'{text}"'
+
+
+def test_attributes_count_as_elements() -> None:
+    body = raw_call(f"<value{ATTRIBUTES}>x</value>", "<value/>")
+    assert xmlrpc.parse_call(body, Limits(10_000, 107)).params
+    with pytest.raises(XmlRpcError, match="more than 106 elements and attributes"):
+        xmlrpc.parse_call(body, Limits(10_000, 106))
+
+
 @pytest.mark.parametrize("odd", ["", "<!-- -->"])
 def test_the_size_is_bounded(odd: str) -> None:
     body = raw_call(f"<value>{odd}x</value>")

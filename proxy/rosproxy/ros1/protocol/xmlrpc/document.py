@@ -9,7 +9,7 @@ Specification: http://xmlrpc.com/spec.md.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sized
 from typing import Any
 from xml.parsers import expat
 from xmlrpc.client import Fault, dumps
@@ -30,8 +30,13 @@ INVALID_PARAMS = -32602
 SYSTEM_ERROR = -32400
 """Fault code: the proxy itself could not do its part."""
 
-# The value of an attribute may hold ``>``.
-_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
+LONGEST_TAG = 4096
+"""Bytes of a tag. Those of ROS have no attributes, and 20 bytes at most."""
+# The value of an attribute may hold ``>``, and never ``<``. The quantifiers are possessive: a plain
+# one keeps a state of 100 bytes for each byte of a long tag.
+_TAG = re.compile(rb"<(?:[^<>\"']++|\"[^<\"]*+\"|'[^<']*+')*+>")
+_LONG_TAG = re.compile(rb"(?=<[^!?][^<]{%d})%b" % (LONGEST_TAG - 1, _TAG.pattern))
+"""A tag, with what follows it up to the next one, that is longer than a tag may be."""
 _ENCODINGS = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1"})
 _MEANING = frozenset(
     {"methodName", "params", "fault", "value", "string", "array", "struct", "member", "name"}
@@ -168,6 +173,10 @@ def exceeds_elements(body: bytes, limits: Limits) -> bool:
     return body.count(b"</") + body.count(b"/>") > limits.elements
 
 
+def _has_long_tag(body: bytes) -> bool:
+    return any(tag.end() - tag.start() > LONGEST_TAG for tag in _LONG_TAG.finditer(body))
+
+
 class _Parser:
     """One pass of expat over a document, collecting values and their byte offsets."""
 
@@ -184,6 +193,9 @@ class _Parser:
             raise XmlRpcError(PARSE_ERROR, f"longer than {limits.size} bytes")
         if exceeds_elements(body, limits):  # before any takes memory
             raise XmlRpcError(PARSE_ERROR, f"more than {limits.elements} elements")
+        # expat has all attributes of a tag in memory, each in some 200 bytes, when it tells of it.
+        if _has_long_tag(body):
+            raise XmlRpcError(PARSE_ERROR, f"a tag of more than {LONGEST_TAG} bytes")
         # expat finds UTF-16 out by itself; here tags and texts are looked for as ASCII.
         if b"\0" in body:
             raise XmlRpcError(PARSE_ERROR, "NUL bytes in the document; use UTF-8")
@@ -206,9 +218,9 @@ class _Parser:
             name = self._encoding[:20]
             raise XmlRpcError(PARSE_ERROR, f"encoding {name} is not supported; use UTF-8")
 
-    def _start(self, name: str, attributes: object) -> None:
+    def _start(self, name: str, attributes: Sized) -> None:
         self._path.append(name)
-        self._count += 1
+        self._count += 1 + len(attributes)
         self.root = self.root or name
         self._check(name)
         if name == "value":
@@ -227,7 +239,8 @@ class _Parser:
         if len(self._path) > self._limits.depth:
             raise XmlRpcError(PARSE_ERROR, f"nested deeper than {self._limits.depth} elements")
         if self._count > self._limits.elements:
-            raise XmlRpcError(PARSE_ERROR, f"more than {self._limits.elements} elements")
+            text = f"more than {self._limits.elements} elements and attributes"
+            raise XmlRpcError(PARSE_ERROR, text)
         if ":" in name and name.rpartition(":")[2] in _MEANING:
             raise XmlRpcError(INVALID_REQUEST, "an element of XML-RPC must have no prefix")
 

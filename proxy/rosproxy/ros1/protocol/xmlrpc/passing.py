@@ -12,7 +12,7 @@ it passes if each of its calls does. Its grammar is held to the letter, as Pytho
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from xml.parsers import expat
 
 from rosproxy.ros1.protocol.xmlrpc.document import (
@@ -29,6 +29,12 @@ HEAD = 4096
 """Bytes of a document in which its method is looked for."""
 DEPTH = 64
 """Elements of a multicall inside of each other, as `Limits` has it for what is read."""
+LONGEST_MARKUP = 64 * 1024
+"""Bytes of a tag, comment or processing instruction of a multicall. expat keeps one until it is
+whole. Before version 2.6 expat reads it again from its start with each piece that comes."""
+LONGEST_NAMES = 4096
+"""Characters of the names of all elements and attributes of a multicall, each counted once. The
+parser keeps them until the end of the document. XML-RPC has 20 names."""
 
 _HEAD = re.compile(
     rb"""(?:<\?xml\s+version=(?:'1\.0'|"1\.0")
@@ -156,6 +162,9 @@ class MulticallWatch(CallWatch):
         self._text = ""
         self._elements: list[str] = []
         self._members: list[str] = []
+        self._size = 0
+        self._names = set[str]()
+        self._names_length = 0
         self._parser = parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
@@ -174,8 +183,13 @@ class MulticallWatch(CallWatch):
             self._parser.Parse(piece, last)
         except expat.ExpatError as error:
             raise XmlRpcError(PARSE_ERROR, f"not well-formed XML: {error}") from None
+        self._size += len(piece)
+        if self._size - self._parser.CurrentByteIndex > LONGEST_MARKUP:
+            text = f"a tag or comment of more than {LONGEST_MARKUP} bytes in a long {MULTICALL}"
+            raise XmlRpcError(PARSE_ERROR, text)
 
-    def _start(self, name: str, attributes: object) -> None:
+    def _start(self, name: str, attributes: Collection[str]) -> None:
+        self._note_names((name, *attributes))
         self._depth += 1
         if self._depth > DEPTH:
             raise XmlRpcError(PARSE_ERROR, f"nested deeper than {DEPTH} elements")
@@ -195,6 +209,15 @@ class MulticallWatch(CallWatch):
             self._text = ""
             # An array holds the parameters, which may be long: no text of theirs is collected.
             self._parser.CharacterDataHandler = None if name == "array" else self._add_text
+
+    def _note_names(self, names: Iterable[str]) -> None:
+        for name in names:
+            if name not in self._names:
+                self._names.add(name)
+                self._names_length += len(name)
+        if self._names_length > LONGEST_NAMES:
+            text = f"names of elements and attributes with more than {LONGEST_NAMES} characters"
+            raise XmlRpcError(PARSE_ERROR, f"{text} in a long {MULTICALL}")
 
     def _end(self, name: str) -> None:
         if self._depth == _FIELD_DEPTH and name == "name":
