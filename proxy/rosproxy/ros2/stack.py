@@ -207,6 +207,7 @@ class Ros2:
             # Before they are ended, or their next announcement would let them in again.
             server.select(())
             ended += server.retire()
+            await server.finish()
         return {"unregistered": ended}
 
     @property
@@ -255,6 +256,8 @@ class Ros2:
         for server in self.servers:
             server.apply_policy()
         self._applied = version  # only now: what fails is tried again
+        for server in self.servers:
+            await server.finish()
         return EnforcementCounts()
 
     retired = False

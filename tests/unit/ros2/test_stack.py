@@ -25,6 +25,9 @@ class FailingOnce:
         if self.calls == 1:
             raise RtpsError("made to fail")
 
+    async def finish(self) -> None:
+        """All have been told."""
+
 
 async def test_a_policy_that_could_not_be_applied_is_tried_again() -> None:
     told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": "45000-45015"}

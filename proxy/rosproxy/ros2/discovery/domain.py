@@ -34,7 +34,6 @@ from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import Standing, cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import LanRelay, Outgoing, sent_to
-from rosproxy.ros2.discovery.hidden_endpoints import has_changed
 from rosproxy.ros2.protocol.addressing import (
     destinations,
     for_all,
@@ -66,6 +65,8 @@ from rosproxy.ros2.rewriting.discovery import (
 
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
+
+SENT_AT_ONCE = 64  # of those that have waited no more are let in at a time
 
 _StandInUsers = Sequence[tuple[OutsideParticipant, Lease]]
 """Participants outside that a stand-in leads to, each by its lease."""
@@ -221,22 +222,22 @@ class Domain(DomainParticipants):
     def settle(self, now: float) -> list[Outgoing]:
         """Admit those that waited until it was known who had which port; and have others meet."""
         sent = self.returning.repeated_questions(now)
-        for source, message in self.returning.ready(now):
-            admit = partial(self._admitted_inside, message, source, now)
-            sent += self._unless_malformed(source, admit)
+        self._admissions = self.returning.ready(now)
+        sent += self._admitted_next(now)
         for insider in list(self.inside.by_prefix.values()):
             proceed = partial(self.rediscovery.proceed, insider, now)
             sent += self._unless_malformed(insider.address, proceed)
-        return sent
+        return sent + self.rediscovery.next_datagrams(now)
+
+    def go_on(self, now: float) -> list[Outgoing]:
+        """Do the next part, of some milliseconds, of what takes long; see `is_busy`."""
+        return self._admitted_next(now) + self.rediscovery.next_datagrams(now)
 
     def apply_policy(self, now: float) -> list[Outgoing]:
         """Have participants meet anew of which the policy says something else than before."""
-        sent = list[Outgoing]()
         self.fragments.clear()  # they were judged by the former policy
-        for insider in self.inside.by_prefix.values():
-            if has_changed(self.settings.judge, insider):
-                sent += self._unless_malformed(insider.address, partial(self._part, insider, now))
-        return sent
+        self.rediscovery.review()
+        return self.rediscovery.next_datagrams(now)
 
     def move_to(self, hosts: tuple[str, ...], now: float) -> list[Outgoing]:
         """Announce the participants inside at other addresses of the advertised host.
@@ -247,9 +248,9 @@ class Domain(DomainParticipants):
         sent = self.settings.to_outside(self.own.observer.farewell())
         self.settings.hosts = hosts
         for insider in self.inside.by_prefix.values():
-            move = partial(self.rediscovery.move, insider, now)
+            move = partial(self.rediscovery.move, insider)
             sent += self._unless_malformed(insider.address, move)
-        return sent
+        return sent + self.rediscovery.next_datagrams(now)
 
     def retire(self, now: float) -> list[Outgoing]:
         """Have all inside and all outside forget each other, as no proxy takes over.
@@ -260,17 +261,22 @@ class Domain(DomainParticipants):
         sent = list[Outgoing]()
         self.returning.forget({insider.address for insider in self.inside.by_prefix.values()})
         for insider in list(self.inside.by_prefix.values()):
-            part = partial(self.rediscovery.separate, insider, now)
+            part = partial(self.rediscovery.separate, insider)
             sent += self._unless_malformed(insider.address, part)
             self._forget_inside(insider)
-        return sent
+        return sent + self.rediscovery.next_datagrams(now)
 
-    def _part(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """Part one from all outside, of whom the policy is asked anew then. Raises RtpsError."""
-        try:
-            return self.rediscovery.separate(insider, now)
-        finally:
-            insider.verdicts.clear()
+    def _admitted_next(self, now: float) -> list[Outgoing]:
+        """What follows as the next participants are let in that have waited."""
+        sent = list[Outgoing]()
+        self._is_admitting = False
+        for source, message in self._admissions:
+            admit = partial(self._admitted_inside, message, source, now)
+            sent += self._unless_malformed(source, admit)
+            if len(sent) >= SENT_AT_ONCE:
+                self._is_admitting = True
+                break
+        return sent
 
     def _unless_malformed(self, source: str, step: Callable[[], list[Outgoing]]) -> list[Outgoing]:
         """What a step gives to send, or nothing: one participant must not keep it from others."""

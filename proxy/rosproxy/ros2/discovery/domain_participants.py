@@ -5,7 +5,7 @@ decided in `rosproxy.ros2.discovery.domain`.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -31,6 +31,10 @@ from rosproxy.ros2.registry.participants import (
     OutsideParticipant,
     Participant,
 )
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
+
+ENDED_AT_ONCE = 64
+"""Participants of a side that are forgotten at a time. The proxy looks twice a second."""
 
 
 @dataclass(slots=True)
@@ -53,6 +57,9 @@ class DomainParticipants:
     owners: PrefixOwners
     rates: DiscoveryRates = field(default_factory=DiscoveryRates)
     passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
+    _admissions: Iterator[tuple[str, DiscoveryMessage]] = field(default_factory=lambda: iter(()))
+    """Participants that waited, and are let in now."""
+    _is_admitting: bool = False
 
     @classmethod
     def starting(
@@ -91,10 +98,15 @@ class DomainParticipants:
             returning,
             refused,
             fragments,
-            Rediscovery(settings, outside),
+            Rediscovery(settings, inside, outside),
             proofs,
             PrefixOwners(settings, inside, outside, returning, proofs),
         )
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether `Domain.go_on` has more to do: hundreds may have to meet hundreds."""
+        return self._is_admitting or self.rediscovery.is_busy
 
     def is_kept(self, participant: InsideParticipant) -> bool:
         """Whether a participant inside keeps all the ports that it has, for the next process."""
@@ -107,9 +119,11 @@ class DomainParticipants:
         was served, and is let in again at the other.
         """
         sent = list[Outgoing]()
-        for insider in [p for p in self.inside.by_prefix.values() if p.until < now]:
+        insiders = [p for p in self.inside.by_prefix.values() if p.until < now]
+        for insider in insiders[:ENDED_AT_ONCE]:
             sent += self._end_for(insider)
-        for outsider in [p for p in self.outside.by_prefix.values() if p.until < now]:
+        outsiders = [p for p in self.outside.by_prefix.values() if p.until < now]
+        for outsider in outsiders[:ENDED_AT_ONCE]:
             self._forget_outside(outsider)
         self.proofs.expire(now, self.inside.count_by_address, self.outside.count_by_address)
         return sent

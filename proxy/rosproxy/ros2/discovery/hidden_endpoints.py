@@ -5,6 +5,8 @@ changes, it is applied by having the participant and those of the other side los
 other, and meet again: only for participants inside for which a verdict has changed.
 """
 
+from collections.abc import Iterable, Iterator
+
 from rosproxy.ros2.discovery.domain_settings import Judge
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
@@ -41,10 +43,21 @@ def is_hidden(
     return not (judge(*rule, inside.address) if verdict is None else verdict)
 
 
-def has_changed(judge: Judge, inside: InsideParticipant) -> bool:
-    """Whether the policy says something else of a participant than before, or may."""
-    if len(inside.verdicts) >= MOST_VERDICTS:
-        return True
-    return any(
-        judge(*rule, inside.address) is not allowed for rule, allowed in inside.verdicts.items()
-    )
+def reviewed(
+    judge: Judge, insiders: Iterable[InsideParticipant]
+) -> Iterator[InsideParticipant | None]:
+    """Judge the verdicts of participants again, one with each step.
+
+    Yield each participant of which the policy says something else than before, or may; None for
+    each verdict that is the same. One participant may have a thousand verdicts, and each may take
+    as many rules.
+    """
+    for insider in insiders:
+        if len(insider.verdicts) >= MOST_VERDICTS:
+            yield insider
+            continue
+        for rule, allowed in list(insider.verdicts.items()):
+            if judge(*rule, insider.address) is not allowed:
+                yield insider
+                break
+            yield None

@@ -87,6 +87,7 @@ class DomainServer:
         self._groups = GroupEars(settings.multicast_port, self._read_group, self._stop_reading)
         self._secret, self._heard = b"", asyncio.Event()
         self._reader = DiscoveryReader()
+        self._next_part: asyncio.Handle | None = None
         self._out = {f: _sending_socket(f) for f in (socket.AF_INET, socket.AF_INET6)}
         self.lost = 0
         """Datagrams that the kernel did not take."""
@@ -140,12 +141,12 @@ class DomainServer:
 
     def move_to(self, hosts: tuple[str, ...]) -> None:
         """Have outside reach the range at these addresses of the host from now on."""
-        self._open_and_send(self.domain.move_to(hosts, self._now()))
+        self._send_and_go_on(self.domain.move_to(hosts, self._now()))
         self._send(self.domain.own.announced_outside())
 
     def apply_policy(self) -> None:
         """Have participants meet anew of which the policy says something else than before."""
-        self._open_and_send(self.domain.apply_policy(self._now()))
+        self._send_and_go_on(self.domain.apply_policy(self._now()))
 
     def select(self, addresses: Iterable[str]) -> None:
         """Let in participants at these addresses alone, from now on."""
@@ -167,13 +168,18 @@ class DomainServer:
     def retire(self) -> int:
         """End all participants inside, as no proxy takes over; returns how many there were."""
         count = len(self.domain.inside.by_prefix)
-        self._send(self.domain.retire(self._now()))
+        self._send_and_go_on(self.domain.retire(self._now()))
         return count
+
+    async def finish(self) -> None:
+        """Wait until all have been told what follows from a change."""
+        while self.domain.is_busy:  # noqa: ASYNC110 - each round of the event loop does a part
+            await asyncio.sleep(0)
 
     async def expire(self) -> None:
         """Let in participants that have waited, and forget those that have gone."""
         self._release()
-        self._open_and_send(self.domain.settle(self._now()))
+        self._send_and_go_on(self.domain.settle(self._now()))
         self._send(self.domain.expire(self._now()))
         self._sync_stand_ins()
         self._tell_changes()
@@ -199,6 +205,8 @@ class DomainServer:
     def close(self) -> None:
         """Close all sockets."""
         self._reader.close()
+        if self._next_part:
+            self._next_part.cancel()
         # The observer's alone: participants are not to forget the keeper, by which they keep ports.
         farewell = self.domain.own.observer.farewell()
         for address in self._groups.joined:
@@ -348,6 +356,16 @@ class DomainServer:
         """
         closed = self._sync_stand_ins()
         self._send(out for out in outgoing if not (closed and self._names_any(closed, out)))
+
+    def _send_and_go_on(self, outgoing: Iterable[Outgoing]) -> None:
+        """Send the first part of what follows from a change, and the others in later rounds."""
+        self._open_and_send(outgoing)
+        if self.domain.is_busy and self._next_part is None:
+            self._next_part = self._loop.call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        self._next_part = None
+        self._send_and_go_on(self.domain.go_on(self._now()))
 
     def _names_any(self, ports: Iterable[int], out: Outgoing) -> bool:
         """Whether a datagram says that somebody is reached at one of these ports of the proxy's."""

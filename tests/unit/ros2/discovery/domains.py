@@ -138,6 +138,14 @@ def meet(domain: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgo
     return domain.heard_inside(spdp(prefix, address), address, NOW)
 
 
+def finished(domain: Domain, sent: Sequence[Outgoing], now: float = NOW) -> list[Outgoing]:
+    """What a change leads to, of which ``sent`` is the first part."""
+    every = list(sent)
+    while domain.is_busy:
+        every += domain.go_on(now)
+    return every
+
+
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
     """What is sent to a host; what is for the LAN relay has its proof."""
     return [

@@ -11,6 +11,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.discovery_rates import BURST
+from rosproxy.ros2.discovery.domain_participants import ENDED_AT_ONCE
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
@@ -41,6 +42,7 @@ from tests.unit.ros2.discovery.domains import (
     B,
     carried,
     farewell,
+    finished,
     make_domain,
     meet,
     prove,
@@ -270,7 +272,7 @@ def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
     assert len(domain.returning.waiting) == MOST_PER_ADDRESS
     assert domain.heard_inside(spdp(A, OTHER), OTHER, 0.2)
     assert A in domain.returning.waiting
-    domain.settle(0.2 + ANSWER_TIME)
+    finished(domain, domain.settle(0.2 + ANSWER_TIME), 0.2 + ANSWER_TIME)
     assert not domain.returning.waiting
     assert domain.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
 
@@ -282,7 +284,8 @@ def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
     assert len(domain.outside.by_prefix) == MOST_PER_HOST
     domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
     assert B in domain.outside.by_prefix
-    domain.expire(NOW + 21)
+    for _ in range(MOST_PER_HOST // ENDED_AT_ONCE + 1):
+        domain.expire(NOW + 21)
     assert not domain.outside.count_by_address
 
 
@@ -402,7 +405,8 @@ def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None
     meet(domain, A, OTHER)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     for insider in domain.inside.by_prefix.values():
-        domain.rediscovery.separate(insider, NOW)
+        domain.rediscovery.separate(insider)
+    domain.go_on(NOW)
     domain.outside.by_prefix[B].announcement = b"no RTPS message"
     domain.settle(NOW + APART_TIME)
     assert not any(insider.is_apart for insider in domain.inside.by_prefix.values())

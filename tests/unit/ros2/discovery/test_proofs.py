@@ -36,6 +36,7 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
+    finished,
     make_domain,
     meet,
     prove,
@@ -251,7 +252,7 @@ def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
     asked = questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE)
     for question in asked:
         domain.heard_inside(answer(question, A), INSIDE, NOW)
-    told = domain.settle(NOW + ANSWER_TIME)
+    told = finished(domain, domain.settle(NOW + ANSWER_TIME), NOW + ANSWER_TIME)
     assert A in {source_prefix(datagram) for datagram in to(told, ROBOT)}
     assert len(domain.inside.by_prefix[A].leases) == 2
 

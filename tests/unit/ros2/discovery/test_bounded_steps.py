@@ -1,0 +1,167 @@
+"""Many participants inside meet many outside: a few at a time, and each of them in the end."""
+
+from collections import Counter
+from itertools import chain
+
+import pytest
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.leases.ports import PortMap, PortRange
+from rosproxy.ros2.discovery.domain import SENT_AT_ONCE, Domain
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.discovery.rediscovery import APART_TIME, PAIRS_AT_ONCE, VERDICTS_AT_ONCE
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
+from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    NOW,
+    OTHER,
+    ROBOT,
+    A,
+    finished,
+    make_domain,
+    meet,
+    prove,
+    sedp,
+    spdp,
+)
+
+OUTSIDE_COUNT = 100
+INSIDE_COUNT = 20
+LONG_RANGE = PortMap(PortRange(45000, 45999), PortRange(45000, 45999))
+
+
+class Policy:
+    """What it says of all, and how often it was asked."""
+
+    def __init__(self) -> None:
+        self.allows = True
+        self.count = 0
+
+    def __call__(self, kind: RuleKind, name: str, address: str) -> bool:
+        self.count += 1
+        return self.allows
+
+
+def inside(number: int) -> bytes:
+    return b"\x01\x0f\x01" + number.to_bytes(9, "big")
+
+
+def outside(number: int) -> bytes:
+    return b"\x01\x0f\x02" + number.to_bytes(9, "big")
+
+
+def crowd(policy: Policy) -> Domain:
+    """A domain with many at one address inside, one at another, and many outside."""
+    domain = make_domain(judge=policy, ports=LONG_RANGE)
+    for number in range(OUTSIDE_COUNT):
+        domain.heard_outside(spdp(outside(number), ROBOT, 4000 + number), ROBOT, NOW)
+    for number in range(INSIDE_COUNT):
+        domain.heard_inside(spdp(inside(number), INSIDE, 7000 + 2 * number), INSIDE, NOW)
+    meet(domain, A, OTHER)
+    (stand_in, *_) = domain.outside.stand_ins
+    for prefix, insider in domain.inside.by_prefix.items():
+        domain.at_stand_in(stand_in, sedp(prefix, insider.address, 7000), insider.address, NOW)
+    return domain
+
+
+def parts(domain: Domain, first: list[Outgoing], now: float) -> list[list[Outgoing]]:
+    every = [first]
+    while domain.is_busy:
+        every.append(domain.go_on(now))
+    return every
+
+
+def told(sent: list[Outgoing], ended: bool) -> Counter[str]:
+    """How many announcements, or farewells, of those outside an address inside gets."""
+    return Counter(
+        out.target.host
+        for out in sent
+        if out.target.host in (INSIDE, OTHER)
+        for announced in read_discovery(out.datagram).announcements
+        if announced.ended is ended and source_prefix(out.datagram)[:3] == outside(0)[:3]
+    )
+
+
+def test_a_change_of_the_policy_is_applied_in_parts() -> None:
+    """With 64 inside and 512 outside nothing else was done for seven seconds."""
+    policy = Policy()
+    domain = crowd(policy)
+    policy.allows = False
+    policy.count = 0
+    parting = parts(domain, domain.apply_policy(NOW), NOW)
+    assert policy.count == INSIDE_COUNT + 1
+    every_pair = {INSIDE: INSIDE_COUNT * OUTSIDE_COUNT, OTHER: OUTSIDE_COUNT}
+    assert told([*chain(*parting)], ended=True) == every_pair
+    later = NOW + APART_TIME
+    meeting = parts(domain, domain.settle(later), later)
+    assert told([*chain(*meeting)], ended=False) == every_pair
+    assert not any(insider.is_apart for insider in domain.inside.by_prefix.values())
+    most = PAIRS_AT_ONCE + 3 * (INSIDE_COUNT + 1)  # three for outside, of each inside
+    assert max(map(len, parting + meeting)) <= most
+
+
+def test_addresses_take_turns() -> None:
+    policy = Policy()
+    domain = crowd(policy)
+    policy.allows = False
+    finished(domain, domain.apply_policy(NOW))
+    later = NOW + APART_TIME
+    sent = domain.settle(later)
+    while told(sent, ended=False)[OTHER] < OUTSIDE_COUNT:
+        sent += domain.go_on(later)
+    assert told(sent, ended=False)[INSIDE] < 2 * OUTSIDE_COUNT
+
+
+def test_a_participant_stays_apart_until_it_has_all_farewells() -> None:
+    policy = Policy()
+    domain = crowd(policy)
+    policy.allows = False
+    domain.apply_policy(NOW)
+    assert domain.is_busy
+    later = NOW + APART_TIME
+    assert not told(domain.settle(later), ended=False)
+    finished(domain, [], later)
+    assert all(insider.is_apart for insider in domain.inside.by_prefix.values())
+
+
+def test_verdicts_are_judged_again_a_few_at_a_time() -> None:
+    """64,000 verdicts took five seconds with a hundred rules."""
+    policy = Policy()
+    domain = crowd(policy)
+    for insider in domain.inside.by_prefix.values():
+        insider.verdicts = {(RuleKind.PUBLISH, f"/t{number}"): True for number in range(100)}
+    policy.count = 0
+    domain.apply_policy(NOW)
+    assert policy.count == VERDICTS_AT_ONCE
+    assert finished(domain, []) == []
+    assert policy.count == 100 * (INSIDE_COUNT + 1)
+
+
+def test_a_participant_that_has_gone_is_not_parted() -> None:
+    policy = Policy()
+    domain = crowd(policy)
+    policy.allows = False
+    for insider in domain.inside.by_prefix.values():
+        insider.verdicts = {(RuleKind.PUBLISH, f"/t{number}"): False for number in range(100)}
+    domain.apply_policy(NOW)
+    policy.allows = True
+    domain.gone({INSIDE})
+    assert not told(finished(domain, []), ended=True)[INSIDE]
+
+
+@pytest.mark.parametrize("count", [INSIDE_COUNT, 2])
+def test_those_that_waited_after_a_start_are_let_in_a_few_at_a_time(count: int) -> None:
+    domain = make_domain(ports=LONG_RANGE)
+    for number in range(OUTSIDE_COUNT):
+        domain.heard_outside(spdp(outside(number), ROBOT, 4000 + number), ROBOT, 0.1)
+    prove(domain, INSIDE)
+    for number in range(count):
+        domain.heard_inside(spdp(inside(number), INSIDE, 7000 + 2 * number), INSIDE, 0.1)
+    later = 0.1 + ANSWER_TIME
+    every = parts(domain, domain.settle(later), later)
+    assert len(domain.inside.by_prefix) == count
+    assert told([*chain(*every)], ended=False) == {INSIDE: count * OUTSIDE_COUNT}
+    one = SENT_AT_ONCE + OUTSIDE_COUNT
+    assert max(map(len, every)) <= one + PAIRS_AT_ONCE + 3 * count
