@@ -5,11 +5,13 @@ says which node that is). In a glob ``*`` stands for any characters, ``/`` too, 
 nothing else is special, and case counts. Of several rules the first that matches decides; where
 none does, everything is allowed (`rosproxy.access.layers`).
 
-A glob is matched by an expression that never goes back behind a ``*`` (atomic groups), so that no
-glob takes longer than its length times the name's.
+A glob without ``?`` is matched by searches for its texts, which take no longer than the name. Any
+other is matched by an expression that never goes back behind a ``*`` (atomic groups), so that it
+takes no longer than its length times the name's.
 """
 
 import re
+from collections.abc import Sequence
 from enum import Enum
 from functools import lru_cache
 
@@ -115,7 +117,12 @@ def format_rules(rules: tuple[Rule, ...]) -> str:
 
 def matches(glob: str, name: str) -> bool:
     """Whether a glob matches all of a name."""
-    return glob == "*" or _expression(glob).fullmatch(name) is not None
+    if glob == "*":
+        return True
+    if "?" in glob:
+        return _expression(glob).fullmatch(name) is not None
+    first, *rest = glob.split("*")
+    return _has_texts(name, first, rest) if rest else name == first
 
 
 def _parse(tokens: list[str]) -> Rule:
@@ -134,6 +141,24 @@ def _parse(tokens: list[str]) -> Rule:
         if glob[0] not in "/*?":  # it would never match: names that the master knows begin so
             raise ValueError(f"{glob[:40]!r} must begin with / or *, as ROS names do")
     return Rule(action, kind, tokens[2], by)
+
+
+def _has_texts(name: str, first: str, rest: Sequence[str]) -> bool:
+    """Whether a name begins with a text, and has the others after it, the last one at its end.
+
+    Each is taken where it comes first: so all that follows has most room.
+    """
+    *middle, last = rest
+    position = len(first)
+    end = len(name) - len(last)
+    if position > end or not name.startswith(first) or not name.endswith(last):
+        return False
+    for text in middle:
+        found = name.find(text, position, end)
+        if found < 0:
+            return False
+        position = found + len(text)
+    return True
 
 
 @lru_cache(maxsize=2 * MOST_RULES)

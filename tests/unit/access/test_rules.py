@@ -53,6 +53,15 @@ def test_a_hostile_glob_takes_no_time() -> None:
     assert not rules.matches("/" + "*a" * 127, "/" + "a" * 100 + "b" * 900)
 
 
+def test_a_glob_without_a_question_mark_takes_no_more_steps_than_the_name_has_characters() -> None:
+    """60 globs of one label took 0.1 s for a name: the expression tried each text at each place."""
+    rules._expression.cache_clear()
+    assert not rules.matches("*" + "a" * 254 + "b", "a" * 1024)
+    assert not rules.matches("*" + "a" * 253 + "b*", "a" * 1024)
+    assert rules.matches("*a*" + "a" * 200 + "*", "a" * 1024)
+    assert rules._expression.cache_info().misses == 0
+
+
 @given(GLOBS, NAMES, NAMES)
 def test_what_may_match_below_a_prefix_is_never_missed(glob: str, prefix: str, rest: str) -> None:
     rule = Rule(RuleAction.DENY, RuleKind.GET_PARAM, glob)

@@ -165,6 +165,7 @@ class MasterApi:
                 if call and reply is None:
                     outcome = await self._outcome(call, request, pending)
                 outcomes.append(outcome)
+                await asyncio.sleep(0)  # with many rules one call may take milliseconds
             yield outcomes
         finally:
             for endpoint in pending:

@@ -5,6 +5,7 @@ addresses in it imported and those in its reply exported (`rosproxy.ros1.rewriti
 the calls tell is noted: the TCPROS port that a node names, and that a node refuses.
 """
 
+import asyncio
 import logging
 import socket
 from collections.abc import Awaitable
@@ -83,6 +84,7 @@ class SlaveApi:
                 raise Unreachable("the caller has closed the connection")
             results.append(await self._multicall_result(endpoint, inner, call))
             call.charge(len(results[-1]))
+            await asyncio.sleep(0)  # what is refused or absorbed waits for nothing else
         return multicall.results_reply(results)
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:

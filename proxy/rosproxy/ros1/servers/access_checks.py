@@ -6,6 +6,7 @@ Somebody who has the address of a node inside is no outsider: nodes in several i
 reach each other through the proxy's ports.
 """
 
+import asyncio
 from dataclasses import dataclass, replace
 
 from rosproxy.access.access_policy import OUTWARDS, PARAMETERS, AccessPolicy
@@ -81,9 +82,11 @@ class AccessChecks:
         caller, params = request.caller, _KnownParams(self._upstream)
         if self.idle:
             return [None] * len(request.calls)
-        return [
-            await self._judge_call(call, caller, params) if call else None for call in request.calls
-        ]
+        replies = list[LocalReply | None]()
+        for call in request.calls:
+            replies.append(await self._judge_call(call, caller, params) if call else None)
+            await asyncio.sleep(0)  # with many rules one call may take milliseconds
+        return replies
 
     def judge_long(self, method: str, head: bytes, source: str) -> LocalReply | None:
         """The reply to a long call of which only the head was read; None if it passes."""

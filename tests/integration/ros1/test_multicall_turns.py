@@ -1,0 +1,80 @@
+"""The calls of one multicall are judged one after the other, and others are served in between."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+
+from rosproxy.access.access_policy import AccessPolicy
+from rosproxy.ros1.api.slave import SlaveApi
+from tests.integration.net import NODE, rpc
+
+CALLS = 100
+
+
+class Rounds:
+    """Counts the rounds of the event loop, and notes in which of them a method is called."""
+
+    def __init__(self) -> None:
+        self.noted = set[int]()
+        self._current = 0
+        self._next: asyncio.Handle
+        self._turn()
+
+    def noting(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """The same method, whose calls are noted."""
+
+        def called(*values: Any) -> Any:
+            self.noted.add(self._current)
+            return method(*values)
+
+        return called
+
+    def end(self) -> None:
+        """Count no more."""
+        self._next.cancel()
+
+    def _turn(self) -> None:
+        self._current += 1
+        self._next = asyncio.get_running_loop().call_soon(self._turn)
+
+
+@pytest.fixture
+async def rounds() -> AsyncIterator[Rounds]:
+    made = Rounds()
+    yield made
+    made.end()
+
+
+def several(method: str, *params: Any) -> list[dict[str, Any]]:
+    return [{"methodName": method, "params": list(params)}] * CALLS
+
+
+async def test_calls_of_inside(make_proxy, node, rounds, monkeypatch):
+    """20 calls for parameters held all others up for 0.6 s, with rules of a label's length."""
+    proxy = await make_proxy(policy="deny get-param /secret/*")
+    await node.publish(proxy.master)
+    monkeypatch.setattr(AccessPolicy, "judge", rounds.noting(AccessPolicy.judge))
+    results = await rpc(proxy.master, "system.multicall", several("getParam", node.name, "/p"))
+    assert len(results) == CALLS
+    assert len(rounds.noted) >= CALLS
+
+
+async def test_registrations(make_proxy, node, rounds, monkeypatch):
+    proxy = await make_proxy(policy="deny publish /secret/*")
+    await node.publish(proxy.master)
+    calls = several("registerPublisher", node.name, "/t", "x/Y", node.uri)
+    monkeypatch.setattr(AccessPolicy, "judge", rounds.noting(AccessPolicy.judge))
+    results = await rpc(proxy.master, "system.multicall", calls, source=NODE)
+    assert len(results) == CALLS
+    assert len(rounds.noted) >= CALLS
+
+
+async def test_calls_of_outside_that_are_refused(proxy, node, rounds, monkeypatch):
+    await node.publish(proxy.master)
+    monkeypatch.setattr(SlaveApi, "_refuse", rounds.noting(SlaveApi._refuse))
+    calls = several("paramUpdate", "/master", "/p", 1)
+    results = await rpc(proxy.lease(node), "system.multicall", calls)
+    assert [status for ((status, *_),) in results] == [-1] * CALLS
+    assert len(rounds.noted) >= CALLS
