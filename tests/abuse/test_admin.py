@@ -20,6 +20,8 @@ from tests.integration.net import until
 from tests.unit.ros2.discovery.domains import SEDP_WRITERS, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload
 
+NAMES_OF_WRITERS = 64 * 1024 * 1024
+"""Bytes that the names of 40,960 writers may take, which the proxy remembers."""
 GOOD = bytes([1, 15, 1]) + bytes(9)
 EVIL = NODES[1:6]
 PORTS = 64
@@ -111,7 +113,7 @@ async def test_a_status_of_many_writers_with_long_names(abused: Abused) -> None:
     client = ProxyClient()
     with closing(Participant(GOOD, NODES[0], WELL_KNOWN)) as good:
         good.announce(ANNOUNCED)
-        with abused.watched():
+        with abused.watched(NAMES_OF_WRITERS):
             await announce_many(abused)
         good.announce(ANNOUNCED)
         try:

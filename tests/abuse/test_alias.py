@@ -10,6 +10,8 @@ from tests.abuse.apart import APART, APART_MASTER, NODES, STRANGERS
 from tests.abuse.conftest import Abused
 from tests.integration.net import connect, exchange, post, refuses, rpc, xml
 
+UPDATES = 64 * 1024 * 1024
+"""Bytes that the updates may take, of which the option --max-buffered lets 32 MiB in."""
 PER_UPDATE = 1000
 """URIs in one call from outside; all ports of a host are named by 63 calls."""
 
@@ -35,7 +37,7 @@ async def test_updates_that_name_every_port_of_the_masters_host(aliased, apart_m
     port = secret.sockets[0].getsockname()[1]
     lease = await aliased.publish(node)
     await robot.publish(host_and_port(apart_master.uri), "/map")
-    with closing(secret), aliased.watched():
+    with closing(secret), aliased.watched(UPDATES):
         asked = len(apart_master.named("getSystemState"))
         sources = (STRANGERS[0], NODES[1], NODES[0])
         calls = [

@@ -8,6 +8,12 @@ from examples.demo.fake_http import value
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, PARSE_ERROR
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, connect, exchange, post, rpc, xml
 
+DOCUMENTS = 48 * 1024 * 1024
+"""Bytes of documents: 32 MiB by --max-buffered, and what is made of one at a time."""
+SLOW_CALLS = 32 * 1024 * 1024
+"""Bytes that may be under way of 20 calls that pass, each with a connection to the master."""
+UPLOADS = 96 * 1024 * 1024
+"""Bytes of uploads: 32 MiB by --max-buffered, and what is read ahead of 200 connections."""
 MB = 1000 * 1000
 
 
@@ -35,7 +41,7 @@ async def test_a_small_body_that_inflates_to_a_huge_one(abused, node):
 
 async def test_documents_with_too_many_elements_and_with_as_many_as_there_may_be(abused, node):
     lease = await abused.publish(node)
-    with abused.watched():
+    with abused.watched(DOCUMENTS):
         for target, method in ((lease, b"publisherUpdate"), (abused.master, b"registerService")):
             whole = many_publishers(490_000, method)
             assert (await exchange(target, post(whole), NODE)).status == 413
@@ -75,7 +81,7 @@ async def test_documents_with_tags_of_megabytes(abused, node):
 async def test_uploads_that_are_never_finished(abused, node):
     lease = await abused.publish(node)
     body_start = b" " * 900_000
-    with abused.watched():
+    with abused.watched(UPLOADS):
         async with AsyncExitStack() as stack:
             for number in range(200):
                 source = OUTSIDE if number % 2 else f"127.0.1.{number}"
@@ -105,7 +111,7 @@ async def test_readers_that_never_read_a_large_parameter(abused, node, master):
 async def test_a_large_parameter_that_is_set_slowly_by_many(abused, node, master):
     lease = await abused.publish(node)
     body = xml("setParam", "/n", "/big", "x" * 20 * MB)
-    with abused.watched():
+    with abused.watched(SLOW_CALLS):
         async with AsyncExitStack() as stack:
             for _ in range(20):
                 wire = await stack.enter_async_context(connect(abused.master, OTHER_NODE))

@@ -29,6 +29,8 @@ from tests.integration.net import (
 )
 from tests.integration.proxy import PORTS
 
+READ_AHEAD = 64 * 1024 * 1024
+"""Bytes that may be read ahead of 400 connections, before a call on each is refused."""
 AT_ONCE = 3.0
 """Seconds after which a node that registers has been kept waiting, on a busy machine too."""
 TOKEN = "the operator's"
@@ -41,7 +43,7 @@ def registration(name: str, uri: str) -> bytes:
 async def test_strangers_flood_the_master_port(apart, apart_master, make_node):
     node = await make_node(address=NODES[0])
     lease = await apart.publish(node)
-    with apart.watched():
+    with apart.watched(READ_AHEAD):
         async with AsyncExitStack() as stack:
             for number in range(400):
                 source = STRANGERS[number % len(STRANGERS)]

@@ -20,6 +20,10 @@ from tests.integration.net import (
 )
 from tests.integration.test_texts import FORGED
 
+SUBSCRIBERS = 32 * 1024 * 1024
+"""Bytes of 400 relayed connections, and of the status of these."""
+REGISTRATIONS = 72 * 1024 * 1024
+"""Bytes of multicalls of 400 registrations, of all that are noted, and of the status of these."""
 MB = 1000 * 1000
 FILLED = "é" * (LONGEST_NAME - 10)
 """Most of the longest name there may be; in JSON each of its letters takes six characters."""
@@ -48,7 +52,7 @@ async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
     """With the longest names, until it is refused: 2 MB of names, which JSON makes more of."""
     evil, node = await make_node("/evil", OTHER_NODE), await make_node()
     lease = await abused.publish(node)
-    with abused.watched():
+    with abused.watched(REGISTRATIONS):
         for number in range(6):
             calls = [
                 register(evil.name, f"/{FILLED}{number * 400 + i}", evil.uri) for i in range(400)
@@ -67,7 +71,7 @@ async def test_subscribers_with_long_names(abused, make_node):
     """From outside, as many as a port takes of one address."""
     node, other = await make_node(), await make_node("/other", OTHER_NODE)
     lease, other_lease = await abused.publish(node), await abused.publish(other)
-    with abused.watched():
+    with abused.watched(SUBSCRIBERS):
         async with AsyncExitStack() as stack:
             for number in range(400):
                 wire = await stack.enter_async_context(connect(lease))
