@@ -40,14 +40,14 @@ MESSAGES = 20
 class Reader(Participant):
     """A participant that answers the proxy, and remembers which number each writer expects.
 
-    It tells the number in ``claimed`` instead, if there is one for the writer's participant.
+    It tells the number in ``claimed`` instead, if there is one for the writer.
     """
 
     def __init__(self, prefix: bytes, address: str, port: int) -> None:
         super().__init__(prefix, address, port)
         self.meta.setblocking(False)
-        self.numbers: dict[bytes, int] = {}
-        self.claimed: dict[bytes, int] = {}
+        self.numbers: dict[tuple[bytes, int], int] = {}
+        self.claimed: dict[tuple[bytes, int], int] = {}
 
     def live(self) -> None:
         """Announce itself, and answer all that has come."""
@@ -59,12 +59,14 @@ class Reader(Participant):
     def _answer(self, datagram: bytes) -> None:
         if source_vendor(datagram) != NO_VENDOR:
             return
-        writer = source_prefix(datagram)
+        own = source_prefix(datagram)
         for heartbeat in heartbeats(datagram):
+            writer = own, heartbeat.writer
             number = max(self.numbers.get(writer, 1), heartbeat.first)
             self.numbers[writer] = number
             told = self.claimed.get(writer, number)
-            self.meta.sendto(kept_number(writer, self.prefix, told), ANNOUNCED)
+            answer = kept_number(own, self.prefix, told, heartbeat.writer)
+            self.meta.sendto(answer, ANNOUNCED)
 
 
 @pytest.fixture
@@ -172,10 +174,10 @@ async def test_a_claimed_port_goes_to_the_participant_that_had_it(
     before = await serve_and_restart(abused, good, robot)
     listened = PortRange(first, first + PORTS - 1)
     keeper = Keeper.of(APART_HOST, listened, 0, 0.0, keeper_key(SECRET))
-    seen_proof = keeper.proof(GOOD, before)
+    seen = keeper.numbers(GOOD, before)
     thief.claimed = {
-        keeper.prefix: keeper.number(before),
-        keeper.witness: seen_proof if has_proof else 1,
+        writer: number if has_proof or writer[0] == keeper.prefix else 1
+        for writer, number in seen.items()
     }
     with abused.watched():
 

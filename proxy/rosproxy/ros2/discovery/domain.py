@@ -304,7 +304,7 @@ class Domain(DomainParticipants):
         self, message: DiscoveryMessage, source: str, now: float
     ) -> list[Outgoing]:
         """Let in a participant inside, unless its prefix is that of a participant outside."""
-        if not self.owners.yields_to_inside(message.prefix, source):
+        if not self.owners.yields_to_inside(message.prefix):
             outsider = self.outside.by_prefix[message.prefix]
             self.returning.forget_participant(message.prefix)
             text = f"GUID prefix {outsider.guid_prefix} belongs to a participant outside, at "
@@ -317,7 +317,7 @@ class Domain(DomainParticipants):
         sent = self.returning.wait(message, source, now)
         if not sent:
             return []
-        if self.owners.yields_to_inside(message.prefix, source):
+        if self.owners.yields_to_inside(message.prefix):
             sent += self._give_prefix_to_inside(message.prefix, source)
         return sent + self._question_to_inside(message, source)
 
@@ -419,7 +419,7 @@ class Domain(DomainParticipants):
         if insider is None:
             return sent
         if is_new:
-            insider.was_inside = self.returning.was_inside(prefix, source)
+            insider.was_inside = self.returning.was_inside(prefix)
             holders = self.ports.displaced_by(prefix, now)
             sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
         lease_count = len(insider.leases)
@@ -430,7 +430,7 @@ class Domain(DomainParticipants):
             sent += self.own.keeper_farewell(insider)
             insider.parting_from = now
         else:
-            sent += self._reminders(insider, lease_count)
+            sent += self._reminders(insider, lease_count, now)
         sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
         if is_new:
             sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
@@ -481,15 +481,18 @@ class Domain(DomainParticipants):
         reader = readers[0] if readers else users[0][0].prefix
         count, exported = len(insider.leases), partial(self.inside.exported, insider, now=now)
         passed, questions = self.fragments.rewritten(port, message, reader, exported)
-        back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count)
+        back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count, now)
         return back + [sent for d in passed for sent in self._to_outside(_meant(users, d), d)]
 
-    def _reminders(self, insider: InsideParticipant, former_count: int) -> list[Outgoing]:
+    def _reminders(
+        self, insider: InsideParticipant, former_count: int, now: float
+    ) -> list[Outgoing]:
         """What makes a participant keep new ports at once, if it has more than ``former_count``.
 
         The proxy may be killed before the next round; what is lost on its way comes again then.
         """
-        return self.returning.reminders(insider) if len(insider.leases) > former_count else []
+        has_more = len(insider.leases) > former_count
+        return self.returning.reminders(insider, now) if has_more else []
 
     def _imported(
         self,

@@ -79,7 +79,7 @@ class DomainParticipants:
         ports, refused = LocatorPorts(pool, now), Refused(settings.note)
         proofs = AddressProofs(secret)
         keeper = Keeper.of(
-            settings.host, settings.ports.listen, settings.number, when, settings.keeper_key
+            settings.host, settings.ports.listen, settings.number, when - now, settings.keeper_key
         )
         inside = InsideParticipants(settings, ports, refused, proofs)
         outside = OutsideParticipants(settings, refused, proofs)

@@ -76,10 +76,10 @@ class OwnParticipants:
         """What makes a participant forget the keeper, which it knows at a former address."""
         return sent_to(participant.metatraffic, self.keeper.farewells(participant.prefix))
 
-    def port_reminders(self) -> list[Outgoing]:
+    def port_reminders(self, now: float) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
         participants = self.inside.by_prefix.values()
-        return [sent for p in participants for sent in self.returning.reminders(p)]
+        return [sent for p in participants for sent in self.returning.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Take in what a participant inside tells the keeper, or the observer. Raises RtpsError."""

@@ -6,50 +6,52 @@ participant, the *keeper*, with a writer of SEDP that never writes: it tells eac
 by a heartbeat that all samples before a number are gone, and the number holds its ports. The keeper
 has the same GUID prefix in each process of the proxy, so that the next one asks, and is told.
 
-The number is 1 for no ports; else it holds each port less the range's first, that of the first port
-in the lowest bits, and a port that is added makes it greater, as it has to be. A range that is made
-longer keeps its first port, and a port its bits, up to a length: so the keeper stays the same.
+The keeper has two writers, one for each half of its number. The number is 1 for no ports; else it
+holds each port less the range's first, that of the first port in the lowest bits. A port that is
+added makes neither half smaller, as it has to be. A range that is made longer keeps its first port,
+and a port its bits, up to a length: so the keeper stays the same.
 
 Each participant can compute this number for the ports of another one. So a proxy with a secret has
 a second such participant, the *witness*, whose number proves that of the keeper: how many ports
 there are, and a keyed hash of the participant's GUID prefix and these ports. The witness's own
 prefix follows from the secret, too: a proxy with another secret asks as another witness.
 
-Both numbers stay small where they can. Fast DDS 2.14 and 3.2 count up to a number one by one, and
-hold a lock meanwhile (StatefulReader.cpp, NotifyChanges): up to 2^24 takes some hundredths of a
-second, and up to 2^61 the participant hangs.
+No half is longer than `HALF_BITS`. Fast DDS before 2.14.6, 3.2.5 and 3.4.3 counts up to the number
+of a writer one by one, and holds a lock meanwhile (StatefulReader.cpp, NotifyChanges): up to 2^24
+takes some hundredths of a second, up to 2^32 ten seconds, and up to 2^48 days.
 """
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b, pbkdf2_hmac
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement, farewell
+from rosproxy.ros2.protocol.announcement import KEEPER_ENDPOINTS, announcement, farewell
 from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
-from rosproxy.ros2.protocol.rtps import NO_VENDOR, PREFIX
+from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 COUNTS_EACH_SECOND = 4
 LEASE = 24 * 3600.0
 """Seconds for which participants remember the keeper without hearing it."""
-_BITS = 62
-"""Bits of a number that are used."""
-_WIDTHS = (7, 10, 16)
-"""Bits that a port may take, by how long the range is: 8, 6 or 3 ports are kept."""
-
-
-_PROOF_BITS = 20
-"""Bits of the keyed hash; above these stands the number of ports. Few: see Fast DDS above."""
-MOST_WRONG = 4
-"""Wrong proofs after which no proof of an address counts any more: it may be guessing."""
-MOST_WRONG_ADDRESSES = 256
-"""Addresses with wrong proofs after which no proof of another address counts any more."""
+WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
+"""The writers of a participant that keeps a number: for its lower half, and for its upper half."""
+HALF_BITS = 24
+"""Bits of each half. Few: see Fast DDS above."""
+_WIDTHS = (7, 10, 12, 16)
+"""Bits that a port may take, by how long the range is: 6, 4, 4 or 2 ports are kept."""
+_HASH_BITS = 20
+"""Bits of the keyed hash in each half of a proof; above these stands the number of ports."""
+_HALF_MASK = (1 << HALF_BITS) - 1
+_HASH_MASK = (1 << _HASH_BITS) - 1
 _KEY_ROUNDS = 100_000
 """Rounds in which the key is made, some 40 ms. A participant can try secrets by its own proof: this
 makes each try slow."""
+
+
+_Writer = tuple[bytes, int]
+"""The GUID prefix of a participant of the proxy, and the entity id of its writer."""
 
 
 def keeper_key(secret: str | None) -> bytes:
@@ -59,39 +61,37 @@ def keeper_key(secret: str | None) -> bytes:
     return pbkdf2_hmac("sha256", secret.encode(), b"rosproxy: ports of participants", _KEY_ROUNDS)
 
 
+def halves(number: int, bits: int) -> tuple[int, int]:
+    """Return the numbers of both writers for a number, whose lower half has so many bits."""
+    upper, lower = divmod(number - 1, 1 << bits)
+    return lower + 1, upper + 1
+
+
 @dataclass(slots=True)
 class Keeper:
     """Keeps ports of a range in participants; ``prefix`` is its own, ``key`` that of the proofs.
 
     ``witness`` is the prefix of the participant that keeps the proofs, empty without a key.
-    ``number_by_prefix`` and ``proof_by_prefix`` are what each participant has answered last, by
-    GUID prefix. ``wrong_by_address`` counts the wrong proofs that each address has sent.
+    ``unix_offset`` is Unix time less the time that the methods are given, in seconds.
     """
 
     prefix: bytes
     ports: PortRange
     key: bytes = field(default=b"", repr=False)
-    number_by_prefix: dict[bytes, int] = field(default_factory=dict)
-    proof_by_prefix: dict[bytes, int] = field(default_factory=dict)
-    wrong_by_address: Counter[str] = field(default_factory=Counter)
-    _first_count: int = 0
+    unix_offset: float = 0.0
+    _answers: dict[bytes, dict[_Writer, int]] = field(default_factory=dict)
+    """What each participant has answered last, by its GUID prefix and by writer."""
     _counts: dict[bytes, int] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, host: str, ports: PortRange, domain: int, started: float, key: bytes = b""
+        cls, host: str, ports: PortRange, domain: int, unix_offset: float, key: bytes = b""
     ) -> "Keeper":
-        """The keeper of a proxy, from its advertised host, its range's first port and its domain.
-
-        ``started`` is Unix time: heartbeats to a participant are counted up from there, since it
-        heeds only those with a greater count than the last, which another process may have sent.
-        No process sends a participant more than `COUNTS_EACH_SECOND`.
-        """
+        """Return the keeper of a host, a range and a domain; any process gets the same."""
         identity = f"{host} {ports.first} {_width(ports)} {domain}"
         digest = blake2b(identity.encode(), digest_size=PREFIX - 2).digest()
-        first_count = int(started * COUNTS_EACH_SECOND)
         # A GUID prefix begins with the vendor's id (DDSI 2.2; so in Cyclone DDS, ddsi_init.c).
-        return cls(NO_VENDOR + digest, ports, key, _first_count=first_count)
+        return cls(NO_VENDOR + digest, ports, key, unix_offset)
 
     @property
     def witness(self) -> bytes:
@@ -100,73 +100,80 @@ class Keeper:
             return b""
         return NO_VENDOR + blake2b(self.prefix, key=self.key, digest_size=PREFIX - 2).digest()
 
-    def questions(self, prefix: bytes, reached_at: HostPort) -> list[bytes]:
-        """What asks a participant for its ports; ``reached_at`` is where it answers."""
-        return self._told(prefix, dict.fromkeys(self._prefixes, 1), reached_at)
+    @property
+    def prefixes(self) -> Iterable[bytes]:
+        """The GUID prefixes of the participants that have answered."""
+        return self._answers.keys()
 
-    def reminders(self, prefix: bytes, ports: Sequence[int], reached_at: HostPort) -> list[bytes]:
+    def questions(self, prefix: bytes, reached_at: HostPort, now: float) -> list[bytes]:
+        """What asks a participant for its ports; ``reached_at`` is where it answers."""
+        return self._told(prefix, dict.fromkeys(self._writers, 1), reached_at, now)
+
+    def reminders(
+        self, prefix: bytes, ports: Sequence[int], reached_at: HostPort, now: float
+    ) -> list[bytes]:
         """What makes a participant keep its ports; nothing if it does already."""
         if self.keeps(prefix, ports):
             return []
-        number = self.number(ports)
-        proof = self.proof(prefix, ports)
-        has_others = not self._has_kept(prefix, ports) and number <= self._number(prefix)
-        has_other_proof = 1 < proof <= self.proof_by_prefix.get(prefix, 1)
-        if has_others or (has_other_proof and not self._is_proven(prefix, ports)):
+        wanted = self.numbers(prefix, ports)
+        is_missing = {
+            self.prefix: not self._has_kept(prefix, ports),
+            self.witness: not self._is_proven(prefix, ports),
+        }
+        answers = self._answers.get(prefix, {})
+        if any(is_missing[w[0]] and n < answers.get(w, 1) for w, n in wanted.items()):
             # A reader heeds no smaller number (DDSI-RTPS 2.5, 8.4.12.1): it has to forget the
             # keeper first, and is told the number the next time.
             return self.farewells(prefix)
-        numbers = dict(zip(self._prefixes, (number, proof), strict=False))
-        return self._told(prefix, numbers, reached_at)
+        return self._told(prefix, wanted, reached_at, now)
 
     def farewells(self, prefix: bytes) -> list[bytes]:
         """What makes a participant forget the keeper, with what it keeps."""
         self.forget(prefix)
-        return [farewell(own) for own in self._prefixes]
+        return [farewell(own) for own in self._own_prefixes]
 
     def keeps(self, prefix: bytes, ports: Sequence[int]) -> bool:
         """Whether a participant keeps all these ports, as many of them as fit."""
         is_proven = not self.key or not ports or self._is_proven(prefix, ports)
-        return prefix in self.number_by_prefix and is_proven and self._has_kept(prefix, ports)
+        return prefix in self._answers and is_proven and self._has_kept(prefix, ports)
 
-    def take(self, prefix: bytes, source: str, datagram: bytes) -> bool:
-        """Note what a participant at an address answers; whether it is an answer. RtpsError."""
-        numbers = acknowledged(datagram, self.prefix, BuiltinWriter.PUBLICATIONS)
-        for number in numbers:
-            self.number_by_prefix[prefix] = number
-        proofs = self._proofs_in(datagram)
-        for proof in proofs:
-            self.proof_by_prefix[prefix] = proof
-        if proofs and self._is_wrong(prefix):
-            self._note_wrong(source)
-        return bool(numbers or proofs)
+    def take(self, prefix: bytes, datagram: bytes) -> bool:
+        """Note what a participant answers; whether it is an answer. Raises RtpsError."""
+        is_answer = False
+        for own, writer in self._writers:
+            for number in acknowledged(datagram, own, writer):
+                self._answers.setdefault(prefix, {})[own, writer] = number
+                is_answer = True
+        return is_answer
 
     def has_answered(self, prefix: bytes) -> bool:
         """Whether a participant has answered all questions."""
-        is_proof_known = not self.key or prefix in self.proof_by_prefix
-        return is_proof_known and prefix in self.number_by_prefix
+        return len(self._answers.get(prefix, ())) == len(self._writers)
 
     def former_ports(self, prefix: bytes) -> list[int]:
         """The ports that a participant has kept, in the order of its locators."""
-        return list(self._ports(self._number(prefix)))
+        return list(self._ports(self._answer(prefix, self.prefix, self.port_bits)))
 
-    def proven_count(self, prefix: bytes, source: str) -> int:
-        """How many of these ports a participant at an address has proved that it had."""
-        is_trusted = self.wrong_by_address[source] < MOST_WRONG and (
-            source in self.wrong_by_address or len(self.wrong_by_address) < MOST_WRONG_ADDRESSES
-        )
+    def proven_count(self, prefix: bytes) -> int:
+        """How many of these ports a participant has proved that it had."""
         ports = self.former_ports(prefix)
-        proof = self.proof_by_prefix.get(prefix, 1)
-        count = proof >> _PROOF_BITS
-        if not is_trusted or not 0 < count <= len(ports):
+        proof = self._answer(prefix, self.witness, HALF_BITS)
+        count = (proof - 1 & _HALF_MASK) >> _HASH_BITS
+        if not 0 < count <= len(ports):
             return 0
         return count if proof == self.proof(prefix, ports[:count]) else 0
 
     def forget(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
-        self.number_by_prefix.pop(prefix, None)
-        self.proof_by_prefix.pop(prefix, None)
-        self._first_count = max(self._first_count, self._counts.pop(prefix, 0))  # it may come again
+        self._answers.pop(prefix, None)
+        self._counts.pop(prefix, None)
+
+    def numbers(self, prefix: bytes, ports: Sequence[int]) -> dict[_Writer, int]:
+        """The number of each writer that holds, or proves, the ports of a participant."""
+        numbers = [*halves(self.number(ports), self.port_bits)]
+        if self.key:
+            numbers += halves(self.proof(prefix, ports), HALF_BITS)
+        return dict(zip(self._writers, numbers, strict=True))
 
     def number(self, ports: Sequence[int]) -> int:
         """The number that holds these ports, as many of them as fit."""
@@ -184,16 +191,30 @@ class Keeper:
             return 1
         # The keeper's prefix stands for the proxy, its range and its domain.
         content = self.prefix + prefix + self.number(ports).to_bytes(8, "big")
-        digest = blake2b(content, key=self.key, digest_size=8).digest()
-        return count << _PROOF_BITS | int.from_bytes(digest, "big") & (1 << _PROOF_BITS) - 1
+        digest = int.from_bytes(blake2b(content, key=self.key, digest_size=8).digest(), "big")
+        lower, upper = digest & _HASH_MASK, digest >> _HASH_BITS & _HASH_MASK
+        # The number of ports in both halves: so both grow with each port.
+        return ((count << _HASH_BITS | upper) << HALF_BITS | count << _HASH_BITS | lower) + 1
 
     @property
-    def _prefixes(self) -> list[bytes]:
+    def _own_prefixes(self) -> list[bytes]:
         return [self.prefix, self.witness] if self.key else [self.prefix]
 
-    def _number(self, prefix: bytes) -> int:
-        """The number that a participant has answered last."""
-        return self.number_by_prefix.get(prefix, 1)
+    @property
+    def _writers(self) -> list[_Writer]:
+        return [(own, writer) for own in self._own_prefixes for writer in WRITERS]
+
+    @property
+    def port_bits(self) -> int:
+        """Bits of the lower half of a number that holds ports: no port lies in both halves."""
+        return _most(self.ports) // 2 * _width(self.ports)
+
+    def _answer(self, prefix: bytes, own: bytes, bits: int) -> int:
+        """The number that a participant has answered last, made of its halves."""
+        answers = self._answers.get(prefix, {})
+        lower, upper = (answers.get((own, writer), 1) for writer in WRITERS)
+        # Of a former version the lower half may have all the ports, in more bits.
+        return lower + (upper - 1 << bits)
 
     def _has_kept(self, prefix: bytes, ports: Sequence[int]) -> bool:
         """Whether the number of a participant holds these ports, as many of them as fit."""
@@ -202,29 +223,7 @@ class Keeper:
 
     def _is_proven(self, prefix: bytes, ports: Sequence[int]) -> bool:
         """Whether a participant has answered the proof of these ports, or of more."""
-        proof = self.proof_by_prefix.get(prefix, 1)
-        count = proof >> _PROOF_BITS
-        kept = self.former_ports(prefix)[:count]
-        is_enough = count >= min(len(ports), _most(self.ports))
-        return is_enough and len(kept) == count and proof == self.proof(prefix, kept)
-
-    def _proofs_in(self, datagram: bytes) -> list[int]:
-        if not self.key:
-            return []
-        return acknowledged(datagram, self.witness, BuiltinWriter.PUBLICATIONS)
-
-    def _is_wrong(self, prefix: bytes) -> bool:
-        """Whether a participant has answered a proof of its ports that is wrong, not just old."""
-        proof = self.proof_by_prefix[prefix]
-        count = proof >> _PROOF_BITS
-        ports = self.former_ports(prefix)
-        return proof > 1 and count <= len(ports) and proof != self.proof(prefix, ports[:count])
-
-    def _note_wrong(self, source: str) -> None:
-        """Count a wrong proof of an address."""
-        is_known = source in self.wrong_by_address
-        if is_known or len(self.wrong_by_address) < MOST_WRONG_ADDRESSES:
-            self.wrong_by_address[source] += 1
+        return self.proven_count(prefix) >= min(len(ports), _most(self.ports))
 
     def _ports(self, number: int) -> Iterator[int]:
         """The ports that a number holds; none if it can't be one of `number`."""
@@ -237,16 +236,25 @@ class Keeper:
             bits >>= width
 
     def _told(
-        self, prefix: bytes, number_by_own: Mapping[bytes, int], reached_at: HostPort
+        self, prefix: bytes, numbers: Mapping[_Writer, int], reached_at: HostPort, now: float
     ) -> list[bytes]:
-        """What tells a participant where the samples of the proxy's own participants begin."""
-        count = self._counts[prefix] = self._counts.get(prefix, self._first_count) + 1
+        """What tells a participant where the samples of the proxy's own participants begin.
+
+        A participant heeds only heartbeats with a greater count than the last, which another
+        process may have sent. So the count follows from the time.
+        """
+        time_count = int((self.unix_offset + now) * COUNTS_EACH_SECOND)
+        count = max(self._counts.get(prefix, 0) + 1, time_count)
+        self._counts[prefix] = count
         sent = list[bytes]()
-        for own, number in number_by_own.items():
-            sent.append(announcement(own, [reached_at], LEASE, WRITER_ENDPOINTS))
+        for own in self._own_prefixes:
             # A count is a signed number of 32 bits.
-            beat_count = count & 0x7FFFFFFF
-            sent.append(heartbeat(own, prefix, BuiltinWriter.PUBLICATIONS, number, beat_count))
+            beats = [
+                heartbeat(own, prefix, writer, numbers[own, writer], count & 0x7FFFFFFF)
+                for writer in WRITERS
+            ]
+            sent.append(announcement(own, [reached_at], LEASE, KEEPER_ENDPOINTS))
+            sent.append(beats[0] + b"".join(beat[HEADER:] for beat in beats[1:]))
         return sent
 
 
@@ -256,4 +264,4 @@ def _width(ports: PortRange) -> int:
 
 def _most(ports: PortRange) -> int:
     """How many ports of a range are kept of a participant."""
-    return _BITS // _width(ports)
+    return 2 * (HALF_BITS // _width(ports))

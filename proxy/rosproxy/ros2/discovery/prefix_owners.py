@@ -37,11 +37,11 @@ class PrefixOwners:
         """Whether a participant inside uses a prefix; it may wait to be served."""
         return prefix in self.inside.by_prefix or prefix in self.returning.waiting
 
-    def yields_to_inside(self, prefix: bytes, source: str) -> bool:
-        """Whether a prefix that outside may use belongs to a participant inside at an address."""
+    def yields_to_inside(self, prefix: bytes) -> bool:
+        """Whether a prefix that outside may use belongs to a participant inside."""
         outsider = self.outside.by_prefix.get(prefix)
         is_weak = outsider is None or not (outsider.trusted or outsider.proven)
-        return is_weak or self.returning.was_inside(prefix, source)
+        return is_weak or self.returning.was_inside(prefix)
 
     def yields_to_outside(self, prefix: bytes, source: str, now: float) -> bool:
         """Whether a prefix that inside uses belongs to a participant outside at an address."""
@@ -50,5 +50,4 @@ class PrefixOwners:
         insider = self.inside.by_prefix.get(prefix)
         if insider is not None:
             return not insider.was_inside and self.inside.ports.may_have_returning(now)
-        address, _, _ = self.returning.waiting[prefix]
-        return not self.returning.was_inside(prefix, address)
+        return not self.returning.was_inside(prefix)

@@ -59,7 +59,7 @@ class ReturningParticipants:
             return []  # it announces itself again, when there may be room
         self.waiting[message.prefix] = source, message, now
         self._counts[source] += 1
-        return self._questions(message, source)
+        return self._questions(message, source, now)
 
     def _has_room(self) -> bool:
         """Whether one more may wait; the first that has not proved to receive leaves for it."""
@@ -77,7 +77,7 @@ class ReturningParticipants:
             question
             for source, message, since in self.waiting.values()
             if not self._has_answered(message.prefix, since, now)
-            for question in self._questions(message, source)
+            for question in self._questions(message, source, now)
         ]
 
     def ready(self, now: float) -> Iterator[tuple[str, DiscoveryMessage]]:
@@ -120,21 +120,21 @@ class ReturningParticipants:
 
         What it tells once it has its ports follows from these, and is no claim.
         """
-        if not self.keeper.take(prefix, source, datagram):
+        if not self.keeper.take(prefix, datagram):
             return False
         if self.is_waiting(prefix, source) and prefix not in self.former:
-            proven_count = self.keeper.proven_count(prefix, source)
+            proven_count = self.keeper.proven_count(prefix)
             self.ports.note_claims(prefix, self.keeper.former_ports(prefix), proven_count)
         return True
 
-    def was_inside(self, prefix: bytes, source: str) -> bool:
+    def was_inside(self, prefix: bytes) -> bool:
         """Whether a former process served a participant inside, as more than its word says.
 
         The kernel's table tells nothing of it: this has addresses, and no prefixes.
         """
         return (
             prefix in self.former
-            or self.keeper.proven_count(prefix, source) > 0
+            or self.keeper.proven_count(prefix) > 0
             or self.ports.is_named(prefix)
         )
 
@@ -155,12 +155,12 @@ class ReturningParticipants:
         self.keeper.forget(prefix)
         self.ports.forget_claims(prefix)
 
-    def reminders(self, participant: InsideParticipant) -> list[Outgoing]:
+    def reminders(self, participant: InsideParticipant, now: float) -> list[Outgoing]:
         """What makes a participant keep the ports that it has now."""
         if participant.metatraffic is None:
             return []
         datagrams = self.keeper.reminders(
-            participant.prefix, participant.ports, self._reply_target(participant.address)
+            participant.prefix, participant.ports, self._reply_target(participant.address), now
         )
         return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
 
@@ -175,12 +175,12 @@ class ReturningParticipants:
             or now - since >= ANSWER_TIME
         )
 
-    def _questions(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
+    def _questions(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         spdp = message.of_participant
         target = first_metatraffic(spdp, message.datagram, source) if spdp else None
         if target is None:
             return []
-        questions = self.keeper.questions(message.prefix, self._reply_target(source))
+        questions = self.keeper.questions(message.prefix, self._reply_target(source), now)
         return [Outgoing(target, datagram) for datagram in questions]
 
     def _reply_target(self, address: str) -> HostPort:

@@ -15,9 +15,11 @@ from rosproxy.ros2.protocol.rtps import NO_VENDOR, SENTINEL, VERSION, Submessage
 _SPDP_READER, _SPDP_WRITER = 0x000100C7, 0x000100C2
 _PARTICIPANT = bytes([0, 0, 1, 0xC1])
 SPDP_ENDPOINTS = 0x01 | 0x02
-READER_ENDPOINTS, WRITER_ENDPOINTS = SPDP_ENDPOINTS | 0x08 | 0x20, SPDP_ENDPOINTS | 0x04
+READER_ENDPOINTS = SPDP_ENDPOINTS | 0x08 | 0x20
+WRITER_ENDPOINTS = SPDP_ENDPOINTS | 0x04
+KEEPER_ENDPOINTS = WRITER_ENDPOINTS | 0x10
 """Built-in endpoints that a participant has (9.3.2.12): those of SPDP, and with them the readers of
-SEDP, or its writer of publications."""
+SEDP, its writer of publications, or its writers of publications and of subscriptions."""
 
 
 def announcement(

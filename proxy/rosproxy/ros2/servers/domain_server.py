@@ -199,7 +199,7 @@ class DomainServer:
         )
         self._ask(self._selected.selected or ())
         self._send(self.domain.own.announced_outside())
-        self._send(self.domain.own.port_reminders())
+        self._send(self.domain.own.port_reminders(self._now()))
         self._tell_relay()
 
     def close(self) -> None:

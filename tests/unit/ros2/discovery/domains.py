@@ -9,13 +9,14 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, LanRelay, Outgoing
+from rosproxy.ros2.discovery.port_keeper import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
-from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.protocol.rtps import HEADER, source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
-from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
 
 INSIDE, OTHER, NEAR = "172.30.0.5", "172.30.0.6", "172.30.0.2"
@@ -104,21 +105,31 @@ def reached_at(datagram: bytes) -> list[HostPort]:
     return [locator for _, locator in announcement.reached_at(datagram)]
 
 
-def kept_number(keeper: bytes, prefix: bytes, number: int) -> bytes:
-    """What a participant answers a keeper: the number that it expects next."""
-    body = struct.pack(">II", 0x000003C7, SEDP_WRITERS)
+def kept_number(
+    keeper: bytes, prefix: bytes, number: int, writer: int = BuiltinWriter.PUBLICATIONS
+) -> bytes:
+    """What a participant answers a writer: the number that it expects next."""
+    body = struct.pack(">II", writer + 5, writer)
     body += struct.pack("<iIIi", number >> 32, number & 0xFFFFFFFF, 0, 1)
     return message(submessage(0x0E, 0, keeper), submessage(0x06, 2, body), prefix=prefix)
 
 
+def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
+    """What a participant answers both writers of the keeper, or of the witness."""
+    pairs = zip(WRITERS, halves(number, bits), strict=True)
+    lower, upper = (kept_number(own, prefix, half, writer) for writer, half in pairs)
+    return lower + upper[HEADER:]
+
+
 def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:
     """What a participant answers the keeper of a domain."""
-    return kept_number(domain.own.keeper.prefix, prefix, number)
+    keeper = domain.own.keeper
+    return kept_halves(keeper.prefix, prefix, number, keeper.port_bits)
 
 
 def proof_answer(domain: Domain, prefix: bytes, proof: int) -> bytes:
     """What a participant answers the witness of a domain with a secret."""
-    return kept_number(domain.own.keeper.witness, prefix, proof)
+    return kept_halves(domain.own.keeper.witness, prefix, proof, HALF_BITS)
 
 
 def allowance_left(domain: Domain, source: str) -> float:

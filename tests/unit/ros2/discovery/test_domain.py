@@ -300,7 +300,7 @@ def test_a_participant_says_which_ports_it_had() -> None:
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     answer = kept_answer(domain, A, domain.own.keeper.number([45009, 45004]))
     domain.heard_inside(answer, OTHER, 0.2)
-    assert not domain.own.keeper.number_by_prefix  # from somewhere else it is nobody's word
+    assert not domain.own.keeper.prefixes  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)
     domain.settle(SETTLING)
     ports = {lease.target.port: port for port, (_, lease) in domain.inside.leases.items()}
@@ -331,19 +331,19 @@ def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
 
     keeper = domain.own.keeper
     numbers = reminded()
-    assert numbers == [keeper.number(domain.inside.by_prefix[A].ports)]
+    assert numbers == [*keeper.numbers(A, domain.inside.by_prefix[A].ports).values()]
     assert reminded() == []  # not by each announcement
 
 
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
     domain = make_domain()
     meet(domain)
-    told, reminder = domain.own.port_reminders()
+    told, reminder = domain.own.port_reminders(NOW)
     assert {told.target, reminder.target} == {HostPort(INSIDE, 7410)}
-    assert domain.own.port_reminders()
-    ports = [lease.port for lease in domain.inside.by_prefix[A].leases.values()]
-    domain.own.keeper.number_by_prefix[A] = domain.own.keeper.number(ports)
-    assert domain.own.port_reminders() == []
+    assert domain.own.port_reminders(NOW)
+    number = domain.own.keeper.number(domain.inside.by_prefix[A].ports)
+    domain.heard_inside(kept_answer(domain, A, number), INSIDE, NOW)
+    assert domain.own.port_reminders(NOW) == []
 
 
 @given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, EAR.host]))

@@ -211,7 +211,7 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule()
     def the_proxy_observes(self) -> None:
-        self.check(self.domain.own.port_reminders() + self.domain.own.announced_outside())
+        self.check(self.domain.own.port_reminders(self.now) + self.domain.own.announced_outside())
 
     @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
     def another_program_has_a_port(self, port: int, for_good: bool) -> None:
@@ -284,11 +284,8 @@ class Neighbours(RuleBasedStateMachine):
             assert side.notes.total == sum(len(participant.endpoints) for participant in everybody)
             assert side.notes.total == side.notes.count_by_address.total()
         assert {prefix for prefix, _ in domain.own.observer._received} <= prefixes
-        assert (
-            domain.own.keeper.number_by_prefix.keys() <= prefixes | domain.returning.waiting.keys()
-        )
         keepers = prefixes | domain.returning.waiting.keys()
-        assert domain.own.keeper.proof_by_prefix.keys() <= keepers
+        assert {*domain.own.keeper.prefixes} <= keepers
         assert domain.ports._ports_claimed.keys() <= keepers
         assert domain.fragments.by_prefix.keys() <= prefixes
         sizes = [store.size for store in domain.fragments.by_prefix.values()]
