@@ -15,7 +15,14 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
 from rosproxy.ros2.protocol.reliable import heartbeat
-from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX, SubmessageId
+from rosproxy.ros2.protocol.rtps import (
+    HEADER,
+    NO_VENDOR,
+    PREFIX,
+    RtpsError,
+    SubmessageId,
+    submessages,
+)
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE_DURATION = 12.0
@@ -28,6 +35,8 @@ MOST_ADDRESSES = 4096
 LONGEST_ANSWER = 256
 """Bytes of an answer that is known without reading it; one of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
+_NOT_IN_ANSWERS = (SubmessageId.INFO_SRC, SubmessageId.DATA, SubmessageId.DATA_FRAG)
+"""After an INFO_SRC another participant speaks."""
 
 
 @dataclass(slots=True)
@@ -61,12 +70,13 @@ class AddressProofs:
         """Whether a datagram is an answer of an address and nothing else, known without reading it.
 
         A flood of forged sources uses up what may be read of unproven addresses. Answers can't be
-        forged, so they are taken in nevertheless.
+        forged, so they are taken in nevertheless. An announcement beside an answer has to wait.
         """
         return (
             len(datagram) <= LONGEST_ANSWER
             and datagram[HEADER : HEADER + 1] == _INFO_DST
             and datagram[HEADER + 4 : HEADER + 4 + PREFIX] == self._prefix(address)
+            and _announces_nothing(datagram)
         )
 
     def note(self, address: str, datagram: bytes, now: float) -> bool:
@@ -89,3 +99,11 @@ class AddressProofs:
     def _prefix(self, address: str) -> bytes:
         size = PREFIX - len(NO_VENDOR)
         return NO_VENDOR + blake2b(address.encode(), key=self.secret, digest_size=size).digest()
+
+
+def _announces_nothing(datagram: bytes) -> bool:
+    """Whether a message is well-formed, has no sample, and is of one participant alone."""
+    try:
+        return not any(kind in _NOT_IN_ANSWERS for kind, _, _ in submessages(datagram))
+    except RtpsError:
+        return False

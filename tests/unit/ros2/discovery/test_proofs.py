@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.address_proofs import KEPT, AddressProofs
+from rosproxy.ros2.discovery.address_proofs import KEPT, LONGEST_ANSWER, AddressProofs
 from rosproxy.ros2.discovery.discovery_rates import BURST, Standing
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import (
@@ -22,7 +22,7 @@ from rosproxy.ros2.discovery.domain_settings import (
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
-from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.protocol.rtps import HEADER, PREFIX, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from tests.unit.ros2.discovery.domains import (
@@ -334,6 +334,33 @@ def test_an_answer_inside_is_not_held_up_either() -> None:
     for datagram in said:
         domain.heard_inside(datagram, INSIDE, NOW)
     assert domain.proofs.has(INSIDE)
+
+
+@pytest.mark.parametrize("speaks_another", [False, True])
+def test_an_announcement_beside_an_answer_is_charged(speaks_another: bool) -> None:
+    """Behind an answer an address announced whatever it liked, beyond its allowance.
+
+    Each announcement went to all ports of the peers at once, and no other source had its turn.
+    """
+    domain = make_domain()
+    prove(domain, INSIDE, ROBOT)
+    meet(domain)
+    for address, hear_it, must_read in (
+        (INSIDE, domain.heard_inside, domain.is_read_of_inside),
+        (ROBOT, domain.heard_outside, domain.is_read_at_discovery),
+    ):
+        asked = domain.proofs.question(address, B, [])
+        ends = submessage(0x0E, 0, bytes(PREFIX))
+        info_src = submessage(0x0C, 0, bytes(4) + b"\2\3\1\x0f" + NEIGHBOUR)
+        told = spdp(NEIGHBOUR if speaks_another else B, address)[HEADER:]
+        hidden = answer(asked, B) + (ends + info_src if speaks_another else b"") + told
+        assert len(hidden) <= LONGEST_ANSWER
+        assert must_read(hidden, address)
+        domain.rates.take(address, 0, NOW)
+        domain.rates.charge(address, int(BURST))
+        assert hear_it(hidden, address, NOW) == []
+        assert not {B, NEIGHBOUR} & domain.inside.by_prefix.keys()
+        assert not {B, NEIGHBOUR} & domain.outside.by_prefix.keys()
 
 
 def test_an_answer_counts_though_its_participant_has_lost_its_place() -> None:
