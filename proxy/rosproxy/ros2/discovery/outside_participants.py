@@ -157,14 +157,15 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     ) -> list[Outgoing]:
         """The announcements of participants outside for some inside, as far as these may know."""
         sent = list[Outgoing]()
-        for outsider in filter(self.may_introduce, outside):
+        introduced = list(filter(self.may_introduce, outside))
+        told = [(p, p.metatraffic) for p in inside if p.metatraffic and not p.is_apart]
+        # Where no participant is told, reading costs time, and the source pays nothing for it.
+        for outsider in introduced if told else ():
             message = read_discovery(outsider.announcement)
-            for insider in inside:
-                if insider.metatraffic and not insider.is_apart:
-                    sent += self.farewell_to(outsider, insider, now)
-                    sent.append(
-                        Outgoing(insider.metatraffic, self._imported(outsider, insider, message))
-                    )
+            for insider, metatraffic in told:
+                sent += self.farewell_to(outsider, insider, now)
+                imported = self._imported(outsider, insider, message)
+                sent.append(Outgoing(metatraffic, imported))
         return sent
 
     def prove(self, address: str) -> tuple[list[OutsideParticipant], list[OutsideParticipant]]:

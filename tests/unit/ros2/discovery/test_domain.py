@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery import outside_participants
 from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import BURST, STEP, cost
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
@@ -21,7 +22,7 @@ from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import source_prefix, source_vendor
 from rosproxy.ros2.registry.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import LeaseKind, ShortageKind
-from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from tests.unit.ros2.discovery.domains import (
     EAR,
     HOST,
@@ -46,7 +47,7 @@ from tests.unit.ros2.discovery.domains import (
     spdp,
     to,
 )
-from tests.unit.ros2.protocol.messages import message, parameter, submessage
+from tests.unit.ros2.protocol.messages import data, message, parameter, payload, submessage
 
 
 def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
@@ -381,6 +382,26 @@ def test_an_announcement_is_charged_with_what_it_leads_to() -> None:
     led_to = sum(cost(len(out.datagram)) for out in sent)
     assert led_to > 40
     assert allowance_left(domain, INSIDE) == before - cost(len(announcement)) - led_to
+
+
+def test_nothing_is_read_for_a_participant_that_is_told_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """72 bytes without a locator had the proxy read what 100 outside had announced: 1.5 ms.
+
+    The source was charged for its own datagram alone.
+    """
+    domain = make_domain()
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+
+    def read(_: bytes) -> DiscoveryMessage:
+        raise AssertionError("an announcement was read")
+
+    monkeypatch.setattr(outside_participants, "read_discovery", read)
+    guid = A + bytes([0, 0, 1, 0xC1])
+    without_locator = message(data(payload([(Pid.PARTICIPANT_GUID, guid)])), prefix=A)
+    domain.heard_inside(without_locator, INSIDE, NOW)
+    assert A in domain.inside.by_prefix
 
 
 def test_a_long_announcement_is_charged_for_each_copy() -> None:
