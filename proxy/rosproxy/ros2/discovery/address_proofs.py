@@ -5,9 +5,12 @@ address hears: the announcement of a participant whose GUID prefix follows from 
 a secret of this process. An answer names that prefix (INFO_DST), so its sender has the question.
 The participant in the question has a writer of SEDP, whose heartbeat each reader answers
 (DDSI-RTPS 2.5, 8.4.9). It is forgotten after `LEASE_DURATION`.
+
+An address that has proved to receive may be forged as any other. So each participant inside answers
+for itself: a question names the participant (INFO_DST), and no other one answers.
 """
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
 
@@ -21,8 +24,10 @@ from rosproxy.ros2.protocol.rtps import (
     PREFIX,
     RtpsError,
     SubmessageId,
+    source_prefix,
     submessages,
 )
+from rosproxy.ros2.registry.participants import Participant
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE_DURATION = 12.0
@@ -31,7 +36,11 @@ each 8 s and is asked again then."""
 KEPT = 60.0
 """Seconds for which an address has proved to receive, after its last participant has gone."""
 MOST_ADDRESSES = 4096
-"""Addresses that count as proven; of more, the one goes that has proved it first."""
+"""Addresses that count as proven; of more, the one goes that has had no participant for longest."""
+ANSWER_KEPT = 30.0
+"""Seconds for which an answer counts of a participant that has lost its place, or has gone."""
+MOST_ANSWERED = 128
+"""Participants at an address that have answered; of more, the first one goes."""
 LONGEST_ANSWER = 256
 """Bytes of an answer that is known without reading it; one of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
@@ -45,11 +54,17 @@ class AddressProofs:
 
     secret: bytes
     _until: dict[str, float] = field(default_factory=dict)
+    _answered: dict[str, dict[bytes, float]] = field(default_factory=dict)
+    """Until when the answer of each participant counts, by address and GUID prefix."""
     _count: int = 0
 
     def has(self, address: str) -> bool:
         """Whether an address has proved to receive."""
         return address in self._until
+
+    def has_answered(self, address: str, prefix: bytes) -> bool:
+        """Whether a participant at an address has answered a question itself."""
+        return prefix in self._answered.get(address, ())
 
     @property
     def addresses(self) -> list[str]:
@@ -83,18 +98,46 @@ class AddressProofs:
         """Take in a datagram; return whether the address proves by it to receive. RtpsError."""
         if not is_destination(datagram, self._prefix(address)):
             return False
-        if address not in self._until and len(self._until) >= MOST_ADDRESSES:
-            del self._until[next(iter(self._until))]
-        self._until[address] = now + KEPT
+        self._renew(address, now)
+        if len(self._until) > MOST_ADDRESSES:
+            first = next(iter(self._until))
+            del self._until[first]
+            self._answered.pop(first, None)
+        answered = self._answered.setdefault(address, {})
+        answered[source_prefix(datagram)] = now + ANSWER_KEPT
+        if len(answered) > MOST_ANSWERED:
+            del answered[next(iter(answered))]
         return True
 
-    def expire(self, now: float, *present: Container[str]) -> None:
-        """Forget the addresses that have no participant any more."""
+    def expire(
+        self, now: float, inside: Mapping[bytes, Participant], *present: Container[str]
+    ) -> None:
+        """Forget addresses without a participant, and answers of participants that have gone.
+
+        ``inside`` are the participants inside, ``present`` the addresses with participants.
+        """
         for address, until in list(self._until.items()):
             if any(address in addresses for addresses in present):
-                self._until[address] = now + KEPT
+                self._renew(address, now)
             elif until < now:
                 del self._until[address]
+        self._expire_answers(now, inside)
+
+    def _expire_answers(self, now: float, inside: Mapping[bytes, Participant]) -> None:
+        for address, answered in list(self._answered.items()):
+            for prefix, until in list(answered.items()):
+                participant = inside.get(prefix)
+                if participant is not None and participant.address == address:
+                    answered[prefix] = now + ANSWER_KEPT
+                elif until < now:
+                    del answered[prefix]
+            if not answered:
+                del self._answered[address]
+
+    def _renew(self, address: str, now: float) -> None:
+        """Have an address count as proven for longer; it is the last one that goes."""
+        self._until.pop(address, None)
+        self._until[address] = now + KEPT
 
     def _prefix(self, address: str) -> bytes:
         size = PREFIX - len(NO_VENDOR)

@@ -29,7 +29,6 @@ Every datagram may be forged. So
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import Standing, cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
@@ -296,7 +295,9 @@ class Domain(DomainParticipants):
         if spdp.ended:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
-        if is_new and (self.ports.may_have_returning(now) or self.inside.lacks_proof(source)):
+        if is_new and (
+            self.ports.may_have_returning(now) or self.inside.lacks_proof(prefix, source)
+        ):
             return self._wait(message, source, now)
         return self._admitted_inside(message, source, now)
 
@@ -314,18 +315,12 @@ class Domain(DomainParticipants):
 
     def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Have a participant inside wait until it has answered the proxy."""
-        sent = self.returning.wait(message, source, now)
-        if not sent:
+        if message.prefix in self.returning.waiting:
             return []
-        if self.owners.yields_to_inside(message.prefix):
+        sent = self.returning.wait(message, source, now)
+        if sent and self.owners.yields_to_inside(message.prefix):
             sent += self._give_prefix_to_inside(message.prefix, source)
-        return sent + self._question_to_inside(message, source)
-
-    def _question_to_inside(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
-        """What asks a participant inside that announces itself to prove that it receives."""
-        spdp = message.of_participant
-        metatraffic = first_metatraffic(spdp, message.datagram, source) if spdp else None
-        return self.own.question_to_inside(source, message.prefix, metatraffic)
+        return sent + self.own.question_to_announced(message, source)
 
     def _heard_outside(
         self,
@@ -409,14 +404,16 @@ class Domain(DomainParticipants):
         """Note what a participant inside announces of itself, and tell outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
-        if is_new and self.inside.lacks_proof(source):
+        if is_new and self.inside.lacks_proof(prefix, source):
             # It is announced with all of its ports or not at all: outside takes up no new locators
             # of a participant that it knows. It announces itself again.
-            return self._question_to_inside(message, source)
-        gives_place = self.inside.gives_place(source) if is_new else None
+            return self.own.question_to_announced(message, source)
+        gives_place = self.inside.gives_place(prefix, source) if is_new else None
         sent = self._end_for(gives_place) if gives_place else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
+            if prefix not in self.inside.by_prefix:  # it may get a place once it has answered
+                sent += self.own.question_to_announced(message, source)
             return sent
         if is_new:
             insider.was_inside = self.returning.was_inside(prefix)

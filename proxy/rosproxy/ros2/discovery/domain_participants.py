@@ -125,7 +125,8 @@ class DomainParticipants:
         outsiders = [p for p in self.outside.by_prefix.values() if p.until < now]
         for outsider in outsiders[:ENDED_AT_ONCE]:
             self._forget_outside(outsider)
-        self.proofs.expire(now, self.inside.count_by_address, self.outside.count_by_address)
+        counts = self.inside.count_by_address, self.outside.count_by_address
+        self.proofs.expire(now, self.inside.by_prefix, *counts)
         return sent
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:

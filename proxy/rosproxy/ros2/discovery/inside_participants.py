@@ -74,7 +74,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         if participant is None:
             if prefix in self.by_prefix:
                 return None
-            if reason := self._why_no_place(source):
+            if reason := self._why_no_place(prefix, source):
                 self.refused("participants", source, reason)
                 return None
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
@@ -87,38 +87,44 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         participant.traits = traits(spdp, datagram, source)
         return participant
 
-    def lacks_proof(self, address: str) -> bool:
-        """Whether an address gets no port before it has proved to receive: ports are scarce."""
+    def lacks_proof(self, prefix: bytes, address: str) -> bool:
+        """Whether a participant gets no port before it has answered: ports are scarce."""
         kept = len(self.settings.ports.listen) // PART_FOR_PROVEN
-        return self.ports.pool.free <= kept and not self.proofs.has(address)
+        return self.ports.pool.free <= kept and not self.proofs.has_answered(address, prefix)
 
-    def gives_place(self, source: str) -> InsideParticipant | None:
+    def gives_place(self, prefix: bytes, source: str) -> InsideParticipant | None:
         """The participant that ends for a new one at an address; None if there is none.
 
         Either there is room without, or the new one gets no place.
         """
+        has_answered = self.proofs.has_answered(source, prefix)
         if self.count_by_address[source] >= MOST_PER_ADDRESS:
-            return None
-        if self.proofs.has(source):
-            return fairer_place(self._at_proven(True), MOST_INSIDE, source)
-        return oldest_unproven(self._at_proven(False), MOST_INSIDE_UNPROVEN)
+            unproven = (p for p in self._answering(False) if p.address == source)
+            return next(unproven, None) if has_answered else None
+        if has_answered:
+            return fairer_place(self._answering(True), MOST_INSIDE, source)
+        return oldest_unproven(self._answering(False), MOST_INSIDE_UNPROVEN)
 
     def prove(self) -> list[InsideParticipant]:
-        """The participants that end, as more than have room are at proven addresses now."""
-        return surplus(self._at_proven(True), MOST_INSIDE)
+        """The participants that end, as more than have room have answered now."""
+        return surplus(self._answering(True), MOST_INSIDE)
 
-    def _why_no_place(self, source: str) -> str:
+    def _why_no_place(self, prefix: bytes, source: str) -> str:
         """Why a new participant at an address gets no place; empty if it gets one."""
         if self.count_by_address[source] >= MOST_PER_ADDRESS:
             return f"the address has {MOST_PER_ADDRESS} participants already"
-        is_proven = self.proofs.has(source)
-        most = MOST_INSIDE if is_proven else MOST_INSIDE_UNPROVEN
-        is_full = len(self._at_proven(is_proven)) >= most
+        has_answered = self.proofs.has_answered(source, prefix)
+        most = MOST_INSIDE if has_answered else MOST_INSIDE_UNPROVEN
+        is_full = len(self._answering(has_answered)) >= most
         return f"there are {most} participants inside already" if is_full else ""
 
-    def _at_proven(self, is_proven: bool) -> list[InsideParticipant]:
-        """The participants at addresses that have proved to receive, or those at the others."""
-        return [p for p in self.by_prefix.values() if self.proofs.has(p.address) is is_proven]
+    def _answering(self, has_answered: bool) -> list[InsideParticipant]:
+        """The participants that have proved to receive, or all others, in the order they came."""
+        return [
+            p
+            for p in self.by_prefix.values()
+            if self.proofs.has_answered(p.address, p.prefix) is has_answered
+        ]
 
     def exported(
         self,
@@ -270,9 +276,9 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             text += "address may have"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
-        if self.lacks_proof(participant.address):
-            text = f"{locator} got no port: the last ports of {ports} are for addresses that have "
-            text += f"proved to receive, and {participant.address} does not answer the proxy"
+        if self.lacks_proof(participant.prefix, participant.address):
+            text = f"{locator} got no port: the last ports of {ports} are for participants that "
+            text += "have proved to receive, and this one does not answer the proxy"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)

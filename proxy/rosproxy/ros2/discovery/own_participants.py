@@ -57,12 +57,18 @@ class OwnParticipants:
     def question_to_inside(
         self, address: str, prefix: bytes, metatraffic: HostPort | None
     ) -> list[Outgoing]:
-        """What asks a participant inside to prove that its address receives, if that is to be."""
-        if self.proofs.has(address):
+        """What asks a participant inside to prove that it receives, if that is to be."""
+        if self.proofs.has_answered(address, prefix):
             return []
         near = self.settings.proxy_address_for(address)
         reached_at = [HostPort(near, self.settings.unicast_port)]
         return sent_to(metatraffic, [self.proofs.question(address, prefix, reached_at)])
+
+    def question_to_announced(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
+        """What asks a participant inside that announces itself to prove that it receives."""
+        spdp = message.of_participant
+        metatraffic = first_metatraffic(spdp, message.datagram, source) if spdp else None
+        return self.question_to_inside(source, message.prefix, metatraffic)
 
     def _reached_from_outside(self) -> list[HostPort]:
         port = self.settings.ports.advertised(self.settings.discovery_port)

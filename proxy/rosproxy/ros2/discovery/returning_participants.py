@@ -53,23 +53,32 @@ class ReturningParticipants:
 
     def wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Keep an announcement until ports are given; meanwhile ask which ports it had."""
-        if message.prefix in self.waiting:
-            return []
-        if self._counts[source] >= MOST_PER_ADDRESS or not self._has_room():
+        if not self._has_room(message.prefix, source):
             return []  # it announces itself again, when there may be room
         self.waiting[message.prefix] = source, message, now
         self._counts[source] += 1
         return self._questions(message, source, now)
 
-    def _has_room(self) -> bool:
-        """Whether one more may wait; the first that has not proved to receive leaves for it."""
-        if len(self.waiting) < MOST_WAITING:
+    def _has_room(self, prefix: bytes, source: str) -> bool:
+        """Whether one more may wait at an address; the first that has not answered leaves for it.
+
+        Where the address is full, a participant leaves that waits there, and for one alone that has
+        answered.
+        """
+        is_full = self._counts[source] >= MOST_PER_ADDRESS
+        if not is_full and len(self.waiting) < MOST_WAITING:
             return True
-        unproven = (p for p, (source, *_) in self.waiting.items() if not self.proofs.has(source))
-        prefix = next(unproven, None)
-        if prefix is not None:
-            self._forget_waiting(prefix)
-        return prefix is not None
+        if is_full and not self.proofs.has_answered(source, prefix):
+            return False
+        unproven = (
+            waiting
+            for waiting, (address, *_) in self.waiting.items()
+            if (address == source or not is_full) and not self.proofs.has_answered(address, waiting)
+        )
+        leaver = next(unproven, None)
+        if leaver is not None:
+            self._forget_waiting(leaver)
+        return leaver is not None
 
     def repeated_questions(self, now: float) -> list[Outgoing]:
         """Questions again to those that have not answered."""

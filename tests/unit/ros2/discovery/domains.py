@@ -1,8 +1,9 @@
 """A domain as tests need one, and datagrams of participants for it."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from ipaddress import ip_address, ip_network
+from itertools import product
 
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
@@ -137,11 +138,11 @@ def allowance_left(domain: Domain, source: str) -> float:
     return allowance.remaining if allowance else BURST
 
 
-def prove(domain: Domain, *addresses: str) -> None:
+def prove(domain: Domain, *addresses: str, prefixes: Iterable[bytes] = (A,)) -> None:
     """Have participants at addresses answer the questions that are for these addresses alone."""
-    for address in addresses:
-        asked = domain.proofs.question(address, A, [HostPort(NEAR, 7410)])
-        answer = message(submessage(0x0E, 0, source_prefix(asked)), prefix=A)
+    for address, prefix in product(addresses, prefixes):
+        asked = domain.proofs.question(address, prefix, [HostPort(NEAR, 7410)])
+        answer = message(submessage(0x0E, 0, source_prefix(asked)), prefix=prefix)
         assert domain.proofs.note(address, answer, NOW)
 
 

@@ -249,19 +249,20 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
 
 def test_an_address_has_so_many_participants_and_no_more() -> None:
     domain = make_domain()
-    prove(domain, INSIDE)
-    for number in range(MOST_PER_ADDRESS + 10):
-        domain.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, NOW)
+    prefixes = [number.to_bytes(12, "big") for number in range(MOST_PER_ADDRESS + 10)]
+    prove(domain, INSIDE, prefixes=prefixes)
+    for prefix in prefixes:
+        domain.heard_inside(spdp(prefix, INSIDE), INSIDE, NOW)
     assert len(domain.inside.by_prefix) == MOST_PER_ADDRESS
 
 
 def test_a_range_that_is_too_short_is_told() -> None:
     domain = make_domain()
-    prove(domain, *(f"172.30.0.{number}" for number in range(1, 10)))
     for number in range(1, 10):
-        domain.heard_inside(
-            spdp(number.to_bytes(12, "big"), f"172.30.0.{number}"), f"172.30.0.{number}", NOW
-        )
+        prefix = number.to_bytes(12, "big")
+        address = f"172.30.0.{number}"
+        prove(domain, address, prefixes=[prefix])
+        domain.heard_inside(spdp(prefix, address), address, NOW)
     assert len(domain.inside.leases) == 15  # of sixteen, one is for discovery
     shortages = domain.inside.port_shortages.values()
     assert all("is free for" in shortage.text for shortage in shortages)

@@ -204,7 +204,7 @@ def test_one_address_leaves_ports_for_others() -> None:
     """Sixty participants at one address, as many as there may be, took all ports of the range."""
     domain = make_domain()
     prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(30)]
-    prove(domain, INSIDE, OTHER)
+    prove(domain, INSIDE, OTHER, prefixes=[*prefixes, B])
     for number, prefix in enumerate(prefixes):
         domain.heard_inside(spdp(prefix, INSIDE, 7410 + 10 * number), INSIDE, NOW)
     assert domain.ports.pool.free == 1  # of 16 the first is the proxy's own, and two are for others

@@ -4,8 +4,16 @@ from collections import Counter
 
 import pytest
 
+from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.address_proofs import KEPT, LONGEST_ANSWER, AddressProofs
+from rosproxy.ros2.discovery.address_proofs import (
+    ANSWER_KEPT,
+    KEPT,
+    LONGEST_ANSWER,
+    MOST_ADDRESSES,
+    MOST_ANSWERED,
+    AddressProofs,
+)
 from rosproxy.ros2.discovery.discovery_rates import BURST, Standing
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import (
@@ -19,6 +27,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     MOST_WAITING,
     Outgoing,
 )
+from rosproxy.ros2.discovery.inside_participants import PART_FOR_PROVEN
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
@@ -31,6 +40,7 @@ from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,
     OTHER,
+    RANGE,
     ROBOT,
     STRANGER,
     A,
@@ -50,6 +60,7 @@ from tests.unit.ros2.protocol.messages import message, submessage
 LAPTOP = "10.0.0.77"
 NEIGHBOUR = b"\x01\x0f" + bytes([8] * 10)
 LEASE = 300.0
+LONG_RANGE = PortMap(PortRange(45000, 45999), PortRange(46000, 46999))
 PADDING = 200
 """Bytes by which an announcement is as long as a real one, so that it may be answered."""
 
@@ -390,5 +401,93 @@ def test_an_address_inside_that_is_full_pushes_out_no_other() -> None:
         address = OTHER if number >= MOST_PER_ADDRESS else INSIDE
         domain.inside.meet(read_discovery(spdp(named(number), address)), address, NOW)
     assert domain.inside.count_by_address == {INSIDE: MOST_PER_ADDRESS, OTHER: MOST_PER_ADDRESS}
-    assert domain.inside.gives_place(OTHER) is None
-    assert domain.inside.gives_place("172.30.0.9") is domain.inside.by_prefix[named(0)]
+    assert domain.inside.gives_place(A, OTHER) is None
+    assert domain.inside.gives_place(A, "172.30.0.9") is domain.inside.by_prefix[named(0)]
+
+
+def crowd_at(domain: Domain, address: str, now: float) -> None:
+    """Announce as many participants at an address as may be there; none answers."""
+    for number in range(MOST_PER_ADDRESS):
+        announcement = spdp(named(number), address, 9000 + 2 * number, lease=LEASE)
+        domain.heard_inside(announcement, address, now)
+
+
+def answers_what_it_is_asked(domain: Domain, now: float) -> None:
+    """Have A announce itself, and answer the question that it gets."""
+    sent = domain.heard_inside(spdp(A, INSIDE), INSIDE, now)
+    for asked in questions(sent, INSIDE):
+        if destination(asked) == A and domain.proofs.is_answer(INSIDE, answer(asked, A)):
+            domain.heard_inside(answer(asked, A), INSIDE, now)
+
+
+def test_forged_participants_at_an_address_keep_no_new_one_from_a_place() -> None:
+    """64 announcements in five minutes, by a forged source, kept a container's new nodes out."""
+    domain = make_domain(ports=LONG_RANGE)
+    prove(domain, INSIDE, prefixes=[B])
+    crowd_at(domain, INSIDE, NOW)
+    answers_what_it_is_asked(domain, NOW)
+    assert to(meet(domain), ROBOT)
+    assert A in domain.inside.by_prefix
+    crowd_at(domain, INSIDE, NOW)
+    assert A in domain.inside.by_prefix
+    assert domain.inside.count_by_address[INSIDE] == MOST_PER_ADDRESS
+
+
+def test_forged_participants_at_an_address_keep_none_from_waiting_after_a_start() -> None:
+    """They did so with each restart, for as long as their source was forged."""
+    domain = make_domain(ports=LONG_RANGE)
+    crowd_at(domain, INSIDE, 0.1)
+    answers_what_it_is_asked(domain, 0.2)
+    answers_what_it_is_asked(domain, 0.3)
+    assert A in domain.returning.waiting
+    crowd_at(domain, INSIDE, 0.4)
+    assert A in domain.returning.waiting
+    domain.settle(ANSWER_TIME + 0.5)
+    assert A in domain.inside.by_prefix
+
+
+def test_forged_participants_at_proven_addresses_take_three_quarters_of_the_range() -> None:
+    """The last quarter was for proven addresses, and their addresses may be forged."""
+    domain = make_domain()
+    prove(domain, INSIDE, OTHER, prefixes=[B])
+    for address in (INSIDE, OTHER):
+        crowd_at(domain, address, NOW)
+    assert domain.ports.pool.free == len(RANGE.listen) // PART_FOR_PROVEN
+    answers_what_it_is_asked(domain, NOW)
+    domain.settle(NOW + ANSWER_TIME)
+    assert len(domain.inside.by_prefix[A].leases) == 2
+
+
+def test_a_participant_that_never_answers_pushes_out_none_at_its_address() -> None:
+    """With DDS Security none answers: 70 processes of a container took turns else."""
+    domain = make_domain(ports=LONG_RANGE)
+    crowd_at(domain, INSIDE, NOW)
+    before = [*domain.inside.by_prefix]
+    meet(domain)
+    assert [*domain.inside.by_prefix] == before
+
+
+def test_an_address_with_participants_stays_proven_while_many_others_prove() -> None:
+    """An attacker with 4,096 addresses had all others count as unproven."""
+    domain = make_domain()
+    prove(domain, INSIDE)
+    meet(domain)
+    for number in range(2 * MOST_ADDRESSES):
+        prove(domain, f"fd00::{number:x}")
+        if number % 100 == 0:
+            domain.expire(NOW)
+    assert domain.proofs.has(INSIDE)
+    assert domain.proofs.has_answered(INSIDE, A)
+    assert len(domain.proofs.addresses) == MOST_ADDRESSES
+
+
+def test_answers_in_the_name_of_many_are_forgotten() -> None:
+    domain = make_domain()
+    prove(domain, INSIDE)
+    domain.heard_inside(spdp(A, INSIDE, lease=LEASE), INSIDE, NOW)
+    prove(domain, OTHER, prefixes=map(named, range(2 * MOST_ANSWERED)))
+    assert not domain.proofs.has_answered(OTHER, named(0))
+    assert domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERED - 1))
+    domain.expire(NOW + ANSWER_KEPT + 1)
+    assert not domain.proofs.has_answered(OTHER, named(2 * MOST_ANSWERED - 1))
+    assert domain.proofs.has_answered(INSIDE, A)
