@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import signal
+import socket
 from pathlib import Path
 
 import pytest
 
+from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.rtps import FAST_DDS
 from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab, is_whole
 
@@ -100,3 +103,20 @@ def test_a_node_that_ends_is_gone_on_the_other_side(lab: Lab) -> None:
     inside.stop()
     outside.wait_for("^nodes outside end$", since=outside.mark())
     wait_until("its ports are free", lambda: lab.domain().ports_used == 0, 20)
+
+
+@ways
+def test_a_forged_end_is_no_end_for_good(lab: Lab, source: str, sink: str) -> None:
+    """A container with the right for raw packets sends it from the address of another one.
+
+    The number of the end is greater than those of the announcements that follow.
+    """
+    lab.node("jazzy", source, "pub", topic="/chatter", depth=1000)
+    reader = lab.node("jazzy", sink, "sub", topic="/chatter", depth=1000)
+    reader.wait_for_count("^got hello ", 5)
+    (participant,) = lab.domain().inside
+    prefix = bytes.fromhex(participant.guid_prefix.replace(".", ""))
+    with lab.place("c1").entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.sendto(farewell(prefix, FAST_DDS, 1000), (lab.place("px").address, 7410))
+    wait_until("it has ended", lambda: not lab.domain().inside)
+    reader.wait_for_count("^got hello ", 20, since=reader.mark())
