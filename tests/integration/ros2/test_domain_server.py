@@ -4,7 +4,7 @@ import asyncio
 import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import chain, repeat
+from itertools import chain, pairwise, repeat
 
 import pytest
 
@@ -14,23 +14,24 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import DomainSettings
+from rosproxy.ros2.discovery.fair_queue import DiscoveryQueue
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.rtps import source_prefix
-from rosproxy.ros2.registry.locator_ports import REMEMBERED, stand_in_port
-from rosproxy.ros2.servers.domain_server import DomainServer
+from rosproxy.ros2.registry.locator_ports import REMEMBERED, SETTLING, stand_in_port
+from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT, DomainServer
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
-from tests.unit.ros2.discovery.domains import A, B, reached_at, spdp
+from tests.unit.ros2.discovery.domains import A, B, farewell, reached_at, spdp
 
 PROXY, INSIDE, OUTSIDE = "127.0.7.1", "127.0.7.2", "127.0.7.9"
 DOMAIN = own_domain()
 
 
-@pytest.fixture
-async def server() -> AsyncIterator[DomainServer]:
-    """One that has long been running."""
-    first = free_ports(16)
-    ports = PortRange(first, first + 15)
-    settings = DomainSettings(
+def settings_of(count: int = 16) -> DomainSettings:
+    """Settings of a domain with so many ports."""
+    first = free_ports(count)
+    ports = PortRange(first, first + count - 1)
+    return DomainSettings(
         number=DOMAIN,
         hosts=(PROXY,),
         ports=PortMap(ports, ports),
@@ -40,9 +41,14 @@ async def server() -> AsyncIterator[DomainServer]:
         is_inside=lambda address: address == INSIDE,
         peers=(HostPort(OUTSIDE, 0),),
     )
+
+
+@pytest.fixture
+async def server() -> AsyncIterator[DomainServer]:
+    """One that has long been running."""
     times = chain([0.0], repeat(REMEMBERED + 1))
     started = DomainServer(
-        settings, PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
+        settings_of(), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
     )
     started.start()
     yield started
@@ -129,3 +135,51 @@ async def test_who_is_not_selected_has_an_allowance_of_discovery(
         insider.sendto(spdp(B, INSIDE, port), well_known)
         await until(lambda: held, "one is held")
     assert held[INSIDE].keys() == {B}
+
+
+async def test_participants_that_have_waited_are_let_in_one_after_the_other() -> None:
+    """They were let in at once: 64 with claims for ports held up the loop for 0.6 s."""
+    times = chain([0.0], repeat(SETTLING + ANSWER_TIME))
+    server = DomainServer(
+        settings_of(64), PROXY, times.__next__, lambda address: address == INSIDE, lambda: None
+    )
+    server.start()
+    prefixes = [bytes([1, 15, number]) + bytes(9) for number in range(20)]
+    for number, prefix in enumerate(prefixes):
+        announcement = spdp(prefix, INSIDE, 9000 + 2 * number)
+        server.domain.heard_inside(announcement, INSIDE, 0.1)
+    table = server.domain.inside.by_prefix
+    await server.expire()
+    assert not table
+    server.domain.heard_inside(farewell(prefixes[-1]), INSIDE, SETTLING)
+    counts = list[int]()
+    while len(table) < len(prefixes) - 1:
+        await asyncio.sleep(0)
+        counts.append(len(table))
+    assert max(after - before for before, after in pairwise([0, *counts])) == 1
+    await server.expire()
+    await asyncio.sleep(0)
+    assert prefixes[-1] not in table  # it had ended before its turn
+    server.close()
+
+
+async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
+    """The longest queue loses its last items while others flood."""
+    now = 0.0
+    server = DomainServer(
+        settings_of(), PROXY, lambda: now, lambda address: address == INSIDE, lambda: None
+    )
+    server.start()
+    server.domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
+    now = SETTLING + ANSWER_TIME
+    await server.expire()
+    server._reader._queue = DiscoveryQueue()
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert not server.domain.inside.by_prefix
+    now += ADMISSION_TIMEOUT
+    await server.expire()
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert A in server.domain.inside.by_prefix
+    server.close()

@@ -65,8 +65,6 @@ from rosproxy.ros2.rewriting.discovery import (
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
 
-SENT_AT_ONCE = 64  # of those that have waited no more are let in at a time
-
 _StandInUsers = Sequence[tuple[OutsideParticipant, Lease]]
 """Participants outside that a stand-in leads to, each by its lease."""
 _Passing = tuple[list[bytes], list[Outgoing]]
@@ -219,10 +217,8 @@ class Domain(DomainParticipants):
         return sent
 
     def settle(self, now: float) -> list[Outgoing]:
-        """Admit those that waited until it was known who had which port; and have others meet."""
+        """Ask participants that wait again, and have others meet."""
         sent = self.returning.repeated_questions(now)
-        self._admissions = self.returning.ready(now)
-        sent += self._admitted_next(now)
         for insider in list(self.inside.by_prefix.values()):
             proceed = partial(self.rediscovery.proceed, insider, now)
             sent += self._unless_malformed(insider.address, proceed)
@@ -230,7 +226,15 @@ class Domain(DomainParticipants):
 
     def go_on(self, now: float) -> list[Outgoing]:
         """Do the next part, of some milliseconds, of what takes long; see `is_busy`."""
-        return self._admitted_next(now) + self.rediscovery.next_datagrams(now)
+        return self.rediscovery.next_datagrams(now)
+
+    def admit(self, prefix: bytes, now: float) -> list[Outgoing]:
+        """Let in a participant that has waited until it was known which ports it had."""
+        waited = self.returning.end_wait(prefix)
+        if waited is None:
+            return []  # it has ended meanwhile
+        source, message = waited
+        return self._unless_malformed(source, partial(self._admitted_inside, message, source, now))
 
     def apply_policy(self, now: float) -> list[Outgoing]:
         """Have participants meet anew of which the policy says something else than before."""
@@ -264,18 +268,6 @@ class Domain(DomainParticipants):
             sent += self._unless_malformed(insider.address, part)
             self._forget_inside(insider)
         return sent + self.rediscovery.next_datagrams(now)
-
-    def _admitted_next(self, now: float) -> list[Outgoing]:
-        """What follows as the next participants are let in that have waited."""
-        sent = list[Outgoing]()
-        self._is_admitting = False
-        for source, message in self._admissions:
-            admit = partial(self._admitted_inside, message, source, now)
-            sent += self._unless_malformed(source, admit)
-            if len(sent) >= SENT_AT_ONCE:
-                self._is_admitting = True
-                break
-        return sent
 
     def _unless_malformed(self, source: str, step: Callable[[], list[Outgoing]]) -> list[Outgoing]:
         """What a step gives to send, or nothing: one participant must not keep it from others."""

@@ -5,7 +5,7 @@ decided in `rosproxy.ros2.discovery.domain`.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -31,7 +31,6 @@ from rosproxy.ros2.registry.participants import (
     OutsideParticipant,
     Participant,
 )
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 
 ENDED_AT_ONCE = 64
 """Participants of a side that are forgotten at a time. The proxy looks twice a second."""
@@ -57,9 +56,6 @@ class DomainParticipants:
     owners: PrefixOwners
     rates: DiscoveryRates = field(default_factory=DiscoveryRates)
     passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
-    _admissions: Iterator[tuple[str, DiscoveryMessage]] = field(default_factory=lambda: iter(()))
-    """Participants that waited, and are let in now."""
-    _is_admitting: bool = False
 
     @classmethod
     def starting(
@@ -106,7 +102,7 @@ class DomainParticipants:
     @property
     def is_busy(self) -> bool:
         """Whether `Domain.go_on` has more to do: hundreds may have to meet hundreds."""
-        return self._is_admitting or self.rediscovery.is_busy
+        return self.rediscovery.is_busy
 
     def is_kept(self, participant: InsideParticipant) -> bool:
         """Whether a participant inside keeps all the ports that it has, for the next process."""

@@ -6,7 +6,7 @@ sending to the ports that it knows (`LocatorPorts`).
 """
 
 from collections import Counter
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
@@ -89,15 +89,19 @@ class ReturningParticipants:
             for question in self._questions(message, source, now)
         ]
 
-    def ready(self, now: float) -> Iterator[tuple[str, DiscoveryMessage]]:
-        """The announcements of those that may get ports now; they wait no longer."""
+    def ready(self, now: float) -> list[bytes]:
+        """The participants that may get ports now; each waits until it is let in."""
         if not self.ports.may_give_ports(now):
-            return
-        for prefix, (source, message, since) in list(self.waiting.items()):
-            if self._has_answered(prefix, since, now):
-                del self.waiting[prefix]
-                self._counts -= Counter((source,))
-                yield source, message
+            return []
+        return [p for p, (*_, since) in self.waiting.items() if self._has_answered(p, since, now)]
+
+    def end_wait(self, prefix: bytes) -> tuple[str, DiscoveryMessage] | None:
+        """The address and announcement of a participant, which waits no longer; None if it has."""
+        if prefix not in self.waiting:
+            return None
+        source, message, _ = self.waiting.pop(prefix)
+        self._counts -= Counter((source,))
+        return source, message
 
     def forget(self, addresses: Collection[str]) -> None:
         """Forget those that wait at addresses where nobody is any more."""

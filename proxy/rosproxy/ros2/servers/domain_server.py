@@ -43,6 +43,8 @@ from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_t
 log = logging.getLogger(__name__)
 
 EXPIRY_INTERVAL = 0.5
+ADMISSION_TIMEOUT = 5.0
+"""Seconds after which a participant is queued again that has waited and was not let in."""
 PER_TURN = 16
 """Datagrams that one socket passes on before the others have their turn."""
 QUEUED_FOR_PASSED = 8
@@ -88,6 +90,8 @@ class DomainServer:
         self._secret, self._heard = b"", asyncio.Event()
         self._reader = DiscoveryReader()
         self._next_part: asyncio.Handle | None = None
+        self._admitting: dict[bytes, float] = {}
+        """Participants that have waited, and since when they wait for their turn."""
         self._out = {f: _sending_socket(f) for f in (socket.AF_INET, socket.AF_INET6)}
         self.lost = 0
         """Datagrams that the kernel did not take."""
@@ -179,6 +183,7 @@ class DomainServer:
     async def expire(self) -> None:
         """Let in participants that have waited, and forget those that have gone."""
         self._release()
+        self._admit_waiting()
         self._send_and_go_on(self.domain.settle(self._now()))
         self._send(self.domain.expire(self._now()))
         self._sync_stand_ins()
@@ -224,6 +229,29 @@ class DomainServer:
         outside = [address for address in proven if not self._is_inside(address)]
         for listed in address_lists(outside):
             self._send(self.domain.settings.to_lan(listed))
+
+    def _admit_waiting(self) -> None:
+        """Have participants let in when their turn comes: after a start they are many at once."""
+        now = self._now()
+        # The longest queue loses its last items without a word (`FairQueue`).
+        admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT}
+        self._admitting = admitting
+        returning = self.domain.returning
+        for prefix in returning.ready(now):
+            if prefix in admitting:
+                continue
+            source, message, _ = returning.waiting[prefix]
+            standing = self.domain.standing(source)
+            admit = partial(self._admit, prefix)
+            if self._reader.put(source, standing, len(message.datagram), admit):
+                admitting[prefix] = now
+
+    def _admit(self, prefix: bytes) -> list[Outgoing]:
+        self._admitting.pop(prefix, None)
+        outgoing = self.domain.admit(prefix, self._now())
+        self._tell_changes()
+        self._open_and_send(outgoing)
+        return outgoing
 
     def _release(self) -> None:
         """Take in what participants have announced that are let in now."""

@@ -158,6 +158,12 @@ def finished(domain: Domain, sent: Sequence[Outgoing], now: float = NOW) -> list
     return every
 
 
+def settle(domain: Domain, now: float) -> list[Outgoing]:
+    """Let in all that have waited for long enough, and have others meet."""
+    admitted = [out for p in domain.returning.ready(now) for out in domain.admit(p, now)]
+    return admitted + finished(domain, domain.settle(now), now)
+
+
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
     """What is sent to a host; what is for the LAN relay has its proof."""
     return [

@@ -3,14 +3,11 @@
 from collections import Counter
 from itertools import chain
 
-import pytest
-
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.ros2.discovery.domain import SENT_AT_ONCE, Domain
+from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, PAIRS_AT_ONCE, VERDICTS_AT_ONCE
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
@@ -22,7 +19,6 @@ from tests.unit.ros2.discovery.domains import (
     finished,
     make_domain,
     meet,
-    prove,
     sedp,
     spdp,
 )
@@ -149,19 +145,3 @@ def test_a_participant_that_has_gone_is_not_parted() -> None:
     policy.allows = True
     domain.gone({INSIDE})
     assert not told(finished(domain, []), ended=True)[INSIDE]
-
-
-@pytest.mark.parametrize("count", [INSIDE_COUNT, 2])
-def test_those_that_waited_after_a_start_are_let_in_a_few_at_a_time(count: int) -> None:
-    domain = make_domain(ports=LONG_RANGE)
-    for number in range(OUTSIDE_COUNT):
-        domain.heard_outside(spdp(outside(number), ROBOT, 4000 + number), ROBOT, 0.1)
-    prove(domain, INSIDE)
-    for number in range(count):
-        domain.heard_inside(spdp(inside(number), INSIDE, 7000 + 2 * number), INSIDE, 0.1)
-    later = 0.1 + ANSWER_TIME
-    every = parts(domain, domain.settle(later), later)
-    assert len(domain.inside.by_prefix) == count
-    assert told([*chain(*every)], ended=False) == {INSIDE: count * OUTSIDE_COUNT}
-    one = SENT_AT_ONCE + OUTSIDE_COUNT
-    assert max(map(len, every)) <= one + PAIRS_AT_ONCE + 3 * count

@@ -17,6 +17,7 @@ from tests.unit.ros2.discovery.domains import (
     make_domain,
     meet,
     of_vendor,
+    settle,
     spdp,
 )
 
@@ -113,6 +114,6 @@ def test_what_an_older_process_forwarded_to_such_a_port_ends_with_the_participan
     domain.ports.note_forwarded({port: LOCATOR})
     assert led(leases) == {port: LOCATOR}
     domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 0.0)
-    domain.settle(SETTLING + ANSWER_TIME)
+    settle(domain, SETTLING + ANSWER_TIME)
     assert domain.inside.leases[port][1].target == LOCATOR
     assert led(leases) == {}

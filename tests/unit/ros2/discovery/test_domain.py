@@ -44,10 +44,17 @@ from tests.unit.ros2.discovery.domains import (
     prove,
     reached_at,
     sedp,
+    settle,
     spdp,
     to,
 )
-from tests.unit.ros2.protocol.messages import data, message, parameter, payload, submessage
+from tests.unit.ros2.protocol.messages import (
+    data,
+    message,
+    parameter,
+    payload,
+    submessage,
+)
 
 
 def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
@@ -291,9 +298,9 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
     domain = make_domain()
     told, *asked = domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     assert {told.target, *(out.target for out in asked)} == {HostPort(INSIDE, 7410)}
-    assert len(to(domain.settle(0.5), INSIDE)) == 2  # asked again
+    assert len(to(settle(domain, 0.5), INSIDE)) == 2  # asked again
     assert not domain.inside.leases
-    assert to(domain.settle(0.1 + ANSWER_TIME), ROBOT)
+    assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
     assert domain.inside.leases
 
 
@@ -304,7 +311,7 @@ def test_a_participant_says_which_ports_it_had() -> None:
     domain.heard_inside(answer, OTHER, 0.2)
     assert not domain.own.keeper.prefixes  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     ports = {lease.target.port: port for port, (_, lease) in domain.inside.leases.items()}
     assert ports == {7410: 45009, 7411: 45004}
 
@@ -316,7 +323,7 @@ def test_what_a_peer_says_of_a_port_counts_more_than_what_others_do() -> None:
             domain.at_lease(port, sedp(outsider, ROBOT, 7410, to=prefix), source, 0.1)
     domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.2)
     domain.heard_inside(spdp(A, OTHER), OTHER, 0.3)
-    domain.settle(SETTLING + ANSWER_TIME)
+    settle(domain, SETTLING + ANSWER_TIME)
     ports = {participant.prefix: port for port, (participant, lease) in domain.inside.leases.items()
              if lease.kind is LeaseKind.METATRAFFIC}  # fmt: skip
     assert ports[A] in {45002, 45005}
@@ -525,11 +532,11 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     assert announcement.sample.sequence == next_number(first)
 
     domain.heard_inside(elsewhere, OTHER, NOW + 22)
-    parted = domain.settle(NOW + 22)
+    parted = settle(domain, NOW + 22)
     (forgets_robot,) = to(parted, OTHER)
     assert source_prefix(forgets_robot) == B
     assert read_discovery(forgets_robot).announcements[0].ended
-    met = domain.settle(NOW + 22 + APART_TIME)
+    met = settle(domain, NOW + 22 + APART_TIME)
     (again,) = to(met, ROBOT)
     assert source_prefix(again) == A
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
@@ -563,7 +570,7 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
     assert domain.returning.waiting
 
     domain.gone({INSIDE})
-    domain.settle(SETTLING + ANSWER_TIME + 1)
+    settle(domain, SETTLING + ANSWER_TIME + 1)
 
     assert not domain.inside.by_prefix
 
@@ -577,7 +584,7 @@ def test_who_ends_while_he_waits_is_not_announced() -> None:
     domain.heard_inside(farewell(B), INSIDE, 0.2)  # nobody ends one at another address
     domain.heard_inside(farewell(A), INSIDE, 0.2)
 
-    sent = domain.settle(SETTLING + ANSWER_TIME)
+    sent = settle(domain, SETTLING + ANSWER_TIME)
 
     assert {source_prefix(told) for told in to(sent, ROBOT)} == {B}
     assert domain.inside.by_prefix.keys() == {B}

@@ -42,11 +42,11 @@ from tests.unit.ros2.discovery.domains import (
     B,
     carried,
     farewell,
-    finished,
     make_domain,
     meet,
     prove,
     sedp,
+    settle,
     spdp,
     to,
 )
@@ -114,7 +114,7 @@ def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> N
     assert domain.refused.count == 5
     sent += domain.heard_outside(farewell(B) + behind, ROBOT, NOW)
     sent += meet(domain, EVIL, OTHER)
-    sent += domain.settle(NOW)
+    sent += settle(domain, NOW)
     assert sent
     assert not any(b"chatter" in told.datagram for told in sent)
 
@@ -132,7 +132,7 @@ def test_fragments_are_judged_anew_by_another_policy() -> None:
     assert b"chatter" in sent.datagram
     allowed = False
     domain.apply_policy(NOW)
-    domain.settle(NOW + APART_TIME)
+    settle(domain, NOW + APART_TIME)
     (sent,) = domain.at_stand_in(stand_in, datagram, INSIDE, NOW)
     assert b"chatter" not in sent.datagram
 
@@ -272,7 +272,7 @@ def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
     assert len(domain.returning.waiting) == MOST_PER_ADDRESS
     assert domain.heard_inside(spdp(A, OTHER), OTHER, 0.2)
     assert A in domain.returning.waiting
-    finished(domain, domain.settle(0.2 + ANSWER_TIME), 0.2 + ANSWER_TIME)
+    settle(domain, 0.2 + ANSWER_TIME)
     assert not domain.returning.waiting
     assert domain.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
 
@@ -307,7 +307,7 @@ def test_who_waits_does_not_take_the_prefix_of_somebody_met_meanwhile() -> None:
     domain = make_domain()
     domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.1)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.2)
-    domain.settle(0.1 + ANSWER_TIME)
+    settle(domain, 0.1 + ANSWER_TIME)
     assert B in domain.outside.by_prefix
     assert B not in domain.inside.by_prefix
 
@@ -359,7 +359,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     domain.at_stand_in(stand_in, sedp(A, OTHER, 7000), OTHER, NOW)
     denied.append("/chatter")
     assert domain.apply_policy(NOW)
-    assert domain.settle(NOW + APART_TIME)
+    assert settle(domain, NOW + APART_TIME)
 
 
 def test_who_can_not_be_rewritten_is_not_taken_in(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -395,7 +395,9 @@ def test_one_whose_announcement_is_bad_keeps_no_policy_from_others() -> None:
     domain.apply_policy(NOW)
     assert domain.inside.by_prefix[A].is_apart
     assert domain.refused.count == 1
-    assert spdp(A, OTHER)[:20] in {told[:20] for told in to(domain.settle(NOW + APART_TIME), ROBOT)}
+    assert spdp(A, OTHER)[:20] in {
+        told[:20] for told in to(settle(domain, NOW + APART_TIME), ROBOT)
+    }
     assert not domain.inside.by_prefix[A].is_apart
 
 
@@ -408,7 +410,7 @@ def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None
         domain.rediscovery.separate(insider)
     domain.go_on(NOW)
     domain.outside.by_prefix[B].announcement = b"no RTPS message"
-    domain.settle(NOW + APART_TIME)
+    settle(domain, NOW + APART_TIME)
     assert not any(insider.is_apart for insider in domain.inside.by_prefix.values())
 
 
@@ -426,7 +428,7 @@ def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(
         return exported(insider, *rest)
 
     monkeypatch.setattr(InsideParticipants, "exported", lambda _, *rest: refusing(*rest))
-    assert to(domain.settle(0.1 + ANSWER_TIME), ROBOT)
+    assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
     assert domain.inside.by_prefix[A].leases
 
 

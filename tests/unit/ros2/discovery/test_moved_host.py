@@ -16,6 +16,7 @@ from tests.unit.ros2.discovery.domains import (
     make_domain,
     meet,
     reached_at,
+    settle,
     spdp,
     to,
 )
@@ -31,7 +32,7 @@ def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     moved = domain.move_to((MOVED,), NOW)
     farewells = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
     assert farewells == [domain.own.observer.prefix, A]
-    (again,) = to(domain.settle(NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     assert {locator.host for locator in reached_at(again)} == {MOVED}
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
     assert {locator.port for locator in reached_at(again)} == ports
@@ -52,7 +53,7 @@ def test_each_locator_keeps_its_family() -> None:
     domain.settings.hosts = (HOST, "fd77::1")
     meet(domain, address="fd30::11")
     domain.move_to((MOVED, MOVED_IPV6), NOW)
-    (again,) = to(domain.settle(NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     assert {locator.host for locator in reached_at(again)} == {MOVED_IPV6}
 
 
@@ -62,5 +63,5 @@ def test_a_participant_without_a_port_keeps_no_other_from_moving() -> None:
     meet(domain, B, "172.30.0.7")
     domain.inside.by_prefix[A].announcement = b""
     domain.move_to((MOVED,), NOW)
-    (again,) = to(domain.settle(NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     assert source_prefix(again) == B

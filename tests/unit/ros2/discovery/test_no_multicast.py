@@ -27,6 +27,7 @@ from tests.unit.ros2.discovery.domains import (
     make_domain,
     meet,
     sedp,
+    settle,
     spdp,
     to,
 )
@@ -138,7 +139,7 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     sent = meet(domain)
     assert is_farewell(by(domain.own.keeper.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
-    parting, meeting = domain.settle(NOW), domain.settle(NOW + APART_TIME)
+    parting, meeting = settle(domain, NOW), settle(domain, NOW + APART_TIME)
 
     for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
         assert [is_farewell(datagram) for datagram in told] == [True]
@@ -153,12 +154,12 @@ def test_they_meet_anew_once_the_ear_is_heard() -> None:
     """It starts after the proxy. What outside is not told it does not forget."""
     domain = moved(EAR)
     meet(domain)
-    assert domain.settle(NOW) == domain.settle(NOW + 1) == []
+    assert settle(domain, NOW) == settle(domain, NOW + 1) == []
 
     told = carried(ROBOT, spdp(C, ROBOT))
     assert by(C, to(domain.heard_outside(told, EAR.host, NOW + 1), INSIDE)) == []
 
-    parting = domain.settle(NOW + 1)
+    parting = settle(domain, NOW + 1)
     assert [is_farewell(datagram) for datagram in by(A, to(parting, EAR.host))] == [True]
     assert [is_farewell(datagram) for datagram in by(C, to(parting, INSIDE))] == [True]
 
@@ -166,14 +167,14 @@ def test_they_meet_anew_once_the_ear_is_heard() -> None:
 def test_they_meet_anew_though_nobody_is_on_the_ears_lan() -> None:
     domain = moved(EAR)
     meet(domain)
-    assert by(A, to(domain.settle(NOW + EAR_TIME), ROBOT))
+    assert by(A, to(settle(domain, NOW + EAR_TIME), ROBOT))
 
 
 def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
     domain = moved()
     meet(domain)
-    domain.settle(NOW)
-    domain.settle(NOW + APART_TIME)
+    settle(domain, NOW)
+    settle(domain, NOW + APART_TIME)
     later = by(B, to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
     assert [is_farewell(datagram) for datagram in later] == [True, False]
     domain.heard_outside(farewell(B), ROBOT, NOW + 1)
@@ -184,8 +185,8 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
     """Datagrams get lost where dozens meet at once."""
     domain = moved()
     meet(domain)
-    domain.settle(NOW)
-    domain.settle(NOW + APART_TIME)
+    settle(domain, NOW)
+    settle(domain, NOW + APART_TIME)
 
     def told(later: float) -> list[bool]:
         sent = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
@@ -202,7 +203,7 @@ def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
     domain, port = moved(), RANGE.listen.last - 2
     domain.returning.note_former({A: (*PORTS, port)}, {})
     meet(domain)
-    domain.settle(NOW)
+    settle(domain, NOW)
     domain.heard_inside(sedp(A, INSIDE, 7000, to=domain.own.observer.prefix), INSIDE, NOW)
     assert tuple(domain.inside.by_prefix[A].ports) == (*PORTS, port)
 
@@ -216,7 +217,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     domain.returning.note_former({A: ports}, domain.inside.by_prefix)
     meet(domain)
     assert not set(domain.inside.by_prefix[A].ports) & set(ports)
-    parting, meeting = domain.settle(NOW), domain.settle(NOW + APART_TIME)
+    parting, meeting = settle(domain, NOW), settle(domain, NOW + APART_TIME)
     assert [is_farewell(datagram) for datagram in by(A, to(parting, ROBOT))] == [True]
     assert [is_farewell(datagram) for datagram in by(A, to(meeting, ROBOT))] == [False]
 

@@ -8,7 +8,7 @@ from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.protocol.rtps import SubmessageId, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery import domains
-from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, meet, sedp, spdp, to
+from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, meet, sedp, settle, spdp, to
 
 
 class Rules:
@@ -82,8 +82,8 @@ def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
     rules.denied = {RuleKind.PUBLISH}
     parting = domain.apply_policy(NOW)
     assert outwards(domain) == inwards(domain) == []
-    assert domain.settle(NOW + APART_TIME / 2) == []
-    meeting = domain.settle(NOW + APART_TIME)
+    assert settle(domain, NOW + APART_TIME / 2) == []
+    meeting = settle(domain, NOW + APART_TIME)
     for host in (ROBOT, INSIDE):
         told = [
             (announced.ended, announced.sample.sequence)

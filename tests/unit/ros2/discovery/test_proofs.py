@@ -46,12 +46,12 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
-    finished,
     make_domain,
     meet,
     prove,
     reached_at,
     sedp,
+    settle,
     spdp,
     to,
 )
@@ -263,7 +263,7 @@ def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
     asked = questions(domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW), INSIDE)
     for question in asked:
         domain.heard_inside(answer(question, A), INSIDE, NOW)
-    told = finished(domain, domain.settle(NOW + ANSWER_TIME), NOW + ANSWER_TIME)
+    told = settle(domain, NOW + ANSWER_TIME)
     assert A in {source_prefix(datagram) for datagram in to(told, ROBOT)}
     assert len(domain.inside.by_prefix[A].leases) == 2
 
@@ -442,7 +442,7 @@ def test_forged_participants_at_an_address_keep_none_from_waiting_after_a_start(
     assert A in domain.returning.waiting
     crowd_at(domain, INSIDE, 0.4)
     assert A in domain.returning.waiting
-    domain.settle(ANSWER_TIME + 0.5)
+    settle(domain, ANSWER_TIME + 0.5)
     assert A in domain.inside.by_prefix
 
 
@@ -454,7 +454,7 @@ def test_forged_participants_at_proven_addresses_take_three_quarters_of_the_rang
         crowd_at(domain, address, NOW)
     assert domain.ports.pool.free == len(RANGE.listen) // PART_FOR_PROVEN
     answers_what_it_is_asked(domain, NOW)
-    domain.settle(NOW + ANSWER_TIME)
+    settle(domain, NOW + ANSWER_TIME)
     assert len(domain.inside.by_prefix[A].leases) == 2
 
 

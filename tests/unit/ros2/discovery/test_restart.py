@@ -33,6 +33,7 @@ from tests.unit.ros2.discovery.domains import (
     prove,
     reached_at,
     sedp,
+    settle,
     spdp,
     to,
 )
@@ -119,7 +120,7 @@ def test_a_forged_proof_gets_no_port_of_another_participant(proof: str, is_first
     claims = [(B, OTHER, FORGED[proof]), (A, INSIDE, PROOF)]
     for prefix, address, claimed in claims if is_first else reversed(claims):
         come(domain, prefix, address, NUMBER, 0.1, claimed)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
     assert not {*ports_of(domain, B)} & {*PORTS}
 
@@ -128,10 +129,10 @@ def test_a_forged_proof_gets_no_port_of_another_participant(proof: str, is_first
 def test_a_participant_with_a_proof_takes_its_port_from_a_liar(proof: str) -> None:
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, FORGED[proof])
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, B) == PORTS
     come(domain, A, INSIDE, NUMBER, 3.0, PROOF)
-    sent = domain.settle(3.1)
+    sent = settle(domain, 3.1)
     assert ports_of(domain, A) == PORTS
     assert not domain.inside.by_prefix[A].is_apart
     assert B not in domain.inside.by_prefix
@@ -144,7 +145,7 @@ def test_a_proof_that_another_participant_has_as_well_gets_the_port_for_neither(
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, proof_of(B, PORTS))
     come(domain, A, INSIDE, NUMBER, 0.1, PROOF)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     for prefix in (A, B):
         assert not {*ports_of(domain, prefix)} & {*PORTS}
         assert domain.inside.by_prefix[prefix].is_apart
@@ -154,15 +155,15 @@ def test_a_participant_that_has_lost_a_port_meets_outside_anew() -> None:
     domain = restarted()
     domain.heard_outside(spdp(C, ROBOT), ROBOT, 0.1)
     come(domain, B, OTHER, NUMBER, 0.1)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     come(domain, A, INSIDE, NUMBER, 3.0, PROOF)
-    domain.settle(3.1)
+    settle(domain, 3.1)
     domain.heard_inside(spdp(B, OTHER), OTHER, 4.0)
     announce_from(domain, b"\x01\x0f" + bytes(9) + b"\x08", LAPTOP, 4.0)
-    parting = domain.settle(4.1)
+    parting = settle(domain, 4.1)
     assert ends_of(B, parting, ROBOT)
     assert ends_of(C, parting, OTHER)
-    meeting = [d for d in to(domain.settle(4.1 + APART_TIME), ROBOT) if source_prefix(d) == B]
+    meeting = [d for d in to(settle(domain, 4.1 + APART_TIME), ROBOT) if source_prefix(d) == B]
     assert not {locator.port - 1000 for locator in reached_at(meeting[0])} & {*PORTS}
 
 
@@ -172,17 +173,17 @@ def test_two_that_claim_one_port_by_their_word_both_get_others(second: float) ->
     domain = restarted(key=b"")
     come(domain, B, OTHER, NUMBER, 0.1)
     if second > SETTLING:
-        domain.settle(SETTLING)
+        settle(domain, SETTLING)
         assert ports_of(domain, B) == PORTS
     come(domain, A, INSIDE, NUMBER, second)
-    domain.settle(second + SETTLING)
+    settle(domain, second + SETTLING)
     come(domain, B, OTHER, NUMBER, second + 2)
-    domain.settle(second + 2)
+    settle(domain, second + 2)
     for prefix in (A, B):
         assert not {*ports_of(domain, prefix)} & {*PORTS}
         assert domain.inside.by_prefix[prefix].is_apart
     come(domain, C, THIRD, 1, REMEMBERED - 1)
-    domain.settle(REMEMBERED - 1)
+    settle(domain, REMEMBERED - 1)
     assert not {*ports_of(domain, C)} & {*PORTS}
 
 
@@ -192,7 +193,7 @@ def test_a_peer_decides_between_two_words() -> None:
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
         domain.at_lease(port, sedp(C, ROBOT, 7410, to=A), ROBOT, 0.5)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
     assert not {*ports_of(domain, B)} & {*PORTS}
 
@@ -206,7 +207,7 @@ def test_a_forged_name_at_a_port_decides_nothing(source: str) -> None:
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
         domain.at_lease(port, sedp(C, source, 7410, to=B), source, 0.5)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert not {*ports_of(domain, B)} & {*PORTS}
 
 
@@ -218,17 +219,17 @@ def test_an_address_that_receives_decides_between_two_words() -> None:
     for port in PORTS:
         domain.at_lease(port, sedp(C, LAPTOP, 7410, to=A), LAPTOP, 0.5)
         domain.at_lease(port, sedp(C, "10.0.0.66", 7410, to=B), "10.0.0.66", 0.5)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
 
 
 def test_the_operators_record_counts_more_than_a_word() -> None:
     domain = restarted(key=b"")
     come(domain, B, OTHER, NUMBER, 0.1)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 3.0)
-    domain.settle(3.1)
+    settle(domain, 3.1)
     assert ports_of(domain, A) == PORTS
     assert B not in domain.inside.by_prefix
 
@@ -236,7 +237,7 @@ def test_the_operators_record_counts_more_than_a_word() -> None:
 def test_a_number_without_a_proof_gets_its_ports_where_no_other_claims_them() -> None:
     domain = restarted()
     come(domain, A, INSIDE, NUMBER, 0.1)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
     assert not domain.inside.by_prefix[A].is_apart
 
@@ -250,7 +251,7 @@ def test_wrong_proofs_from_many_addresses_take_nothing_from_a_proof() -> None:
         come(domain, prefix, f"172.31.{number // 250}.{number % 250}", NUMBER, 0.1, PROOF)
     come(domain, A, INSIDE, NUMBER, 0.2, PROOF)
     prove(domain, INSIDE)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
 
 
@@ -258,10 +259,10 @@ def test_ports_are_given_once_their_proof_is_known() -> None:
     domain = restarted()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     domain.heard_inside(kept_answer(domain, A, NUMBER), INSIDE, 0.1)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert not domain.inside.by_prefix
     domain.heard_inside(proof_answer(domain, A, PROOF), INSIDE, SETTLING)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
 
 
@@ -295,7 +296,7 @@ def test_an_unproven_address_keeps_no_participant_inside_from_being_served(start
     assert A in domain.outside.by_prefix
     come(domain, A, INSIDE, 1, start + 0.1)
     announce_from(domain, A, LAPTOP, start + 0.2)
-    domain.settle(start + ANSWER_TIME + 1)
+    settle(domain, start + ANSWER_TIME + 1)
     announce_from(domain, A, LAPTOP, start + ANSWER_TIME + 2)
     assert A in domain.inside.by_prefix
     assert A not in domain.outside.by_prefix
@@ -315,7 +316,7 @@ def test_a_proof_of_before_the_start_beats_peers_and_proven_addresses(
     if not is_answered_first:
         assert A in domain.outside.by_prefix
         come(domain, A, INSIDE, NUMBER, 0.3, PROOF)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     announce_from(domain, A, source, 3.0)
     assert ports_of(domain, A) == PORTS
     assert A not in domain.outside.by_prefix
@@ -326,7 +327,7 @@ def test_what_a_peer_sends_to_a_participant_tells_that_it_was_inside() -> None:
     domain.at_lease(PORTS[0], sedp(C, ROBOT, 7410, to=A), ROBOT, 0.1)
     announce_from(domain, A, ROBOT, 0.2)
     come(domain, A, INSIDE, 1, 0.3)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     announce_from(domain, A, ROBOT, 3.0)
     assert A in domain.inside.by_prefix
 
@@ -339,10 +340,10 @@ def test_no_address_inside_takes_the_prefix_of_a_peers_participant(
     """The container was first after the restart, and the robot was heard no more."""
     domain = restarted()
     come(domain, B, OTHER, NUMBER, 0.1, proof)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     sent = announce_from(domain, B, ROBOT, second)
     sent += domain.heard_inside(spdp(B, OTHER), OTHER, second + 0.1)
-    sent += domain.settle(REMEMBERED)
+    sent += settle(domain, REMEMBERED)
     sent += domain.heard_inside(spdp(B, OTHER), OTHER, NOW)
     assert B in domain.outside.by_prefix
     assert B not in domain.inside.by_prefix
@@ -353,7 +354,7 @@ def test_no_address_inside_takes_the_prefix_of_a_peers_participant(
 def test_an_address_that_proves_to_receive_takes_its_prefix_back() -> None:
     domain = restarted(peers=())
     come(domain, B, OTHER, 1, 0.1)
-    domain.settle(SETTLING)
+    settle(domain, SETTLING)
     assert B in domain.inside.by_prefix
     asked = to(announce_from(domain, B, LAPTOP, 2.0), LAPTOP)
     (question,) = [d for d in asked if destination(d) == B]
@@ -404,7 +405,7 @@ def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
     domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), EAR.host, SETTLING)
     come(domain, A, INSIDE, 1, SETTLING)
     assert A in domain.own.keeper.prefixes
-    domain.settle(SETTLING + ANSWER_TIME)
+    settle(domain, SETTLING + ANSWER_TIME)
     assert A not in domain.inside.by_prefix
     assert reasons_of(domain)["prefix"]
     assert A not in domain.own.keeper.prefixes

@@ -35,6 +35,7 @@ from tests.unit.ros2.discovery.domains import (
     make_domain,
     proof_answer,
     sedp,
+    settle,
     spdp,
 )
 from tests.unit.ros2.protocol.messages import data, fragment, message, payload, submessage
@@ -201,7 +202,7 @@ class Neighbours(RuleBasedStateMachine):
     @rule(seconds=st.sampled_from([0.3, 2.0, 5.0]))
     def time_passes(self, seconds: float) -> None:
         self.now += seconds
-        self.check(self.domain.settle(self.now))
+        self.check(settle(self.domain, self.now))
         self.domain.expire(self.now)
 
     @rule(denied=st.sets(st.sampled_from(RuleKind)))
