@@ -21,8 +21,47 @@ LEASE = 12.0
 """Seconds after which others that do not hear it forget it: the proxy may have been killed."""
 ANNOUNCE_INTERVAL = 3.0
 OBSERVED = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
-MOST_SAMPLES = 1000
-"""Samples of a writer that are remembered as got; a participant has some tens."""
+
+
+@dataclass(slots=True)
+class _Received:
+    """Which samples of a writer have come: all before ``base``, and some of those that follow.
+
+    A sample has a bit in ``later``, of `MOST_ASKED` bits. Those further ahead are asked for later.
+    ``behind`` counts the last heartbeats in a row that told of no sample from ``base`` on.
+    """
+
+    base: int = 1
+    later: int = 0
+    behind: int = 0
+
+    def note(self, number: int) -> None:
+        """Note that a sample has come."""
+        if 0 <= number - self.base < MOST_ASKED:
+            self.later |= 1 << number - self.base
+            self._pass_over_received()
+
+    def note_range(self, first: int, last: int) -> None:
+        """Note which samples the writer has."""
+        self.behind = self.behind + 1 if last < self.base - 1 else 0
+        # One heartbeat may be late; two in a row mean that a forged one told of greater numbers.
+        if self.behind > 1:
+            self.base = 1
+            self.later = 0
+        if first > self.base:
+            self.later >>= min(first - self.base, MOST_ASKED)
+            self.base = first
+            self._pass_over_received()
+
+    def missing(self, last: int) -> list[int]:
+        """The samples up to ``last`` that have not come, at most `MOST_ASKED`."""
+        end = min(last + 1, self.base + MOST_ASKED)
+        return [n for n in range(self.base, end) if not self.later >> n - self.base & 1]
+
+    def _pass_over_received(self) -> None:
+        while self.later & 1:
+            self.later >>= 1
+            self.base += 1
 
 
 @dataclass(slots=True)
@@ -30,7 +69,7 @@ class Observer:
     """The samples that the proxy's participant has got; ``prefix`` is its own, which is random."""
 
     prefix: bytes
-    _received: dict[tuple[bytes, int], set[int]] = field(default_factory=dict)
+    _received: dict[tuple[bytes, int], _Received] = field(default_factory=dict)
     _count: int = 0
 
     def announcement(self, *reached_at: HostPort) -> bytes:
@@ -52,17 +91,15 @@ class Observer:
         """
         for sample in samples(datagram):
             if sample.writer in OBSERVED and sample.prefix == prefix:
-                received = self._received.setdefault((prefix, sample.writer), set())
-                if len(received) < MOST_SAMPLES:
-                    received.add(sample.sequence)
+                self._of_writer(prefix, sample.writer).note(sample.sequence)
         # One answer to each writer: a datagram has room for 256 heartbeats, all of one writer.
         by_writer = {heartbeat.writer: heartbeat for heartbeat in heartbeats(datagram)}
         answers = []
         for writer, heartbeat in by_writer.items():
             if writer in OBSERVED:
-                self._received.setdefault((prefix, writer), set())
+                received = self._of_writer(prefix, writer)
                 if heartbeat.last > 0:  # an empty writer would take an answer for a question
-                    answers.append(self._answer(prefix, heartbeat))
+                    answers.append(self._answer(prefix, heartbeat, received))
         return answers
 
     def forget(self, prefix: bytes) -> None:
@@ -70,15 +107,13 @@ class Observer:
         for writer in OBSERVED:
             self._received.pop((prefix, writer), None)
 
-    def _answer(self, prefix: bytes, heartbeat: Heartbeat) -> bytes:
-        received = self._received[prefix, heartbeat.writer]
-        first = max(heartbeat.first, 1)
-        base = next((n for n in range(first, heartbeat.last + 1) if n not in received), None)
-        # Confirm all: it has them, or can't remember more and would ask for them without end.
-        if base is None or len(received) >= MOST_SAMPLES:
-            return self._ask(prefix, heartbeat.writer, max(heartbeat.last, 0) + 1, ())
-        last = min(heartbeat.last, base + MOST_ASKED - 1)
-        missing = [number for number in range(base, last + 1) if number not in received]
+    def _of_writer(self, prefix: bytes, writer: int) -> _Received:
+        return self._received.setdefault((prefix, writer), _Received())
+
+    def _answer(self, prefix: bytes, heartbeat: Heartbeat, received: _Received) -> bytes:
+        received.note_range(heartbeat.first, heartbeat.last)
+        missing = received.missing(heartbeat.last)
+        base = missing[0] if missing else heartbeat.last + 1
         return self._ask(prefix, heartbeat.writer, base, missing)
 
     def _ask(self, prefix: bytes, writer: int, base: int, missing: Sequence[int]) -> bytes:

@@ -1,6 +1,7 @@
 """The proxy's own participant: it asks for what it lacks, and for nothing else."""
 
 import struct
+import tracemalloc
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -52,6 +53,48 @@ def test_it_asks_for_what_it_lacks(got: set[int], last: int) -> None:
     lacking = [number for number in range(1, last + 1) if number not in got]
     assert (missing, final) == (lacking, True)
     assert base == (lacking[0] if lacking else last + 1)
+
+
+def test_it_asks_for_all_samples_of_a_writer_that_has_many() -> None:
+    observer = Observer(OWN)
+    got = set[int]()
+    for _ in range(10):
+        (answer,) = observer.take(PEER, message(heartbeat(500, 3000), prefix=PEER))
+        _, missing, _ = asked(answer)
+        for number in missing:
+            observer.take(
+                PEER, message(data(b"\0\3\0\0", writer=WRITERS, sequence=number), prefix=PEER)
+            )
+        got |= {*missing}
+    assert got == {*range(500, 3001)}
+    (answer,) = observer.take(PEER, message(heartbeat(500, 3000), prefix=PEER))
+    assert asked(answer) == (3001, [], True)
+
+
+def test_a_forged_heartbeat_hides_no_samples() -> None:
+    observer = Observer(OWN)
+    observer.take(PEER, message(heartbeat(10**9, 10**9), prefix=PEER))
+    observer.take(PEER, message(heartbeat(1, 3), prefix=PEER))
+    for _ in range(3):
+        (answer,) = observer.take(PEER, message(heartbeat(1, 3), prefix=PEER))
+        assert asked(answer) == (1, [1, 2, 3], True)
+
+
+def test_little_is_remembered_of_a_writer() -> None:
+    """1,000 samples of each writer took 70 MB for 384 participants, and a proxy may have 256 MB."""
+    observer = Observer(OWN)
+    numbers = range(10**9, 10**9 + 3000, 3)
+    datagrams = [
+        message(data(b"\0\3\0\0", writer=WRITERS, sequence=number), prefix=PEER)
+        for number in numbers
+    ]
+    observer.take(PEER, message(heartbeat(numbers[0] - 1, numbers[-1]), prefix=PEER))
+    tracemalloc.start()
+    for datagram in datagrams:
+        observer.take(PEER, datagram)
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert size < 10_000
 
 
 def test_a_participant_that_has_gone_is_forgotten() -> None:
