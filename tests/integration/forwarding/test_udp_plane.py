@@ -15,6 +15,7 @@ from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Refused
+from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
@@ -47,7 +48,8 @@ class Bench:
         )
         refused = Refused(domain.note)
         proofs = AddressProofs(b"a secret")
-        self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs)
+        verdicts = Verdicts(domain.judge)
+        self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs, verdicts)
         self.leases = DataLeases(pool)
         self.leases.domains.append(self.inside)
         table = KernelTable(DatagramTable(RANGE), self.tools)

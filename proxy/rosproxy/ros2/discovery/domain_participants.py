@@ -15,6 +15,7 @@ from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores
+from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
@@ -77,8 +78,9 @@ class DomainParticipants:
         keeper = Keeper.of(
             settings.host, settings.ports.listen, settings.number, when - now, settings.keeper_key
         )
-        inside = InsideParticipants(settings, ports, refused, proofs)
-        outside = OutsideParticipants(settings, refused, proofs)
+        verdicts = Verdicts(settings.judge)
+        inside = InsideParticipants(settings, ports, refused, proofs, verdicts)
+        outside = OutsideParticipants(settings, refused, proofs, verdicts)
         settings.participants_at = outside.count_by_address.__getitem__
         returning = ReturningParticipants(settings, ports, keeper, proofs)
         fragments = FragmentStores()

@@ -5,59 +5,88 @@ changes, it is applied by having the participant and those of the other side los
 other, and meet again: only for participants inside for which a verdict has changed.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 
+from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery.domain_settings import Judge
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
 from rosproxy.ros2.rewriting.policing import rule_about
 
 MOST_VERDICTS = 1024
-"""Verdicts that are remembered of a participant; real ones have some hundreds. One that has more
-meets others anew with each change of the policy."""
+MOST_VERDICTS_PER_ADDRESS = 16_384
+MOST_VERDICTS_IN_ALL = 65_536
+"""Verdicts that are remembered of a participant, at an address, and in all; a participant has some
+hundreds. One that has more meets others anew with each change of the policy."""
+LONGEST_NAME = 256
+"""Bytes of a name that is remembered with its verdict. A topic of ROS 2 has 255 at most."""
 
 
-def is_hidden(
-    judge: Judge,
-    inside: InsideParticipant,
-    announcement: Announcement,
-    datagram: bytes,
-    is_own: bool,
-) -> bool:
-    """Whether an announcement is not to be passed on.
+@dataclass(slots=True)
+class Verdicts:
+    """Judges topics and services of participants inside, and remembers verdicts within bounds."""
 
-    ``inside`` is the participant that makes it, if it ``is_own``, else the one that is to get it.
-    """
-    # An end names the key of a reader or writer, and no topic to judge it by. What names a topic
-    # others may not take for an end: they read the last status of several, or another flag.
-    topic = announcement.topic(datagram)
-    if announcement.kind is None or (announcement.ended and not topic):
-        return False
-    rule = rule_about(announcement.kind, topic, is_own)
-    if rule is None:
-        return False
-    if rule not in inside.verdicts and len(inside.verdicts) < MOST_VERDICTS:
-        inside.verdicts[rule] = judge(*rule, inside.address)
-    # Those that are not remembered are judged each time.
-    verdict = inside.verdicts.get(rule)
-    return not (judge(*rule, inside.address) if verdict is None else verdict)
+    judge: Judge
+    count_by_address: Counter[str] = field(default_factory=Counter)
 
+    def is_hidden(
+        self, inside: InsideParticipant, announcement: Announcement, datagram: bytes, is_own: bool
+    ) -> bool:
+        """Whether an announcement is not to be passed on.
 
-def reviewed(
-    judge: Judge, insiders: Iterable[InsideParticipant]
-) -> Iterator[InsideParticipant | None]:
-    """Judge the verdicts of participants again, one with each step.
+        ``inside`` is the participant that makes it, if it ``is_own``, else the one that is to get
+        it.
+        """
+        # An end names the key of a reader or writer, and no topic to judge it by. What names a
+        # topic others may not take for an end: they read the last status of several, or another
+        # flag.
+        topic = announcement.topic(datagram)
+        if announcement.kind is None or (announcement.ended and not topic):
+            return False
+        rule = rule_about(announcement.kind, topic, is_own)
+        return rule is not None and not self._is_allowed(inside, rule)
 
-    Yield each participant of which the policy says something else than before, or may; None for
-    each verdict that is the same. One participant may have a thousand verdicts, and each may take
-    as many rules.
-    """
-    for insider in insiders:
-        if len(insider.verdicts) >= MOST_VERDICTS:
-            yield insider
-            continue
-        for rule, allowed in list(insider.verdicts.items()):
-            if judge(*rule, insider.address) is not allowed:
+    def review(self, insiders: Iterable[InsideParticipant]) -> Iterator[InsideParticipant | None]:
+        """Judge the verdicts of participants again, one with each step.
+
+        Yield each participant of which the policy says something else than before, or may; None
+        for each verdict that is the same. One participant may have a thousand verdicts, and each
+        may take as many rules.
+        """
+        for insider in insiders:
+            if insider.has_more_verdicts:
                 yield insider
-                break
-            yield None
+                continue
+            for rule, allowed in list(insider.verdicts.items()):
+                if self.judge(*rule, insider.address) is not allowed:
+                    yield insider
+                    break
+                yield None
+
+    def forget(self, inside: InsideParticipant) -> None:
+        """Forget all verdicts of a participant."""
+        self.count_by_address -= Counter({inside.address: len(inside.verdicts)})
+        inside.verdicts.clear()
+        inside.has_more_verdicts = False
+
+    def _is_allowed(self, inside: InsideParticipant, rule: tuple[RuleKind, str]) -> bool:
+        known = inside.verdicts.get(rule)
+        if known is not None:
+            return known
+        allowed = self.judge(*rule, inside.address)
+        _, name = rule
+        if len(name) <= LONGEST_NAME and self._has_room(inside):
+            inside.verdicts[rule] = allowed
+            self.count_by_address[inside.address] += 1
+        else:
+            inside.has_more_verdicts = True
+        return allowed
+
+    def _has_room(self, inside: InsideParticipant) -> bool:
+        return (
+            len(inside.verdicts) < MOST_VERDICTS
+            and self.count_by_address[inside.address] < MOST_VERDICTS_PER_ADDRESS
+            and self.count_by_address.total() < MOST_VERDICTS_IN_ALL
+        )

@@ -22,7 +22,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     Outgoing,
     Refused,
 )
-from rosproxy.ros2.discovery.hidden_endpoints import is_hidden
+from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.protocol.addressing import for_all
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
@@ -57,6 +57,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     ports: LocatorPorts
     refused: Refused
     proofs: AddressProofs
+    verdicts: Verdicts
     leases: dict[int, tuple[InsideParticipant, Lease]] = field(default_factory=dict)
     port_shortages: dict[bytes, PortShortage] = field(default_factory=dict)
     changes: int = 0
@@ -138,12 +139,12 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         ``kept`` are the ports that it is known to have had before the proxy started, in the order
         of its locators.
         """
-        datagram, judge = message.datagram, self.settings.judge
+        datagram = message.datagram
         note_endpoints(self.notes, participant, datagram, message.announcements)
         return rewritten(
             message,
             partial(self._lead_out, participant, now, kept),
-            lambda announcement: is_hidden(judge, participant, announcement, datagram, is_own=True),
+            lambda a: self.verdicts.is_hidden(participant, a, datagram, is_own=True),
         )
 
     def observed(
@@ -195,6 +196,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             del self.leases[lease.port]
             self.ports.give_back(lease.port)
         self.remove(participant)
+        self.verdicts.forget(participant)
         self._mark_read(participant.address)
         self.port_shortages.pop(participant.prefix, None)
 

@@ -37,7 +37,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     Refused,
     sent_to,
 )
-from rosproxy.ros2.discovery.hidden_endpoints import is_hidden
+from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.protocol.addressing import destination, for_all
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.protocol.parameters import Pid
@@ -76,6 +76,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     settings: DomainSettings
     refused: Refused
     proofs: AddressProofs
+    verdicts: Verdicts
     stand_ins: dict[int, list[tuple[OutsideParticipant, Lease]]] = field(default_factory=dict)
     blocked: set[int] = field(default_factory=set)
     changes: int = 0
@@ -338,11 +339,10 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         self, outsider: OutsideParticipant, insider: InsideParticipant, message: DiscoveryMessage
     ) -> bytes:
         """A message as a participant inside gets it, without what the policy denies. RtpsError."""
-        judge = self.settings.judge
         return rewritten(
             message,
             self._leading_in(outsider, insider.address, message),
-            lambda a: is_hidden(judge, insider, a, message.datagram, is_own=False),
+            lambda a: self.verdicts.is_hidden(insider, a, message.datagram, is_own=False),
         )
 
     def _leading_in(

@@ -26,7 +26,6 @@ from math import inf
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing
-from rosproxy.ros2.discovery.hidden_endpoints import reviewed
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.protocol.announcement import farewell
@@ -70,7 +69,7 @@ class Rediscovery:
 
     def review(self) -> None:
         """Part the participants inside of which the policy says something else than before."""
-        self._review = reviewed(self.settings.judge, list(self.inside.by_prefix.values()))
+        self._review = self.inside.verdicts.review(list(self.inside.by_prefix.values()))
         self._has_verdicts = True
 
     @property
@@ -130,7 +129,7 @@ class Rediscovery:
             self.outside.refused("malformed", insider.address, str(error))
             return []
         finally:
-            insider.verdicts.clear()
+            self.inside.verdicts.forget(insider)
 
     def _next_pair(self) -> list[Outgoing]:
         """What the next participant outside leads to, for one at the address whose turn it is."""

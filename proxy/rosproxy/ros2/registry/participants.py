@@ -236,7 +236,8 @@ class InsideParticipant(Participant):
     """A participant inside, with a port of the range for each of its locators.
 
     ``verdicts``: whether the policy allows a topic or service, by rule; of its own endpoints and of
-    those outside that it was to be told of. ``proxy_address`` is the proxy's address on its
+    those outside that it was to be told of; ``has_more_verdicts``: some are not remembered.
+    ``proxy_address`` is the proxy's address on its
     network; ``is_in_group``: it was heard there by multicast. ``was_inside``: a former process
     served it, as more than its own word says. ``announced_at`` is when outside was last told of it.
     `Rediscovery` sets the rest, None if it does not apply: since when it waits to
@@ -245,6 +246,7 @@ class InsideParticipant(Participant):
     """
 
     verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
+    has_more_verdicts: bool = False
     proxy_address: str = ""
     is_in_group: bool = False
     was_inside: bool = False

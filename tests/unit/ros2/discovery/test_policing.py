@@ -1,14 +1,38 @@
 """Policy: what is denied is told to neither side, and a change has the two meet again."""
 
+import struct
+from collections.abc import Iterable
+
+import pytest
+
 from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery import hidden_endpoints
+from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.discovery.hidden_endpoints import LONGEST_NAME
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
-from rosproxy.ros2.protocol.rtps import SubmessageId, submessages
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery import domains
-from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, meet, sedp, settle, spdp, to
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    NOW,
+    ROBOT,
+    SEDP_WRITERS,
+    A,
+    B,
+    meet,
+    sedp,
+    settle,
+    spdp,
+    to,
+)
+from tests.unit.ros2.protocol.messages import data, payload
+
+NEIGHBOUR = b"\x01\x0f" + bytes(9) + b"\x09"
 
 
 class Rules:
@@ -103,3 +127,39 @@ def test_the_proxy_itself_is_told_of_what_is_denied() -> None:
     domain.heard_inside(told, INSIDE, NOW)
     assert len(domain.inside.by_prefix[A].endpoints) == 1
     assert HostPort(INSIDE, 7000) in domain.inside.by_prefix[A].leases
+
+
+def announced_topics(domain: Domain, prefix: bytes, names: Iterable[bytes]) -> None:
+    """Have a participant inside announce itself with writers of topics."""
+    for name in names:
+        text = name + bytes(4 - len(name) % 4)
+        topic = struct.pack("<I", len(name) + 1) + text
+        guid = prefix + bytes([0, 0, 1, 3])
+        told = payload([(Pid.ENDPOINT_GUID, guid), (Pid.TOPIC_NAME, topic)])
+        writer = data(told, writer=SEDP_WRITERS)
+        announcement = spdp(prefix, INSIDE, 7410 + 2 * prefix[-1])
+        domain.rates = DiscoveryRates()
+        domain.heard_inside(announcement + writer, INSIDE, NOW)
+
+
+def test_verdicts_of_one_address_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container took 80 MB by 64 participants with 1,024 topics each, of 1 KB of name."""
+    bounds = {"MOST_VERDICTS": 5, "MOST_VERDICTS_PER_ADDRESS": 8, "MOST_VERDICTS_IN_ALL": 10}
+    for name, bound in bounds.items():
+        monkeypatch.setattr(hidden_endpoints, name, bound)
+    rules = Rules()
+    domain = domains.make_domain(judge=rules)
+    for prefix in (A, NEIGHBOUR):
+        announced_topics(domain, prefix, (b"rt/%d" % number for number in range(6)))
+    first, second = (domain.inside.by_prefix[prefix] for prefix in (A, NEIGHBOUR))
+    assert [len(first.verdicts), len(second.verdicts)] == [5, 3]
+    parted = domain.apply_policy(NOW)
+    assert {A, NEIGHBOUR} <= {source_prefix(datagram) for datagram in to(parted, ROBOT)}
+    assert domain.inside.verdicts.count_by_address.total() == 0
+    announced_topics(domain, A, [b"rt/" + bytes([120]) * LONGEST_NAME])
+    assert not first.verdicts
+    assert first.has_more_verdicts
+    announced_topics(domain, A, [b"rt/0"])
+    assert first.verdicts == {(RuleKind.PUBLISH, "/0"): True}
+    domain.gone({INSIDE})
+    assert domain.inside.verdicts.count_by_address.total() == 0
