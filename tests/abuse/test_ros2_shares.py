@@ -16,7 +16,7 @@ from rosproxy.ros2.protocol.rtps import SubmessageId
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
 from tests.abuse.pair import Pair
-from tests.abuse.ros2_neighbours import WELL_KNOWN, Address, Counted, Participant, udp
+from tests.abuse.ros2_neighbours import WELL_KNOWN, Address, Counted, Flood, Participant, udp
 from tests.integration.net import until
 from tests.unit.ros2.discovery.domains import SEDP_WRITERS, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload, submessage
@@ -145,5 +145,24 @@ async def test_a_message_in_which_many_speak_is_not_multiplied(abused, robot, pa
         await until(lambda: is_met(abused, sock, 2), "all that waited has been read")
         has_arrived()
     assert arrived <= 3 * 10 * len(datagram)
+    assert pair.figures.lost == 0
+    assert pair.figures.longest_gap < LONGEST_GAP
+
+
+def forged_crowd(address: str) -> list[tuple[str, Address, bytes]]:
+    """Announcements in the name of participants at an address that is another container's."""
+    return [
+        (address, ANNOUNCED, spdp(evil(number), address, 9000 + 2 * number, lease=300))
+        for number in range(100)
+    ]
+
+
+async def test_forged_participants_at_an_address_keep_no_new_one_out(abused, robot, pair):
+    """A neighbour announced participants at a container's address, and no new one was met."""
+    flood = Flood(forged_crowd(NODES[0]), is_forged=True, per_second=500)
+    with abused.watched(), pair, flood, closing(Participant(evil(200), NODES[0], 8000)) as new:
+        flood.wait(200)
+        new.proves_to_receive(lambda: new.announce(ANNOUNCED))
+        robot.hears(evil(200), lambda: new.announce(ANNOUNCED))
     assert pair.figures.lost == 0
     assert pair.figures.longest_gap < LONGEST_GAP
