@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import signal
+import socket
 import time
 
 import pytest
 
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
 from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab, is_whole
+from tests.unit.ros2.protocol.messages import data, message, payload
 
 
 def test_ten_participants_get_their_ports_again(lab: Lab) -> None:
@@ -110,3 +116,38 @@ def test_50_messages_a_second_and_calls_go_on_without_a_loss(lab: Lab) -> None:
         assert is_whole(reader), "messages were lost"
     for caller in callers:
         caller.wait_for_count("^reply ", 50, since=caller.mark())
+
+
+@pytest.mark.parametrize("count", [1, 16])
+@pytest.mark.parametrize(("source", "sink"), [("c1", "out"), ("out", "c1")])
+def test_a_forged_announcement_after_a_restart_is_no_end(
+    lab: Lab, source: str, sink: str, count: int
+) -> None:
+    """A container with the right for raw packets is the first to announce another one's node.
+
+    With 16 locators, the announcement took all ports that the node may have.
+    """
+    lab.node("jazzy", source, "pub", topic="/chatter")
+    reader = lab.node("jazzy", sink, "sub", topic="/chatter")
+    reader.wait_for_count("^got hello ", 5)
+    (participant,) = lab.domain().inside
+    node = next(node for node in lab.nodes if "(c1)" in node.title)
+    node.send(signal.SIGSTOP)
+    lab.restart_proxy()
+    prefix = bytes.fromhex(participant.guid_prefix.replace(".", ""))
+    guid = prefix + bytes([0, 0, 1, 0xC1])
+    address = lab.place("c1").address
+    locators = [
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(address, 9000 + number), "<"))
+        for number in range(count)
+    ]
+    forged = message(data(payload([(Pid.PARTICIPANT_GUID, guid), *locators])), prefix=prefix)
+
+    def is_taken_in() -> bool:
+        with lab.place("c1").entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.sendto(forged, (lab.place("px").address, 7410))
+        return bool(lab.domain().inside)
+
+    wait_until("it is announced", is_taken_in)
+    node.send(signal.SIGCONT)
+    reader.wait_for_count("^got hello ", 20, since=reader.mark())

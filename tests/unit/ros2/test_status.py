@@ -19,6 +19,7 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import Lease, Participant
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.status import Ros2State
+from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,
@@ -116,8 +117,9 @@ def test_in_which_direction_the_proxy_passes_on(both_ways: bool, direction: str)
 def test_what_there_is_too_little_of() -> None:
     ports = PortMap(PortRange(45000, 45099), PortRange(45000, 45099))
     domain = make_domain(ports=ports)
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
     for number in range(20):
-        domain.heard_inside(spdp(A, INSIDE, 7410 + 2 * number), INSIDE, NOW)
+        domain.heard_inside(domains.sedp(A, INSIDE, 9000 + number), INSIDE, NOW)
     (inside,) = told(domain).inside
     assert (inside.shortage, len(inside.leases)) == ("bound", 16)
     assert "more than 16 locators" in inside.problem

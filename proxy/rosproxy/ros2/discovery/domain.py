@@ -420,6 +420,8 @@ class Domain(DomainParticipants):
             insider.parting_from = now
         else:
             sent += self._reminders(insider, lease_count, now)
+        if not is_new and len(insider.leases) > lease_count:
+            insider.parting_from = now  # outside takes up no new locators of it
         sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
         if is_new:
             sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)

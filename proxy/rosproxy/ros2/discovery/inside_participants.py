@@ -36,7 +36,12 @@ from rosproxy.ros2.registry.participants import (
     ShortageKind,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
-from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, require_rewritable, rewritten
+from rosproxy.ros2.rewriting.discovery import (
+    Announcement,
+    DiscoveryMessage,
+    require_rewritable,
+    rewritten,
+)
 
 PART_FOR_PROVEN = 4
 """One of so many parts of the range is for addresses that have proved to receive."""
@@ -81,6 +86,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
             participant.proxy_address = self.settings.proxy_address_for(source)
             self.add(participant)
+        self._make_room(participant, spdp, datagram)
         if participant.note_vendor(source_vendor(datagram)):
             self._mark_read(source)
         participant.until = now + lease_duration(spdp, datagram)
@@ -193,12 +199,30 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     def forget(self, participant: InsideParticipant) -> None:
         """Forget a participant that has gone, and take its ports back."""
         for lease in participant.leases.values():
-            del self.leases[lease.port]
-            self.ports.give_back(lease.port)
+            self._take_back(lease)
         self.remove(participant)
         self.verdicts.forget(participant)
         self._mark_read(participant.address)
         self.port_shortages.pop(participant.prefix, None)
+
+    def _make_room(
+        self, participant: InsideParticipant, spdp: Announcement, datagram: bytes
+    ) -> None:
+        """Take back ports of locators that a participant no longer names, if it has too many.
+
+        A forged announcement may have named them.
+        """
+        address = participant.address
+        named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
+        if len(named) <= MOST_LEASES < len(named | participant.leases.keys()):
+            for locator in participant.leases.keys() - named:
+                self._take_back(participant.leases.pop(locator))
+            self.port_shortages.pop(participant.prefix, None)
+            self._mark_read(address)
+
+    def _take_back(self, lease: Lease) -> None:
+        del self.leases[lease.port]
+        self.ports.give_back(lease.port)
 
     def _mark_read(self, address: str) -> None:
         """Mark the leases to locators at which a participant at an address reads discovery.

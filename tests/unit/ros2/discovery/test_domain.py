@@ -12,7 +12,7 @@ from rosproxy.ros2.discovery import outside_participants
 from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import BURST, STEP, cost
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
-from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, Outgoing
+from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
@@ -55,6 +55,8 @@ from tests.unit.ros2.protocol.messages import (
     payload,
     submessage,
 )
+
+LONG_RANGE = PortMap(PortRange(45000, 45099), PortRange(46000, 46099))
 
 
 def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
@@ -542,6 +544,32 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
     assert {locator.port for locator in reached_at(again)} == ports
     assert [source_prefix(datagram) for datagram in to(met, OTHER)] == [B]
+
+
+@pytest.mark.parametrize("count", [1, MOST_LEASES])
+def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -> None:
+    """Others were announced in its name, before it announced itself again after a start.
+
+    With 16 others it got no port. Fast DDS takes no new locators of a participant that it knows.
+    """
+    domain = make_domain(ear=None, ports=LONG_RANGE)
+    domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    guid = A + bytes([0, 0, 1, 0xC1])
+    others = [
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 9000 + number), "<"))
+        for number in range(count)
+    ]
+    forged = message(data(payload([(Pid.PARTICIPANT_GUID, guid), *others])), prefix=A)
+    assert to(domain.heard_inside(forged, INSIDE, NOW), ROBOT)
+    meet(domain)
+    (ended,) = to(settle(domain, NOW), ROBOT)
+    assert read_discovery(ended).announcements[0].ended
+    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
+    ports = {RANGE.listen.first + p.port - RANGE.advertise.first for p in reached_at(again)}
+    assert {domain.inside.leases[port][1].target.port for port in ports} == {7410, 7411}
+    assert len(domain.inside.leases) <= MOST_LEASES
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 3)
+    assert not domain.inside.by_prefix[A].is_apart
 
 
 def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
