@@ -16,9 +16,10 @@ a second such participant, the *witness*, whose number proves that of the keeper
 there are, and a keyed hash of the participant's GUID prefix and these ports. The witness's own
 prefix follows from the secret, too: a proxy with another secret asks as another witness.
 
-No half is longer than `HALF_BITS`. Fast DDS before 2.14.6, 3.2.5 and 3.4.3 counts up to the number
-of a writer one by one, and holds a lock meanwhile (StatefulReader.cpp, NotifyChanges): up to 2^24
-takes some hundredths of a second, up to 2^32 ten seconds, and up to 2^48 days.
+No half is longer than `HALF_BITS`. Fast DDS before 2.14.6, 3.2.4, 3.3.1 and 3.4.2 counts up to the
+number of a writer one by one, under a lock (StatefulReader.cpp, NotifyChanges). Up to 2^24 takes
+some hundredths of a second, up to 2^32 ten seconds, and up to 2^48 days. Cyclone DDS does not
+count: a heartbeat makes one gap there (ddsi_receive.c, handle_Heartbeat).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
