@@ -64,7 +64,7 @@ class Participant:
 
     def proves_to_receive(self, asked: Callable[[], object]) -> None:
         """Answer the question that the proxy sends to this address; ``asked`` is done meanwhile."""
-        question = self._wait(self.meta, asked, _is_question)
+        question = self.is_asked(asked)
         told = read_discovery(question).of_participant
         assert told is not None
         (meta, _) = (locator for _, locator in told.reached_at(question))
@@ -72,6 +72,10 @@ class Participant:
         body = bytes([0, 0, 3, 0xC7, 0, 0, 3, 0xC2]) + bytes(20)
         answer = message(info_dst, submessage(0x06, 0, body), prefix=self.prefix)
         self.meta.sendto(answer, (meta.host, meta.port))
+
+    def is_asked(self, asked: Callable[[], object]) -> bytes:
+        """The question that the proxy sends to this address; ``asked`` is done meanwhile."""
+        return self._wait(self.meta, asked, _is_question)
 
     def hears(self, prefix: bytes, asked: Callable[[], object]) -> list[HostPort]:
         """The locators in another's announcement, once that comes; ``asked`` is done meanwhile."""

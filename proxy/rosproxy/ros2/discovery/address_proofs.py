@@ -42,7 +42,7 @@ ANSWER_KEPT = 30.0
 MOST_ANSWERED = 128
 """Participants at an address that have answered; of more, the first one goes."""
 LONGEST_ANSWER = 256
-"""Bytes of an answer that is known without reading it; one of Fast DDS has 72."""
+"""Bytes of a first answer, which is read at any rate; an answer of Fast DDS has 72."""
 _INFO_DST = bytes([SubmessageId.INFO_DST])
 _NOT_IN_ANSWERS = (SubmessageId.INFO_SRC, SubmessageId.DATA, SubmessageId.DATA_FRAG)
 """After an INFO_SRC another participant speaks."""
@@ -82,13 +82,18 @@ class AddressProofs:
         return announcement(own, reached_at, LEASE_DURATION, WRITER_ENDPOINTS) + asks[HEADER:]
 
     def is_answer(self, address: str, datagram: bytes) -> bool:
-        """Whether a datagram is an answer of an address and nothing else, known without reading it.
+        """Return whether a datagram is the first answer of a participant, and nothing else.
 
         A flood of forged sources uses up what may be read of unproven addresses. Answers can't be
-        forged, so they are taken in nevertheless. An announcement beside an answer has to wait.
+        forged, so the first answer of a participant is taken in nevertheless. Later answers are
+        discovery like any other: a proven address could send them without end. An announcement
+        beside an answer has to wait.
         """
+        answered = self._answered.get(address, {})
         return (
-            len(datagram) <= LONGEST_ANSWER
+            len(answered) < MOST_ANSWERED
+            and datagram[HEADER - PREFIX : HEADER] not in answered
+            and len(datagram) <= LONGEST_ANSWER
             and datagram[HEADER : HEADER + 1] == _INFO_DST
             and datagram[HEADER + 4 : HEADER + 4 + PREFIX] == self._prefix(address)
             and _announces_nothing(datagram)

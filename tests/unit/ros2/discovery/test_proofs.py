@@ -336,6 +336,20 @@ def test_a_flood_of_forged_sources_holds_up_no_answer() -> None:
     assert domain.is_read_at_discovery(said + bytes(300), LAPTOP)
 
 
+def test_a_proven_address_repeats_no_answer_at_any_rate() -> None:
+    """What stood behind a repeated answer was read without an allowance."""
+    domain = make_domain(peers=())
+    meet(domain)
+    (asked,) = questions(hear(domain, B, LAPTOP), LAPTOP)
+    said = answer(asked, B)
+    behind = said + spdp(B, LAPTOP)[HEADER:]
+    assert domain.is_read_at_discovery(behind, LAPTOP)
+    domain.heard_outside(said, LAPTOP, NOW)
+    assert domain.is_read_at_discovery(said, LAPTOP)
+    domain.rates.charge(LAPTOP, 2 * int(BURST))
+    assert not domain.heard_outside(behind, LAPTOP, NOW)
+
+
 def test_an_answer_inside_is_not_held_up_either() -> None:
     domain = make_domain()
     (asked,) = questions(meet(domain), INSIDE)[-1:]

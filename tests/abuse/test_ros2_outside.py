@@ -1,0 +1,101 @@
+"""ROS 2: what an address outside can do that has proved to receive, or that is a peer's.
+
+A participant outside sends 100 messages a second to one inside meanwhile, through a port that the
+proxy itself relays. A crowd of participants is inside, all of which are told of each announcement.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+
+import pytest
+
+from examples.demo.fake_http import free_ports
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import source_prefix
+from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES
+from tests.abuse.conftest import Abused
+from tests.abuse.health import Health
+from tests.abuse.ros2_neighbours import WELL_KNOWN, Flood, Participant
+from tests.abuse.test_ros2_shares import (  # noqa: F401 - fixtures
+    ANNOUNCED,
+    LONGEST_GAP,
+    PEER,
+    pair,
+    robot,
+)
+from tests.integration.net import until
+from tests.unit.ros2.protocol.messages import data, message, payload, submessage
+
+EVIL_PREFIX = bytes([1, 15, 7]) + bytes(9)
+PORTS = 256
+CROWD = 50
+AT_ONE_ADDRESS = 16
+"""Participants of the crowd at one address."""
+AMONG = 30_000
+"""Datagrams of a flood."""
+PER_SECOND = 5000
+HEALTHY_S = 0.5
+"""Seconds in which the proxy answers a health check. The machine may be busy."""
+
+
+@pytest.fixture
+def first() -> int:
+    """The first port of the proxy's range."""
+    return free_ports(PORTS)
+
+
+@pytest.fixture
+def abused(start_abused, _apart, first) -> Abused:
+    """A proxy for ROS 2 that is a machine of its own, and relays user data itself."""
+    return start_abused(
+        ros=2,
+        prefix=_apart.prefix,
+        advertise_host=APART_HOST,
+        inside_network=INSIDE,
+        admin_bind=f"{APART}:{free_ports(1)}",
+        port_range=f"{first}-{first + PORTS - 1}",
+        ros2_peer=f"{PEER}:{WELL_KNOWN}",
+        data_plane="copy",
+    )
+
+
+@pytest.fixture
+async def crowd(abused) -> Iterator[list[Participant]]:
+    """Participants inside; the address of each has proved to receive."""
+    with ExitStack() as stack:
+        made = [stack.enter_context(closing(crowd_member(number))) for number in range(CROWD)]
+        for leader in made[::AT_ONE_ADDRESS]:
+            leader.proves_to_receive(lambda leader=leader: leader.announce(ANNOUNCED))
+
+        def is_known() -> bool:
+            for participant in made:
+                participant.announce(ANNOUNCED)
+            (domain,) = abused.status()["domains"]
+            return len(domain["inside"]) >= CROWD
+
+        await until(is_known, "the crowd is known")
+        yield made
+
+
+def crowd_member(number: int) -> Participant:
+    prefix = bytes([1, 15, 6, number]) + bytes(8)
+    return Participant(prefix, NODES[2 + number // AT_ONE_ADDRESS], 20_000 + 2 * number)
+
+
+async def test_an_address_repeats_its_answer(abused, robot, crowd, pair, first):  # noqa: F811
+    """An announcement behind an answer was read at any rate: no message came for 0.4 s."""
+    discovery = APART_HOST, first
+    question = robot.is_asked(lambda: robot.announce(discovery))
+    locator = pack_locator(HostPort(PEER, 9000), "<")
+    announcement = data(payload([(Pid.METATRAFFIC_UNICAST_LOCATOR, locator)]))
+    info_dst = submessage(0x0E, 0, source_prefix(question))
+    answer = message(info_dst, announcement, prefix=EVIL_PREFIX)
+    with Health(*abused.admin) as health, pair:
+        with Flood([(PEER, discovery, answer)], False, per_second=PER_SECOND) as flood:
+            flood.wait(AMONG)
+    assert pair.figures.lost == 0
+    assert pair.figures.longest_gap < LONGEST_GAP
+    assert health.longest < HEALTHY_S
+    assert "rate" in abused.refused()
