@@ -15,7 +15,7 @@ from rosproxy.ros2.registry.participants import (
     Participant,
     ParticipantTraits,
 )
-from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
+from rosproxy.ros2.rewriting.discovery import Announcement
 
 LONGEST_LEASE = 300.0
 """Seconds after which a participant that is not heard counts as gone, whatever it says itself."""
@@ -105,9 +105,3 @@ def _locator_fault(spdp: Announcement, datagram: bytes, address: str) -> Locator
         if locators or pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
             return LocatorFault.MISSING
     return LocatorFault.NO
-
-
-def next_number(announcement: bytes) -> int:
-    """The number that comes after that of a participant's announcement. Raises RtpsError."""
-    spdp = read_discovery(announcement).of_participant
-    return spdp.sample.sequence + 1 if spdp else 1

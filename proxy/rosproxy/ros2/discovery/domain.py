@@ -44,7 +44,6 @@ from rosproxy.ros2.protocol.rtps import (
     MAGIC,
     NO_VENDOR,
     RtpsError,
-    by_source,
     source_prefix,
     source_vendor,
 )
@@ -58,7 +57,7 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     credited_messages,
-    read_discovery,
+    read_messages,
     require_rewritable,
 )
 
@@ -83,7 +82,7 @@ class Domain(DomainParticipants):
             return []
         sent = list[Outgoing]()
         try:
-            for message in map(read_discovery, by_source(datagram)):
+            for message in read_messages(datagram):
                 sent += self._heard_inside(message, source, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
@@ -210,7 +209,7 @@ class Domain(DomainParticipants):
         if self._is_too_much(datagram, source, now):
             return []
         try:
-            for message in map(read_discovery, by_source(datagram)):
+            for message in read_messages(datagram):
                 sent += self._exported(port, source, users, message, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
@@ -264,8 +263,7 @@ class Domain(DomainParticipants):
         sent = list[Outgoing]()
         self.returning.forget({insider.address for insider in self.inside.by_prefix.values()})
         for insider in list(self.inside.by_prefix.values()):
-            part = partial(self.rediscovery.separate, insider)
-            sent += self._unless_malformed(insider.address, part)
+            sent += self.rediscovery.separate(insider)
             self._forget_inside(insider)
         return sent + self.rediscovery.next_datagrams(now)
 

@@ -11,7 +11,6 @@ from typing import Self
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
-from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores
@@ -217,5 +216,4 @@ def _farewell_of(participant: Participant) -> bytes:
     The number is the next one after that of its last announcement: Fast DDS takes no older sample
     of the same writer (StatelessReader.cpp), so a greater one would keep it out for good.
     """
-    number = next_number(participant.announcement) if participant.announcement else 1
-    return farewell(participant.prefix, participant.vendor, number)
+    return farewell(participant.prefix, participant.vendor, participant.next_number)

@@ -90,6 +90,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         if participant.note_vendor(source_vendor(datagram)):
             self._mark_read(source)
         participant.until = now + lease_duration(spdp, datagram)
+        participant.next_number = spdp.sample.sequence + 1
         participant.metatraffic = first_metatraffic(spdp, datagram, source)
         participant.traits = traits(spdp, datagram, source)
         return participant

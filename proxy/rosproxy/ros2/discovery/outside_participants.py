@@ -17,7 +17,6 @@ from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
-    next_number,
     note_endpoints,
     traits,
 )
@@ -38,7 +37,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
-from rosproxy.ros2.protocol.addressing import destination, for_all
+from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.announcement import farewell
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_vendor
@@ -53,6 +52,7 @@ from rosproxy.ros2.registry.participants import (
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
+    participant_alone,
     read_discovery,
     require_rewritable,
     rewritten,
@@ -92,7 +92,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
             if participant is not None:
                 # Its end: `introduced` tells inside of it as of any announcement.
-                participant.announcement = for_all(datagram)
+                self._keep(participant, message)
             return participant
         metatraffic = first_metatraffic(spdp, datagram, source)
         if metatraffic is None:
@@ -107,9 +107,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         participant = participant or self._add(prefix, datagram, source, now)
         if participant is not None:
             participant.until = now + lease_duration(spdp, datagram)
-            # Cyclone DDS answers the observer with an announcement that is for the observer alone
-            # (ddsi_discovery_spdp.c, respond_to_spdp).
-            participant.metatraffic, participant.announcement = metatraffic, for_all(datagram)
+            participant.metatraffic = metatraffic
+            self._keep(participant, message)
             participant.traits = traits(spdp, datagram, source)
         return participant
 
@@ -147,7 +146,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         note_endpoints(self.notes, outsider, message.datagram, message.announcements)
         # The observer alone gets this: it is rewritten to open the stand-ins. Nothing is hidden,
         # since the observer would ask for that again and again.
-        lead = self._leading_in(outsider, outsider.address, message)
+        near = self.settings.proxy_address_for(outsider.address)
+        lead = self._leading_in(outsider, near, message)
         return rewritten(message, lead, lambda _: False)
 
     def introduced(
@@ -158,15 +158,17 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     ) -> list[Outgoing]:
         """The announcements of participants outside for some inside, as far as these may know."""
         sent = list[Outgoing]()
-        introduced = list(filter(self.may_introduce, outside))
-        told = [(p, p.metatraffic) for p in inside if p.metatraffic and not p.is_apart]
-        # Where no participant is told, reading costs time, and the source pays nothing for it.
-        for outsider in introduced if told else ():
-            message = read_discovery(outsider.announcement)
-            for insider, metatraffic in told:
-                sent += self.farewell_to(outsider, insider, now)
-                imported = self._imported(outsider, insider, message)
-                sent.append(Outgoing(metatraffic, imported))
+        by_near = dict[str, list[InsideParticipant]]()
+        for insider in inside:
+            if insider.metatraffic and not insider.is_apart:
+                near = self.settings.proxy_address_for(insider.address)
+                by_near.setdefault(near, []).append(insider)
+        for outsider in filter(self.may_introduce, outside):
+            for near, told in by_near.items():
+                datagram = self._introduction(outsider, near)
+                for insider in told:
+                    sent += self.farewell_to(outsider, insider, now)
+                    sent += sent_to(insider.metatraffic, [datagram])
         return sent
 
     def prove(self, address: str) -> tuple[list[OutsideParticipant], list[OutsideParticipant]]:
@@ -203,7 +205,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         ):
             return []
         insider.farewell_times[outsider.prefix] = now
-        datagram = farewell(outsider.prefix, outsider.vendor, next_number(outsider.announcement))
+        datagram = farewell(outsider.prefix, outsider.vendor, outsider.next_number)
         return sent_to(insider.metatraffic, [datagram])
 
     def to_met(self, datagram: bytes) -> list[Outgoing]:
@@ -341,14 +343,34 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """A message as a participant inside gets it, without what the policy denies. RtpsError."""
         return rewritten(
             message,
-            self._leading_in(outsider, insider.address, message),
+            self._leading_in(outsider, self.settings.proxy_address_for(insider.address), message),
             lambda a: self.verdicts.is_hidden(insider, a, message.datagram, is_own=False),
         )
 
+    def _keep(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> None:
+        """Keep what a participant announces of itself, for those inside that come later."""
+        announcement = participant_alone(message)
+        if announcement != outsider.announcement:
+            outsider.announcement = announcement
+            outsider.introduction = None
+        if message.of_participant is not None:
+            outsider.next_number = message.of_participant.sample.sequence + 1
+
+    def _introduction(self, outsider: OutsideParticipant, near: str) -> bytes:
+        """The announcement of a participant for those that reach the proxy at ``near``. RtpsError.
+
+        It is made once for all of them: with many parameters that takes a millisecond.
+        """
+        if outsider.introduction is None or outsider.introduction[0] != near:
+            message = read_discovery(outsider.announcement)
+            lead = self._leading_in(outsider, near, message)
+            outsider.introduction = near, rewritten(message, lead, lambda _: False)
+        return outsider.introduction[1]
+
     def _leading_in(
-        self, outsider: OutsideParticipant, address: str, message: DiscoveryMessage
+        self, outsider: OutsideParticipant, near: str, message: DiscoveryMessage
     ) -> Callable[[int, HostPort], HostPort | None]:
-        near, hosts = self.settings.proxy_address_for(address), set(_user_hosts(message))
+        hosts = set(_user_hosts(message))
         return partial(self._lead_in, outsider, near, outsider.address in hosts)
 
     def _lead_in(
@@ -405,6 +427,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
     def _close(self, participant: OutsideParticipant, locator: HostPort) -> None:
         lease = participant.leases.pop(locator)
+        participant.introduction = None
         remaining = [pair for pair in self.stand_ins.pop(lease.port) if pair[1] is not lease]
         if remaining:
             self.stand_ins[lease.port] = remaining

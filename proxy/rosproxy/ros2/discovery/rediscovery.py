@@ -24,7 +24,6 @@ from itertools import islice
 from math import inf
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
@@ -58,8 +57,8 @@ class Rediscovery:
     _now: float = 0.0
 
     def separate(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Have a participant inside and all outside forget each other. Raises RtpsError."""
-        datagram = farewell(insider.prefix, insider.vendor, next_number(insider.announcement))
+        """Have a participant inside and all outside forget each other."""
+        datagram = farewell(insider.prefix, insider.vendor, insider.next_number)
         insider.parting_from = None
         insider.apart_until = inf  # until the last farewell
         insider.farewell_times = {}  # it was not told to forget anybody yet
@@ -99,7 +98,7 @@ class Rediscovery:
         return self.separate(insider)
 
     def proceed(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """Part one that has waited, or introduce one that is apart for long enough. RtpsError."""
+        """Part a participant that has waited, or introduce it once it is apart for long enough."""
         if insider.parting_from is not None and self._may_part(insider.parting_from, now):
             return self.separate(insider)
         if insider.apart_until is None or now < insider.apart_until:
@@ -123,13 +122,8 @@ class Rediscovery:
         """Part a participant, of which the policy is asked anew then, unless it has gone."""
         if self.inside.by_prefix.get(insider.prefix) is not insider:
             return []
-        try:
-            return self.separate(insider)
-        except RtpsError as error:
-            self.outside.refused("malformed", insider.address, str(error))
-            return []
-        finally:
-            self.inside.verdicts.forget(insider)
+        self.inside.verdicts.forget(insider)
+        return self.separate(insider)
 
     def _next_pair(self) -> list[Outgoing]:
         """What the next participant outside leads to, for one at the address whose turn it is."""

@@ -6,6 +6,7 @@ regular announcement, which may be seconds away.
 
 import struct
 from collections.abc import Iterable
+from functools import lru_cache
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.locators import pack_locator
@@ -45,6 +46,7 @@ def announcement(
     )
 
 
+@lru_cache(1024)
 def farewell(prefix: bytes, vendor: bytes = NO_VENDOR, sequence: int = 2) -> bytes:
     """The datagram by which a participant says that it has ended: its key, with that status.
 

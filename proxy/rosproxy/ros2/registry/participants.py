@@ -151,7 +151,8 @@ class Participant:
 
     ``address`` is where it was found, ``until`` when it counts as gone unless it is heard again.
     ``announcement`` is its last SPDP datagram: of one inside as outside gets it, of one outside as
-    it came. ``endpoints`` are by their entity ids, ``leases`` by its locators.
+    it came. ``next_number`` is the sequence number after that of the announcement. ``endpoints``
+    are by their entity ids, ``leases`` by its locators.
     """
 
     prefix: bytes
@@ -159,6 +160,7 @@ class Participant:
     vendor: bytes
     until: float
     announcement: bytes = b""
+    next_number: int = 1
     metatraffic: HostPort | None = None
     traits: ParticipantTraits = UNKNOWN_TRAITS
     endpoints: dict[bytes, DdsEndpoint] = field(default_factory=dict)
@@ -279,7 +281,8 @@ class OutsideParticipant(Participant):
     ``proven`` to receive. All others are sent no more bytes than came from there; ``credit`` is how
     many are left. ``has_answered``: it has named the proxy's participant, or one inside, and may be
     sent `ANSWERED_FACTOR` times as much. ``has_come_in``: discovery from it has arrived at a port
-    of the range. ``is_introduced``: participants inside are told of it.
+    of the range. ``is_introduced``: participants inside are told of it. ``introduction`` is the
+    announcement as inside gets it, with the proxy's address inside for which it is made.
     """
 
     trusted: bool = False
@@ -287,6 +290,7 @@ class OutsideParticipant(Participant):
     has_answered: bool = False
     has_come_in: bool = False
     is_introduced: bool = False
+    introduction: tuple[str, bytes] | None = None
     credit: int = 0
 
     def note_received(self, datagram: bytes, size: int, addressee: bytes) -> None:

@@ -29,18 +29,21 @@ from rosproxy.ros2.protocol.parameters import (
 from rosproxy.ros2.protocol.reliable import withheld
 from rosproxy.ros2.protocol.rtps import (
     FAST_DDS,
+    HEADER,
     NO_VENDOR,
     PREFIX,
     Fragments,
     Overwrite,
     RtpsError,
     Sample,
+    SubmessageId,
     apply,
     by_source,
     has_checksum,
     samples,
     source_prefix,
     source_vendor,
+    submessages,
 )
 from rosproxy.ros2.registry.participants import EndpointKind
 
@@ -70,6 +73,10 @@ MOST_PARAMETERS_OF_ALL = 4096
 datagram of 64 KiB has 2,700."""
 MOST_LOCATORS_OF_ALL = 1024
 """Locators of all announcements in a datagram. Fast DDS writes five for a reader or writer."""
+
+MOST_ANNOUNCED = 48
+"""Participants that announce themselves in a datagram; all of the other side are told of each.
+Cyclone DDS sends 14,720 bytes at most (MaxMessageSize), and announces a participant in 400."""
 
 
 class BuiltinWriter(IntEnum):
@@ -181,6 +188,16 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
     return message
 
 
+def read_messages(datagram: bytes) -> Iterator[DiscoveryMessage]:
+    """Each participant's message in a datagram. Raises RtpsError."""
+    announced_count = 0
+    for message in map(read_discovery, by_source(datagram)):
+        announced_count += message.of_participant is not None
+        if announced_count > MOST_ANNOUNCED:
+            raise RtpsError(f"more than {MOST_ANNOUNCED} announcements of participants")
+        yield message
+
+
 def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]:
     """Each participant's message in a datagram, and how many of the received bytes are its own.
 
@@ -188,7 +205,7 @@ def credited_messages(datagram: bytes) -> Iterator[tuple[DiscoveryMessage, int]]
     not, so no participant is sent more than came in its name. Raises RtpsError.
     """
     remaining = len(datagram)
-    for message in map(read_discovery, by_source(datagram)):
+    for message in read_messages(datagram):
         received = min(len(message.datagram), remaining)
         remaining -= received
         yield message, received
@@ -208,6 +225,27 @@ def rewritten(
         else:
             edits += _edits(message.datagram, announcement.parameters, lead)
     return apply(message.datagram, edits)
+
+
+def participant_alone(message: DiscoveryMessage) -> bytes:
+    """What a participant announces of itself, without what else the message holds, and for all.
+
+    Cyclone DDS answers the observer with an announcement that is for the observer alone
+    (ddsi_discovery_spdp.c, respond_to_spdp). Readers ask again for the readers and writers that
+    were announced beside it (DDSI-RTPS 2.5, 8.4.9).
+    """
+    datagram = message.datagram
+    spdp = message.of_participant
+    kept = datagram[:HEADER]
+    if spdp is None:
+        return kept
+    stamp = b""
+    for kind, _, body in submessages(datagram):
+        if kind == SubmessageId.INFO_TS:
+            stamp = datagram[body.start - 4 : body.end]
+        if body == spdp.sample.body:
+            return kept + stamp + datagram[body.start - 4 : body.end]
+    return kept
 
 
 def require_rewritable(message: DiscoveryMessage) -> None:

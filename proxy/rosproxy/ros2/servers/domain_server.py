@@ -34,9 +34,9 @@ from rosproxy.ros2.discovery.domain_settings import (
 )
 from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.locators import pack_locator
-from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, by_source
+from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
 from rosproxy.ros2.registry.selected import SelectedAddresses
-from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
 from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
 
@@ -318,7 +318,7 @@ class DomainServer:
             if not self.domain.rates.take(source, len(datagram), now, standing):
                 return []
             with contextlib.suppress(RtpsError):
-                for message in map(read_discovery, by_source(datagram)):
+                for message in read_messages(datagram):
                     if message.of_participant is not None:
                         self._selected.hold(source, message.datagram)
             return []

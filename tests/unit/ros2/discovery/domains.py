@@ -101,6 +101,13 @@ def sedp(prefix: bytes, address: str, port: int, to: bytes = b"") -> bytes:
     return message(*meant, data(payload(parameters), writer=SEDP_WRITERS), prefix=prefix)
 
 
+def next_number(announcement: bytes) -> int:
+    """The sequence number after that of a participant's announcement."""
+    told = read_discovery(announcement).of_participant
+    assert told is not None
+    return told.sample.sequence + 1
+
+
 def reached_at(datagram: bytes) -> list[HostPort]:
     (announcement,) = read_discovery(datagram).announcements
     return [locator for _, locator in announcement.reached_at(datagram)]

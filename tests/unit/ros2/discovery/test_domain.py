@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import outside_participants
-from rosproxy.ros2.discovery.announced_participant import next_number
 from rosproxy.ros2.discovery.discovery_rates import BURST, STEP, cost
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, MOST_PER_ADDRESS, Outgoing
@@ -41,6 +40,7 @@ from tests.unit.ros2.discovery.domains import (
     kept_answer,
     make_domain,
     meet,
+    next_number,
     prove,
     reached_at,
     sedp,

@@ -86,7 +86,7 @@ def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
     meet(domain)
     behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
     (told,) = to(domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW), INSIDE)
-    assert len(told) == len(spdp(B, ROBOT) + behind)
+    assert len(told) == len(spdp(B, ROBOT))
     (ended,) = to(domain.heard_inside(farewell(A) + behind, INSIDE, NOW), ROBOT)
     for sent in (told, ended):
         assert b"chatter" not in sent
@@ -394,7 +394,6 @@ def test_one_whose_announcement_is_bad_keeps_no_policy_from_others() -> None:
     denied.append("/chatter")
     domain.apply_policy(NOW)
     assert domain.inside.by_prefix[A].is_apart
-    assert domain.refused.count == 1
     assert spdp(A, OTHER)[:20] in {
         told[:20] for told in to(settle(domain, NOW + APART_TIME), ROBOT)
     }
@@ -436,7 +435,7 @@ def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forged sources have an allowance each."""
     domain = make_domain()
     meet(domain)
-    monkeypatch.setattr(discovery_domain, "read_discovery", None)
+    monkeypatch.setattr(discovery_domain, "read_messages", None)
     domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
     for port in domain.inside.leases:
         domain.at_lease(port, message(prefix=B), STRANGER, NOW)

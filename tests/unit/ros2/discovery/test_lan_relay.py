@@ -106,7 +106,7 @@ def test_a_proof_from_another_address_is_not_looked_at() -> None:
 def test_nothing_is_read_before_the_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor is anything charged to the relay, whose allowance others would use up."""
     domain = make_domain()
-    for unread in ("read_discovery", "by_source", "unwrapped"):
+    for unread in ("read_messages", "credited_messages", "unwrapped"):
         monkeypatch.setattr(discovery_domain, unread, None)
     for datagram in (CLAIM, made_at(0, "another secret").sealed(Direction.TO_PROXY, CLAIM)):
         assert domain.heard_outside(datagram, EAR.host, NOW) == []
