@@ -4,6 +4,7 @@ A participant outside sends 100 messages a second to one inside meanwhile, throu
 proxy itself relays. A crowd of participants is inside, all of which are told of each announcement.
 """
 
+import struct
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, closing
 from functools import partial
@@ -27,7 +28,7 @@ from tests.abuse.test_ros2_shares import (  # noqa: F401 - fixtures
     robot,
 )
 from tests.integration.net import until
-from tests.unit.ros2.discovery.domains import spdp
+from tests.unit.ros2.discovery.domains import SEDP_WRITERS, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload, submessage
 
 EVIL_PREFIX = bytes([1, 15, 7]) + bytes(9)
@@ -38,6 +39,12 @@ AT_ONE_ADDRESS = 16
 AMONG = 30_000
 """Datagrams of a flood."""
 PER_SECOND = 5000
+NAMED_TO = 20
+"""Participants inside to which names are made up."""
+NAMED_PER_SECOND = 1500
+NAMED_GROWTH = 32_000_000
+"""Bytes by which the proxy may grow then: 13 MB have bounds of their own, and as many go to and
+fro."""
 HEALTHY_S = 0.5
 """Seconds in which the proxy answers a health check. The machine may be busy."""
 
@@ -118,6 +125,42 @@ async def test_many_announce_themselves_at_once(abused, robot, crowd, pair, firs
     assert pair.figures.lost == 0
     assert pair.figures.longest_gap < LONGEST_GAP
     assert health.longest < HEALTHY_S
+
+
+def ports_for_discovery(abused: Abused) -> list[int]:
+    """The ports of the range at which the participants inside get discovery."""
+    (domain,) = abused.status()["domains"]
+    leases = [lease for insider in domain["inside"] for lease in insider["leases"]]
+    return [lease["port"] for lease in leases if lease["kind"] == "metatraffic"]
+
+
+def named(number: int) -> bytes:
+    """What announces a writer of a topic with a name that takes four times its bytes."""
+    name = b"rt/" + f"\U0001f600{number:05d}".encode() + b"x" * 1000 + b"\0" * 4
+    parameters = [
+        (Pid.ENDPOINT_GUID, EVIL_PREFIX + number.to_bytes(3, "big") + b"\3"),
+        (Pid.TOPIC_NAME, struct.pack("<I", len(name)) + name),
+        (Pid.TYPE_NAME, struct.pack("<I", len(name)) + name),
+    ]
+    content = data(payload(parameters), writer=SEDP_WRITERS, sequence=number + 1)
+    return message(content, prefix=EVIL_PREFIX)
+
+
+async def test_a_peer_makes_up_names(abused, robot, crowd, pair, first):  # noqa: F811
+    """For each participant inside the proxy remembered 1,024 names: 86 MB for 20 of them."""
+    robot.meta.sendto(spdp(EVIL_PREFIX, PEER, 9000), (APART_HOST, first))
+    await until(lambda: EVIL_PREFIX.hex() in known_outside(abused), "the hostile one is known")
+    ports = ports_for_discovery(abused)[:NAMED_TO]
+    datagrams = [
+        (PEER, (APART_HOST, port), named(number)) for number in range(1024) for port in ports
+    ]
+    before = abused.most_memory()
+    flood = Flood(datagrams, False, per_second=NAMED_PER_SECOND)
+    with pair, flood:
+        flood.wait(len(datagrams))
+    assert abused.most_memory() - before < NAMED_GROWTH
+    assert pair.figures.lost == 0
+    assert pair.figures.longest_gap < LONGEST_GAP
 
 
 async def test_an_address_repeats_its_answer(abused, robot, crowd, pair, first):  # noqa: F811

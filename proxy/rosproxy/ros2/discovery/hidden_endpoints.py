@@ -17,11 +17,12 @@ from rosproxy.ros2.rewriting.policing import rule_about
 
 MOST_VERDICTS = 1024
 MOST_VERDICTS_PER_ADDRESS = 16_384
-MOST_VERDICTS_IN_ALL = 65_536
+MOST_VERDICTS_IN_ALL = 32_768
 """Verdicts that are remembered of a participant, at an address, and in all; a participant has some
 hundreds. One that has more meets others anew with each change of the policy."""
 LONGEST_NAME = 256
-"""Bytes of a name that is remembered with its verdict. A topic of ROS 2 has 255 at most."""
+"""Characters of a name that is remembered with its verdict; all are of ASCII, as in ROS 2. One wide
+character would make each take four bytes. A topic of ROS 2 has 255 at most."""
 
 
 @dataclass(slots=True)
@@ -77,7 +78,7 @@ class Verdicts:
             return known
         allowed = self.judge(*rule, inside.address)
         _, name = rule
-        if len(name) <= LONGEST_NAME and self._has_room(inside):
+        if len(name) <= LONGEST_NAME and name.isascii() and self._has_room(inside):
             inside.verdicts[rule] = allowed
             self.count_by_address[inside.address] += 1
         else:

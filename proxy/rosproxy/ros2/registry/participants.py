@@ -7,6 +7,7 @@ anybody may write any prefix into a datagram.
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
+from sys import getsizeof
 from typing import Generic, TypeVar
 
 import msgspec
@@ -29,9 +30,13 @@ VENDORS = {
 }
 """Names of implementations, by the vendor id in each message's header (OMG's list). Zero stands for
 none; a proxy's own participants have it."""
-MOST_ENDPOINTS, MOST_ENDPOINTS_PER_ADDRESS, MOST_ENDPOINTS_IN_ALL = 2048, 8192, 65_536
-"""Readers and writers that are remembered, which is for the status alone: of a participant, at an
-address, on a side."""
+MOST_ENDPOINTS = 2048
+MOST_ENDPOINT_BYTES_PER_ADDRESS = 4 * 1024 * 1024
+MOST_ENDPOINT_BYTES = 16 * 1024 * 1024
+"""Readers and writers of a participant that are remembered, which is for the status alone, and the
+bytes that those at an address and on a side take."""
+ENDPOINT_OVERHEAD = 500
+"""Bytes that a reader or writer takes beside its texts."""
 
 
 class LeaseKind(StrEnum):
@@ -74,6 +79,12 @@ class DdsEndpoint(msgspec.Struct, frozen=True):
     topic: str
     type_name: str
     qos: EndpointQos = EndpointQos()
+
+    @property
+    def size(self) -> int:
+        """The bytes that it takes: one character may make all of a text take four bytes each."""
+        texts = (self.topic, self.type_name, *(self.qos.partitions or ()))
+        return ENDPOINT_OVERHEAD + sum(map(getsizeof, texts))
 
 
 class DdsSecurity(StrEnum):
@@ -201,36 +212,42 @@ class Participant:
 
 @dataclass(slots=True)
 class EndpointNotes:
-    """Notes the readers and writers of participants, within bounds for each address and in all."""
+    """Notes the readers and writers of participants, within bounds for each address and in all.
 
-    count_by_address: Counter[str] = field(default_factory=Counter)
-    total: int = 0
+    ``size_by_address`` and ``size`` are in bytes.
+    """
+
+    size_by_address: Counter[str] = field(default_factory=Counter)
+    size: int = 0
 
     def note(self, participant: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
         """Remember a reader or writer; with None, that it has ended."""
-        if participant.endpoints.pop(entity, None) is not None:
-            self._count(participant.address, -1)
-        if endpoint is not None and self._has_room(participant):
+        former = participant.endpoints.pop(entity, None)
+        if former is not None:
+            self._count(participant.address, -former.size)
+        if endpoint is not None and self._has_room(participant, endpoint.size):
             participant.endpoints[entity] = endpoint
-            self._count(participant.address, 1)
+            self._count(participant.address, endpoint.size)
 
     def forget(self, participant: Participant) -> None:
         """Forget those of a participant that has gone."""
-        self._count(participant.address, -len(participant.endpoints))
+        size = sum(endpoint.size for endpoint in participant.endpoints.values())
+        self._count(participant.address, -size)
         participant.endpoints.clear()
 
-    def _has_room(self, participant: Participant) -> bool:
+    def _has_room(self, participant: Participant, size: int) -> bool:
+        at_address = self.size_by_address[participant.address] + size
         return (
             len(participant.endpoints) < MOST_ENDPOINTS
-            and self.count_by_address[participant.address] < MOST_ENDPOINTS_PER_ADDRESS
-            and self.total < MOST_ENDPOINTS_IN_ALL
+            and at_address <= MOST_ENDPOINT_BYTES_PER_ADDRESS
+            and self.size + size <= MOST_ENDPOINT_BYTES
         )
 
     def _count(self, address: str, change: int) -> None:
-        self.total += change
-        self.count_by_address[address] += change
-        if not self.count_by_address[address]:
-            del self.count_by_address[address]
+        self.size += change
+        self.size_by_address[address] += change
+        if not self.size_by_address[address]:
+            del self.size_by_address[address]
 
 
 @dataclass(slots=True)

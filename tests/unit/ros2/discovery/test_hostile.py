@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator
+from sys import getsizeof
 from typing import Any
 
 import pytest
@@ -244,10 +245,25 @@ def test_announcements_and_topics_have_a_length() -> None:
     assert domain.inside.by_prefix.keys() == {A}
 
 
-def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(participants, "MOST_ENDPOINTS_PER_ADDRESS", 5)
-    notes, many = EndpointNotes(), [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
+def test_the_texts_of_an_address_take_so_many_bytes() -> None:
+    """One wide character makes each of a text take four bytes: 8,192 of them took 34 MB."""
+    notes = EndpointNotes()
+    many = [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(4)]
+    for participant in many:
+        for number in range(2048):
+            name = f"\U0001f600{number:05d}" + "x" * 250
+            endpoint = DdsEndpoint(EndpointKind.READER, name, f"{name} ")
+            notes.note(participant, number.to_bytes(4, "big"), endpoint)
+    kept = [endpoint for participant in many for endpoint in participant.endpoints.values()]
+    texts = [text for endpoint in kept for text in (endpoint.topic, endpoint.type_name)]
+    assert kept
+    assert sum(map(getsizeof, texts)) <= 4 * 1024 * 1024
+
+
+def test_readers_and_writers_of_an_address_have_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
     end = DdsEndpoint(EndpointKind.READER, "t", "T")
+    monkeypatch.setattr(participants, "MOST_ENDPOINT_BYTES_PER_ADDRESS", 5 * end.size)
+    notes, many = EndpointNotes(), [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
     for participant in many:
         notes.note(participant, b"0001", end)
         notes.note(participant, b"0001", end)
@@ -255,14 +271,14 @@ def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.Mon
     notes.note(many[0], b"0001", None)
     notes.note(many[8], b"0001", end)
     assert (
-        notes.total
-        == notes.count_by_address[INSIDE]
-        == sum(len(participant.endpoints) for participant in many)
-        == 5
+        notes.size
+        == notes.size_by_address[INSIDE]
+        == sum(len(participant.endpoints) for participant in many) * end.size
+        == 5 * end.size
     )
     for participant in many:
         notes.forget(participant)
-    assert (notes.total, notes.count_by_address) == (0, {})
+    assert (notes.size, notes.size_by_address) == (0, {})
 
 
 def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:

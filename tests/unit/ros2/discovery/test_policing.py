@@ -157,6 +157,7 @@ def test_verdicts_of_one_address_are_bounded(monkeypatch: pytest.MonkeyPatch) ->
     assert {A, NEIGHBOUR} <= {source_prefix(datagram) for datagram in to(parted, ROBOT)}
     assert domain.inside.verdicts.count_by_address.total() == 0
     announced_topics(domain, A, [b"rt/" + bytes([120]) * LONGEST_NAME])
+    announced_topics(domain, A, ["rt/\N{ROBOT FACE}".encode()])
     assert not first.verdicts
     assert first.has_more_verdicts
     announced_topics(domain, A, [b"rt/0"])

@@ -282,8 +282,11 @@ class Neighbours(RuleBasedStateMachine):
         for side in (domain.inside, domain.outside):
             everybody = side.by_prefix.values()
             assert all(len(participant.leases) <= MOST_LEASES for participant in everybody)
-            assert side.notes.total == sum(len(participant.endpoints) for participant in everybody)
-            assert side.notes.total == side.notes.count_by_address.total()
+            endpoints = [e for participant in everybody for e in participant.endpoints.values()]
+            assert side.notes.size == sum(endpoint.size for endpoint in endpoints)
+            assert side.notes.size == side.notes.size_by_address.total()
+        verdicts = [verdict for p in domain.inside.by_prefix.values() for verdict in p.verdicts]
+        assert domain.inside.verdicts.count_by_address.total() == len(verdicts)
         assert {prefix for prefix, _ in domain.own.observer._received} <= prefixes
         keepers = prefixes | domain.returning.waiting.keys()
         assert {*domain.own.keeper.prefixes} <= keepers
