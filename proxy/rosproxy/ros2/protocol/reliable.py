@@ -64,7 +64,7 @@ def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> byt
     body = struct.pack(">II", writer + _TO_READER, writer)
     last = first - 1
     body += struct.pack("<iIiI", first >> 32, first & 0xFFFFFFFF, last >> 32, last & 0xFFFFFFFF)
-    return _directed(own, to, SubmessageId.HEARTBEAT, _LITTLE, body + struct.pack("<i", count))
+    return _directed(own, to, SubmessageId.HEARTBEAT, _LITTLE, body + _packed_count(count))
 
 
 def acknowledged(datagram: bytes, prefix: bytes, writer: int) -> list[int]:
@@ -95,7 +95,7 @@ def acknack(
     # Cyclone DDS ignores one without a reader (ddsi_receive.c, validate_AckNack).
     body = struct.pack(">II", writer + _TO_READER, writer)
     body += struct.pack("<iI", base >> 32, base & 0xFFFFFFFF)
-    body += _bits([number - base for number in missing]) + struct.pack("<i", count)
+    body += _bits([number - base for number in missing]) + _packed_count(count)
     flags = _LITTLE | (_FINAL if final else 0)
     return _directed(own, to, SubmessageId.ACKNACK, flags, body)
 
@@ -109,7 +109,7 @@ def nack_frag(
     """
     body = struct.pack(">II", writer + _TO_READER, writer)
     body += struct.pack("<iII", sequence >> 32, sequence & 0xFFFFFFFF, missing[0])
-    body += _bits([number - missing[0] for number in missing]) + struct.pack("<i", count)
+    body += _bits([number - missing[0] for number in missing]) + _packed_count(count)
     return _directed(own, to, SubmessageId.NACK_FRAG, _LITTLE, body)
 
 
@@ -147,6 +147,11 @@ def _bits(numbers: Collection[int]) -> bytes:
     for number in requested:
         bitmap[number // 32] |= 1 << (31 - number % 32)
     return struct.pack(f"<I{len(bitmap)}I", bit_count, *bitmap)
+
+
+def _packed_count(count: int) -> bytes:
+    """A count, which begins anew after 2^32: a reader tells by the count what it has seen."""
+    return struct.pack("<I", count & 0xFFFFFFFF)
 
 
 def _number(high: int, low: int) -> int:
