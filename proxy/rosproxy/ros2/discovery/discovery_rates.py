@@ -23,9 +23,14 @@ MOST_SOURCES = 4096
 
 
 class Standing(Enum):
-    """What is known of a source. PROVEN: its address has proved to receive, or is a peer's."""
+    """What is known of a source.
+
+    PROVEN: its address is a peer's, or lies inside and has proved to receive. STRANGER: its address
+    is another one outside, and has proved to receive. One machine may have thousands of these.
+    """
 
     PROVEN = auto()
+    STRANGER = auto()
     INSIDE = auto()
     OUTSIDE = auto()
 

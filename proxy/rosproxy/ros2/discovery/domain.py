@@ -148,9 +148,12 @@ class Domain(DomainParticipants):
 
     def standing(self, source: str) -> Standing:
         """What is known of an address."""
-        if self.proofs.has(source) or self.settings.is_peer(source):
+        if self.settings.is_peer(source):
             return Standing.PROVEN
-        return Standing.INSIDE if self.settings.is_inside(source) else Standing.OUTSIDE
+        is_proven = self.proofs.has(source)
+        if self.settings.is_inside(source):
+            return Standing.PROVEN if is_proven else Standing.INSIDE
+        return Standing.STRANGER if is_proven else Standing.OUTSIDE
 
     def is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
         """Whether `heard_outside` reads a datagram, which takes long."""

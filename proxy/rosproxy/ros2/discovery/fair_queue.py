@@ -2,8 +2,9 @@
 
 Reading discovery takes long, and any neighbour may send it. So datagrams wait, and the source goes
 first that has had least of the reading (start-time fair queueing; Goyal, Vin, Cheng: SIGCOMM 1996).
-A forged source costs its sender nothing. So the reading has three parts: for sources that have
-proved to receive and for peers, for other sources inside, and for other sources outside.
+A forged source costs its sender nothing, and one machine may have thousands of addresses. So the
+reading has four parts: for peers and proven sources inside, for proven sources outside, for other
+sources inside, and for other sources outside.
 """
 
 import heapq
@@ -14,7 +15,7 @@ from typing import Generic, NamedTuple, TypeVar
 from rosproxy.ros2.discovery.discovery_rates import Standing
 
 MOST_OF_SOURCE = 1024 * 1024
-MOST_OF_ALL = 4 * 1024 * 1024
+MOST_OF_ALL = 3 * 1024 * 1024
 """Bytes of one source that wait, and bytes that wait of one standing."""
 MOST_KNOWN = 2048
 MOST_UNKNOWN = 256
@@ -136,7 +137,7 @@ class DiscoveryQueue(Generic[Item]):
     def __init__(self) -> None:
         self._queues = {
             standing: FairQueue[Item](
-                MOST_KNOWN if standing is Standing.PROVEN else MOST_UNKNOWN,
+                MOST_KNOWN if standing in (Standing.PROVEN, Standing.STRANGER) else MOST_UNKNOWN,
             )
             for standing in Standing
         }

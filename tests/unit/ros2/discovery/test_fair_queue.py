@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.ros2.discovery.discovery_rates import Standing
-from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue, FairQueue
+from rosproxy.ros2.discovery.fair_queue import MOST_KNOWN, OVERHEAD, DiscoveryQueue, FairQueue
+from tests.unit.ros2.discovery.domains import INSIDE, ROBOT, make_domain, prove
 
 SIZES = st.integers(0, 60_000)
 
@@ -111,6 +112,19 @@ def test_a_thousand_forged_sources_get_their_share_alone() -> None:
         queue.put("node", Standing.INSIDE, number, 500)
     counts = Counter(source.partition(" ")[0] for source in taken(queue, 300))
     assert counts == {"robot": 100, "forged": 100, "node": 100}
+
+
+def test_a_stranger_with_many_addresses_keeps_no_peer_from_being_read() -> None:
+    """Peers and strangers shared their places and the reading: a peer found no place."""
+    domain = make_domain()
+    strangers = [f"2001:db8::{number:x}" for number in range(MOST_KNOWN)]
+    prove(domain, INSIDE, *strangers)
+    queue = DiscoveryQueue[int]()
+    for number, stranger in enumerate(strangers):
+        assert queue.put(stranger, domain.standing(stranger), number, 500)
+    for known in (ROBOT, INSIDE):
+        assert queue.put(known, domain.standing(known), 0, 500)
+    assert {ROBOT, INSIDE} <= set(taken(queue, 4))
 
 
 def test_a_standing_that_has_nothing_to_read_leaves_its_time() -> None:

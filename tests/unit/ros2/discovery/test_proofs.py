@@ -313,6 +313,9 @@ def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
     domain.expire(NOW + 21)
     domain.expire(NOW + 22 + KEPT)
     assert domain.standing(INSIDE) is Standing.INSIDE
+    prove(domain, LAPTOP, ROBOT)
+    assert domain.standing(LAPTOP) is Standing.STRANGER
+    assert domain.standing(ROBOT) is Standing.PROVEN
 
 
 def test_a_process_has_questions_of_its_own() -> None:
