@@ -279,7 +279,7 @@ class Domain(DomainParticipants):
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         prefix, spdp = message.prefix, message.of_participant
-        if source_vendor(message.datagram) == NO_VENDOR:
+        if source_vendor(message.datagram) == NO_VENDOR or self.own.is_own(prefix):
             return []  # a proxy's own participants are not passed on
         if self.proofs.note(source, message.datagram, now):
             return [out for insider in self.inside.prove() for out in self._end_for(insider)]
@@ -323,7 +323,7 @@ class Domain(DomainParticipants):
         received: int,
         now: float,
     ) -> list[Outgoing]:
-        if message.prefix == self.own.observer.prefix:
+        if self.own.is_own(message.prefix):
             return []
         if message.of_participant is None:
             return self._told_outside(message, source, received, now)
@@ -500,7 +500,8 @@ class Domain(DomainParticipants):
         spdp = message.of_participant
         if outsider is not None:
             outsider.has_come_in = True
-        if message.prefix in self.inside.by_prefix or insider.is_apart:
+        is_anothers = message.prefix in self.inside.by_prefix or self.own.is_own(message.prefix)
+        if is_anothers or insider.is_apart:
             return [], []
         back = list[Outgoing]()
         if spdp is not None:

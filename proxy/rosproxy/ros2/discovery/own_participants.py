@@ -37,6 +37,14 @@ class OwnParticipants:
     fragments: FragmentStores
     proofs: AddressProofs
 
+    def is_own(self, prefix: bytes) -> bool:
+        """Whether a GUID prefix is that of one of the proxy's own participants.
+
+        No other participant may use it. The keeper's follows from what all can see, and whatever
+        ends the keeper for those inside has them forget their ports.
+        """
+        return prefix in (self.observer.prefix, self.keeper.prefix, self.keeper.witness)
+
     def announced_inside(self, near: str) -> bytes:
         """The observer's announcement for a network inside, where the proxy has an address."""
         return self.observer.announcement(HostPort(near, self.settings.unicast_port))

@@ -7,6 +7,7 @@ import pytest
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 from tests.unit.ros2.discovery.domains import (
     EAR,
@@ -17,9 +18,11 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
+    farewell,
     make_domain,
     meet,
     spdp,
+    to,
 )
 from tests.unit.ros2.protocol.messages import data, fragment, message, parameter_list, payload
 
@@ -49,6 +52,30 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     yield domain.at_lease(lease.port, outside, ROBOT, NOW)
     yield domain.heard_outside(outside, ROBOT, NOW)
     yield domain.heard_outside(carried(ROBOT, outside), EAR.host, NOW)
+
+
+@pytest.mark.parametrize("whose", ["observer", "keeper", "witness"])
+def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> None:
+    """The end of the keeper, told by any machine on the LAN, had inside forget its ports."""
+    domain = make_domain(keeper_key=b"a key")
+    meet(domain)
+    keeper = domain.own.keeper
+    own = {
+        "observer": domain.own.observer.prefix,
+        "keeper": keeper.prefix,
+        "witness": keeper.witness,
+    }
+    prefix = own[whose]
+    (port,) = [p for p, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410]
+    sent = list[Outgoing]()
+    for said in (spdp(prefix, ROBOT), farewell(prefix)):
+        sent += domain.heard_outside(said, ROBOT, NOW)
+        sent += domain.heard_outside(carried(ROBOT, said), EAR.host, NOW)
+        sent += domain.at_lease(port, said, ROBOT, NOW)
+    for said in (spdp(prefix, OTHER), farewell(prefix)):
+        sent += domain.heard_inside(said, OTHER, NOW)
+    assert prefix not in {source_prefix(datagram) for datagram in to(sent, INSIDE)}
+    assert prefix not in {source_prefix(datagram) for datagram in to(sent, ROBOT)}
 
 
 def said_of(prefix: bytes, pid: int, writer: int) -> dict[str, bytes]:
