@@ -189,9 +189,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         made them up, and each participant inside would remember all of them.
         """
         if not outsider.is_introduced:
-            is_proven = outsider.trusted or outsider.proven
             outsider.is_introduced = (
-                is_proven or len(self._unproven_strangers()) <= MOST_INTRODUCED_UNPROVEN
+                outsider.is_known or len(self._unproven_strangers()) <= MOST_INTRODUCED_UNPROVEN
             )
         return outsider.is_introduced
 
@@ -403,7 +402,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """
         lease = outsider.leases.get(locator)
         if lease is None and len(outsider.leases) < MOST_LEASES:
-            port = stand_in_port(f"{outsider.prefix.hex()} {locator}", self._users, self._is_taken)
+            users = partial(self._users, outsider.is_known)
+            port = stand_in_port(f"{outsider.prefix.hex()} {locator}", users, self._is_taken)
             if port is not None:
                 lease = outsider.leases[locator] = Lease(port, locator, kind)
                 self.stand_ins.setdefault(port, []).append((outsider, lease))
@@ -419,8 +419,14 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Whether a locator is a port of the proxy itself: a stand-in there would lead inside."""
         return is_proxy_port(locator, self.stand_ins, self.settings)
 
-    def _users(self, port: int) -> int:
-        return len(self.stand_ins.get(port, ()))
+    def _users(self, for_known: bool, port: int) -> int:
+        """How many participants keep one more from a port; ``for_known`` is what that one is.
+
+        A forger can choose prefixes that lead to the port of another participant. If that one lost
+        the port after a restart, Fast DDS inside would go on sending there (PDPListener.cpp).
+        """
+        users = self.stand_ins.get(port, ())
+        return sum(outsider.is_known or not for_known for outsider, _ in users)
 
     def _is_taken(self, port: int) -> bool:
         return port in self.blocked or port in self.settings.ports.listen

@@ -38,7 +38,7 @@ MOST_NAMED = 8
 """Participants that may be named at one port; more tell nothing. One that is named for both kinds
 counts twice."""
 MOST_SHARING = 3
-"""Locators outside that one port may stand for."""
+"""Locators outside that one port may stand for; as many of forged participants do not count."""
 SETTLING = 1.0
 """Seconds from the start in which no port is given, to hear first whom outside means by each."""
 REMEMBERED = 30.0

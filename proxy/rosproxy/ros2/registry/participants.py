@@ -310,6 +310,11 @@ class OutsideParticipant(Participant):
     introduction: tuple[str, bytes] | None = None
     credit: int = 0
 
+    @property
+    def is_known(self) -> bool:
+        """Whether its address is a peer's, or has proved to receive."""
+        return self.trusted or self.proven
+
     def note_received(self, datagram: bytes, size: int, addressee: bytes) -> None:
         """Note a message of the participant's, for which ``size`` bytes have come.
 
@@ -322,7 +327,7 @@ class OutsideParticipant(Participant):
 
     def may_be_sent(self, size: int) -> bool:
         """Whether so many bytes may go to it; if so, they are taken off its credit."""
-        if self.trusted or self.proven:
+        if self.is_known:
             return True
         if self.credit < size:
             return False

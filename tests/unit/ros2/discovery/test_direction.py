@@ -1,6 +1,7 @@
 """Both directions by the proxy: stand-ins for what those outside have, and nothing else."""
 
 import struct
+from itertools import count, islice
 from math import inf
 
 import pytest
@@ -10,18 +11,22 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.locator_ports import MOST_SHARING
+from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS, order_for
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
+    EAR,
     INSIDE,
     NEAR,
     NOW,
     OTHER,
     ROBOT,
     SEDP_WRITERS,
+    STRANGER,
     A,
     B,
+    carried,
+    make_domain,
     meet,
     reached_at,
     sedp,
@@ -178,3 +183,24 @@ def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:
     assert port not in domain.outside.stand_ins
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     assert port in domain.outside.stand_ins
+
+
+def test_forged_participants_do_not_take_the_port_of_a_peer_before_it_comes() -> None:
+    """After a restart Fast DDS inside went on sending to the port that these had taken."""
+    (before,) = told_port(make_domain())
+    wanted = f"{STRANGER}:7410"
+    prefixes = (b"\x01\x0f" + number.to_bytes(10, "big") for number in count())
+    chosen = (p for p in prefixes if next(order_for(f"{p.hex()} {wanted}", STAND_INS)) == before)
+    domain = make_domain()
+    meet(domain)
+    for prefix in islice(chosen, MOST_SHARING):
+        domain.heard_outside(carried(STRANGER, spdp(prefix, STRANGER)), EAR.host, NOW)
+    assert len(domain.outside.stand_ins[before]) == MOST_SHARING
+    assert told_port(domain) == [before]
+
+
+def told_port(domain: Domain) -> list[int]:
+    """The ports at which inside is told that the peer gets discovery."""
+    meet(domain)
+    told = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    return [reached_at(datagram)[0].port for datagram in told]

@@ -263,7 +263,7 @@ class Neighbours(RuleBasedStateMachine):
         outside = self.domain.outside
         for port, users in outside.stand_ins.items():
             assert port not in outside.blocked
-            assert 0 < len(users) <= MOST_SHARING
+            assert 0 < len(users) <= 2 * MOST_SHARING
             for participant, lease in users:
                 assert outside.by_prefix[participant.prefix] is participant
                 assert participant.leases[lease.target] is lease
