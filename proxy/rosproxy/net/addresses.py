@@ -86,6 +86,18 @@ def is_of_link(host: str) -> bool:
 
 
 @cached
+def subnet(address: str) -> str:
+    """An IPv4 address itself, and of an IPv6 address its network of 64 bits.
+
+    One machine has any number of the addresses in such a network (RFC 4291, 2.5.1; RFC 8981).
+    """
+    parsed = as_ip(address)
+    if parsed is None or parsed.version == 4:
+        return address
+    return str(IPv6Network((parsed, 64), strict=False))
+
+
+@cached
 def plain_address(address: str) -> str:
     """An IP address without an IPv4-in-IPv6 prefix (``::ffff:``) and without a zone."""
     bare = address.partition("%")[0]

@@ -110,12 +110,12 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             unproven = (p for p in self._answering(False) if p.address == source)
             return next(unproven, None) if has_answered else None
         if has_answered:
-            return fairer_place(self._answering(True), MOST_INSIDE, source)
+            return fairer_place(self._answering(True), MOST_INSIDE, source, str)
         return oldest_unproven(self._answering(False), MOST_INSIDE_UNPROVEN)
 
     def prove(self) -> list[InsideParticipant]:
         """The participants that end, as more than have room have answered now."""
-        return surplus(self._answering(True), MOST_INSIDE)
+        return surplus(self._answering(True), MOST_INSIDE, str)
 
     def _why_no_place(self, prefix: bytes, source: str) -> str:
         """Why a new participant at an address gets no place; empty if it gets one."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from math import inf
 
-from rosproxy.net.addresses import HostPort, is_loopback, is_of_link
+from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
@@ -178,7 +178,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """
         for outsider in self.at(address):
             outsider.proven = True
-        ended = surplus(self._proven_strangers(), MOST_OUTSIDE)
+        ended = surplus(self._proven_strangers(), MOST_OUTSIDE, subnet)
         told = [p for p in self.at(address) if not p.is_introduced and p not in ended]
         return told, ended
 
@@ -295,7 +295,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         if self.settings.is_peer(source) or self._is_full(source):
             return None
         if self.proofs.has(source):
-            return fairer_place(self._proven_strangers(), MOST_OUTSIDE, source)
+            return fairer_place(self._proven_strangers(), MOST_OUTSIDE, source, subnet)
         return oldest_unproven(self._unproven_strangers(), MOST_OUTSIDE_UNPROVEN)
 
     def _why_no_place(self, source: str) -> str:

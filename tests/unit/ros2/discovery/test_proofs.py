@@ -153,6 +153,21 @@ def test_no_address_takes_the_place_of_another_that_has_fewer() -> None:
     assert domain.outside.count_by_address.total() == MOST_OUTSIDE
 
 
+def test_many_addresses_of_one_machine_take_no_places_of_others() -> None:
+    """A machine has any number of IPv6 addresses: of 20 participants of a laptop one was left."""
+    domain = make_domain(peers=())
+    addresses = [f"2001:db8::{number:x}" for number in range(1, MOST_OUTSIDE + 11)]
+    prove(domain, LAPTOP, STRANGER, *addresses)
+    for number in range(20):
+        hear(domain, named(number), LAPTOP)
+    for number, address in enumerate(addresses):
+        hear(domain, named(100 + number), address)
+    assert domain.outside.count_by_address[LAPTOP] == 20
+    hear(domain, NEIGHBOUR, STRANGER)
+    assert NEIGHBOUR in domain.outside.by_prefix
+    assert len(domain.outside.by_prefix) == MOST_OUTSIDE
+
+
 def test_a_place_that_is_given_up_is_told_inside() -> None:
     domain = make_domain()
     meet(domain)
