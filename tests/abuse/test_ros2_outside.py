@@ -43,8 +43,8 @@ NAMED_TO = 20
 """Participants inside to which names are made up."""
 NAMED_PER_SECOND = 1500
 NAMED_GROWTH = 32_000_000
-"""Bytes by which the proxy may grow then: 13 MB have bounds of their own, and as many go to and
-fro."""
+"""Bytes by which the proxy may grow then. The names may take 13 MB, and datagrams that wait some
+more."""
 HEALTHY_S = 0.5
 """Seconds in which the proxy answers a health check. The machine may be busy."""
 
@@ -147,7 +147,7 @@ def named(number: int) -> bytes:
 
 
 async def test_a_peer_makes_up_names(abused, robot, crowd, pair, first):  # noqa: F811
-    """For each participant inside the proxy remembered 1,024 names: 86 MB for 20 of them."""
+    """The proxy remembered 1,024 names for each participant inside: 86 MB for 20 of these."""
     robot.meta.sendto(spdp(EVIL_PREFIX, PEER, 9000), (APART_HOST, first))
     await until(lambda: EVIL_PREFIX.hex() in known_outside(abused), "the hostile one is known")
     ports = ports_for_discovery(abused)[:NAMED_TO]

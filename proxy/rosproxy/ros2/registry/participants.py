@@ -162,8 +162,9 @@ class Participant:
 
     ``address`` is where it was found, ``until`` when it counts as gone unless it is heard again.
     ``announcement`` is its last SPDP datagram: of one inside as outside gets it, of one outside as
-    it came. ``next_number`` is the sequence number after that of the announcement. ``endpoints``
-    are by their entity ids, ``leases`` by its locators.
+    it came, without what else the datagram held (`participant_alone`). ``next_number`` is the
+    sequence number after that of the announcement. ``endpoints`` are by their entity ids,
+    ``leases`` by its locators.
     """
 
     prefix: bytes
