@@ -12,6 +12,7 @@ from examples.demo.fake_http import free_ports
 from rosproxy.admin.status_bounds import MOST_BYTES
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.registry.participants import MOST_ENDPOINT_BYTES_PER_ADDRESS
 from rosproxy_operator.common.proxy_client import ProxyClient
 from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
 from tests.abuse.conftest import Abused
@@ -21,13 +22,15 @@ from tests.unit.ros2.discovery.domains import SEDP_WRITERS, spdp
 from tests.unit.ros2.protocol.messages import data, message, payload
 
 NAMES_OF_WRITERS = 64 * 1024 * 1024
-"""Bytes that the names of 40,960 writers may take, which the proxy remembers."""
+"""Bytes that writers of five addresses may take, and a status of them while it is made."""
 GOOD = bytes([1, 15, 1]) + bytes(9)
 EVIL = NODES[1:6]
 PORTS = 64
 ANNOUNCED = APART, WELL_KNOWN
 PARTICIPANTS, WRITERS = 4, 2048
-"""Participants at one address, and writers of each: as many as the proxy remembers."""
+"""Participants at one address, and writers of each: more than the proxy remembers."""
+WRITER_BYTES = 1200
+"""Bytes that such a writer takes at most."""
 PER_SECOND = 1000
 """Datagrams that the addresses send in a second: less than the proxy reads of five."""
 READERS = 32
@@ -104,8 +107,8 @@ async def announce_many(abused: Abused) -> None:
         for datagram in writers(address, number)
     ]
     with Flood(said, is_forged=False, per_second=PER_SECOND):
-        expected = len(EVIL) * PARTICIPANTS * WRITERS
-        await until(lambda: told_writers(abused) > 0.95 * expected, "all are known", 120)
+        remembered = len(EVIL) * MOST_ENDPOINT_BYTES_PER_ADDRESS / WRITER_BYTES
+        await until(lambda: told_writers(abused) >= remembered, "as many are known", 120)
 
 
 async def test_a_status_of_many_writers_with_long_names(abused: Abused) -> None:

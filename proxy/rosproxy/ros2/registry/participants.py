@@ -32,7 +32,7 @@ VENDORS = {
 none; a proxy's own participants have it."""
 MOST_ENDPOINTS = 2048
 MOST_ENDPOINT_BYTES_PER_ADDRESS = 4 * 1024 * 1024
-MOST_ENDPOINT_BYTES = 16 * 1024 * 1024
+MOST_ENDPOINT_BYTES = 32 * 1024 * 1024
 """Readers and writers of a participant that are remembered, which is for the status alone, and the
 bytes that those at an address and on a side take."""
 ENDPOINT_OVERHEAD = 500
