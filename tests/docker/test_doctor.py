@@ -92,6 +92,9 @@ def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named
         )
         assert docker("exec", the_proxy().name, "python3", "-c", code_here, url, body) == "400"
         assert "the operator's policy: refused" in waiting.once("status", check=False)
+        # The master stays for the next test: a node that is still registered is a finding there.
+        node.remove()
+        wait_until(lambda: not named.uri(node.node), 60, process.logs)
     finally:
         process.stop()
         remove_proxies()
