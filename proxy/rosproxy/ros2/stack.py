@@ -123,6 +123,7 @@ class Ros2:
                 ports=ports,
                 proxy_address_for=address_towards,
                 note=self._runtime.refusals.note,
+                settled=self._runtime.refusals.settle,
                 judge=self._is_allowed,
                 is_inside=self._is_inside,
                 both_ways=settings.direction == "both",

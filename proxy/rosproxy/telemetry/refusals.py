@@ -8,7 +8,7 @@ that reason for some minutes.
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
@@ -34,20 +34,35 @@ LINES = 20
 """Sources that are logged in that time for one reason: sources of datagrams may be forged."""
 MOST = 1000
 """Sources and reasons that are remembered for that."""
+MOST_SOURCES = 256
+"""Sources of a span that are remembered. A span with more sources ends by a pause alone."""
 
 
 @dataclass(slots=True)
 class _Span:
-    """A time in which something was refused for one reason again and again, in seconds."""
+    """A time in which something was refused for one reason again and again, in seconds.
+
+    ``sources`` are those of the refusals that have not settled.
+    """
 
     first: float
     last: float
+    sources: set[str] = field(default_factory=set)
 
-    def extend(self, now: float) -> None:
-        """Take in a refusal; after a pause a new span begins."""
+    def extend(self, source: str, now: float) -> None:
+        """Take in a refusal; after a pause, or when all sources have settled, a span begins."""
         if now - self.last > PAUSE:
+            self.sources.clear()
+        if not self.sources:
             self.first = now
         self.last = now
+        if len(self.sources) < MOST_SOURCES:
+            self.sources.add(source)
+
+    def settle(self, source: str) -> None:
+        """Note that the participant of a source has been met."""
+        if len(self.sources) < MOST_SOURCES:
+            self.sources.discard(source)
 
     @property
     def length(self) -> float:
@@ -75,7 +90,7 @@ class Refusals:
         now = self._now()
         key = reason, source
         span = self._spans.setdefault(reason, _Span(now, now))
-        span.extend(now)
+        span.extend(source, now)
         if reason in OF_STARTS and span.length < PATIENCE:
             return
         if now - self._logged_at.get(key, -QUIET) < QUIET:
@@ -94,6 +109,14 @@ class Refusals:
         log.warning("%s, from %s: %s", subject, source, text)
         self._problems.solved(subject)
         self._problems.add(subject, f"from {source}: {text}")
+
+    def settle(self, source: str) -> None:
+        """Note that a participant has been met: what its start has brought is over.
+
+        A node that crashes again and again starts each time.
+        """
+        for reason in OF_STARTS & self._spans.keys():
+            self._spans[reason].settle(source)
 
     def end_old(self) -> None:
         """End the problems that tell refusals which are over."""

@@ -7,6 +7,7 @@ from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import (
     LINES,
     MOST,
+    MOST_SOURCES,
     OF_STARTS,
     OVER_AFTER,
     PATIENCE,
@@ -100,3 +101,41 @@ def test_what_goes_on_after_a_start_is_told(caplog: pytest.LogCaptureFixture) ->
     (problem,) = problems.all()
     assert problem.text == "from 10.0.0.2: x"
     assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize("reason", sorted(OF_STARTS))
+def test_a_node_that_starts_again_and_again_is_not_told(reason: str) -> None:
+    """Its participant is met each time."""
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for started in range(30):
+        clock[0] = float(started)
+        refusals.note(reason, "10.0.0.5", "x")
+        refusals.settle("10.0.0.5")
+    assert not problems.all()
+
+
+def test_another_source_that_settles_hides_nothing() -> None:
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for started in range(12):
+        clock[0] = float(started)
+        refusals.note("not_a_peer", "10.0.0.6", "x")
+        refusals.note("not_a_peer", "10.0.0.5", "x")
+        refusals.settle("10.0.0.5")
+    assert problems.all()
+
+
+def test_many_forged_sources_that_settle_hide_nothing() -> None:
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for number in range(2 * MOST_SOURCES):
+        clock[0] = number / 40
+        refusals.note("not_a_peer", str(number), "x")
+    for number in range(2 * MOST_SOURCES):
+        refusals.settle(str(number))
+    refusals.note("not_a_peer", "10.0.0.5", "x")
+    assert problems.all()

@@ -43,6 +43,8 @@ Judge = Callable[[RuleKind, str, str], bool]
 """Whether a kind of rule allows a name to the participant inside at an address."""
 Note = Callable[[str, str, str], None]
 """Called with each refusal: its reason in one word, the source, and a text."""
+Settled = Callable[[str], None]
+"""Called with the address of each participant that is met."""
 
 
 @dataclass(slots=True)
@@ -89,7 +91,7 @@ class DomainSettings:
     ``proxy_address_for`` gives the proxy's own address that an address inside reaches.
     ``is_inside`` tells whether an address lies in an inside network. ``participants_at`` counts the
     participants outside that are known at an address. ``gateways`` are those of the proxy's
-    default routes.
+    default routes. ``settled`` is called with the address of each participant that is met.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
     ``keeper_key`` proves which ports participants had (`port_keeper.keeper_key`).
     """
@@ -107,6 +109,7 @@ class DomainSettings:
     keeper_key: bytes = field(default=b"", repr=False)
     participants_at: Callable[[str], int] = lambda _: 0
     gateways: frozenset[str] = frozenset()
+    settled: Settled = lambda _: None
 
     @property
     def host(self) -> str:

@@ -86,6 +86,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             participant = InsideParticipant(prefix, source, source_vendor(datagram), now)
             participant.proxy_address = self.settings.proxy_address_for(source)
             self.add(participant)
+            self.settings.settled(source)
         self._make_room(participant, spdp, datagram)
         if participant.note_vendor(source_vendor(datagram)):
             self._mark_read(source)

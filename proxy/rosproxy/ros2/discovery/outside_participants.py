@@ -334,6 +334,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         outsider.trusted = self.settings.is_peer(source)
         outsider.proven = self.proofs.has(source)
         self.add(outsider)
+        self.settings.settled(source)
         return outsider
 
     def _imported(
