@@ -274,9 +274,10 @@ class ParticipantStatus(msgspec.Struct, frozen=True):
 
     ``leases`` are ports of the range for one inside; for one outside its stand-ins, which inside
     reaches. ``kept``: one inside keeps them for when the proxy starts again. ``proven``: one
-    outside gets in at ports of the range. ``problem``: what it lacks. ``domain``: that which it
-    says it is in. ``security``, ``locator_fault`` and ``shortage``, the kind of ``problem``, are
-    of `rosproxy.ros2.registry.participants`. ``types`` are those of the topics and services.
+    outside gets in at ports of the range, or has not been known for long enough to tell.
+    ``problem``: what it lacks. ``domain``: that which it says it is in. ``security``,
+    ``locator_fault`` and ``shortage``, the kind of ``problem``, are of
+    `rosproxy.ros2.registry.participants`. ``types`` are those of the topics and services.
     """
 
     guid_prefix: str = ""

@@ -187,7 +187,7 @@ class Ros2State(Collector):
 
     def _outside(self, participant: OutsideParticipant, most: int) -> document.ParticipantStatus:
         status = self._status_of(participant, most)
-        return msgspec.structs.replace(status, proven=participant.has_come_in)
+        return msgspec.structs.replace(status, proven=participant.comes_in)
 
     def _status_of(self, participant: Participant, most: int) -> document.ParticipantStatus:
         endpoints = list(islice(participant.endpoints.values(), most))

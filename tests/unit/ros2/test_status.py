@@ -16,7 +16,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.participants import Lease, Participant
+from rosproxy.ros2.registry.participants import COMES_IN_WITHIN_S, Lease, Participant
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.status import Ros2State
 from tests.unit.ros2.discovery import domains
@@ -175,3 +175,17 @@ def test_metrics_tell_how_many_have_not_proved_to_receive() -> None:
     assert values["rosproxy_ros2_participants", "inside"] == 2
     assert values["rosproxy_ros2_unproven_participants", "inside"] == 1
     assert values["rosproxy_ros2_unproven_participants", "outside"] == 0
+
+
+def test_outside_comes_in_or_may_still_do_so() -> None:
+    """A participant that crashed at once was reported as one that does not reach the range."""
+    domain = make_domain()
+    domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    for seconds, is_proven in ((0.0, True), (COMES_IN_WITHIN_S, False)):
+        domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + seconds)
+        (outside,) = told(domain).outside
+        assert outside.proven is is_proven
+    port = next(iter(domain.inside.leases))
+    domain.at_lease(port, spdp(B, ROBOT), ROBOT, NOW + COMES_IN_WITHIN_S)
+    (outside,) = told(domain).outside
+    assert outside.proven

@@ -106,6 +106,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             return None
         participant = participant or self._add(prefix, datagram, source, now)
         if participant is not None:
+            participant.heard_at = now
             participant.until = now + lease_duration(spdp, datagram)
             participant.metatraffic = metatraffic
             self._keep(participant, message)
@@ -331,6 +332,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             self.refused("participants", source, reason)
             return None
         outsider = OutsideParticipant(prefix, source, source_vendor(datagram), now)
+        outsider.met_at = now
         outsider.trusted = self.settings.is_peer(source)
         outsider.proven = self.proofs.has(source)
         self.add(outsider)

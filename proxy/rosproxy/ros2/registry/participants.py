@@ -286,6 +286,8 @@ class InsideParticipant(Participant):
         return [lease.port for lease in self.leases.values()]
 
 
+COMES_IN_WITHIN_S = 2.0
+"""Seconds after which a participant that announces itself has sent discovery to the range."""
 ANSWERED_FACTOR = 3
 """Bytes for each byte that has come, to a participant that has answered but not proved to receive.
 Where DDS Security authenticates participants, they don't answer the question that proves it."""
@@ -301,6 +303,7 @@ class OutsideParticipant(Participant):
     sent `ANSWERED_FACTOR` times as much. ``has_come_in``: discovery from it has arrived at a port
     of the range. ``is_introduced``: participants inside are told of it. ``introduction`` is the
     announcement as inside gets it, with the proxy's address inside for which it is made.
+    ``met_at`` and ``heard_at`` are when it announced itself for the first and for the last time.
     """
 
     trusted: bool = False
@@ -310,11 +313,21 @@ class OutsideParticipant(Participant):
     is_introduced: bool = False
     introduction: tuple[str, bytes] | None = None
     credit: int = 0
+    met_at: float = 0.0
+    heard_at: float = 0.0
 
     @property
     def is_known(self) -> bool:
         """Whether its address is a peer's, or has proved to receive."""
         return self.trusted or self.proven
+
+    @property
+    def comes_in(self) -> bool:
+        """Whether discovery from it arrives at ports of the range, or still may.
+
+        A participant that does not announce itself again may have crashed at once.
+        """
+        return self.has_come_in or self.heard_at - self.met_at < COMES_IN_WITHIN_S
 
     def note_received(self, datagram: bytes, size: int, addressee: bytes) -> None:
         """Note a message of the participant's, for which ``size`` bytes have come.
