@@ -114,6 +114,14 @@ class Lab:
         document: dict[str, Any] = json.loads(self._get("/graph"))
         return document
 
+    def told(self) -> set[str]:
+        """What the proxy reports: its problems, and the findings and broken links of its page."""
+        page = self.page()
+        findings = [finding["text"] for finding in page.get("findings", ())]
+        broken = [link["text"] for link in page["links"].values() if link["state"] == "broken"]
+        problems = [f"{problem.subject}: {problem.text}" for problem in self.status().problems]
+        return {*problems, *findings, *broken}
+
     def _get(self, path: str) -> bytes:
         with self.place(self.proxy_role).entered():
             asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)

@@ -7,11 +7,12 @@ import time
 import pytest
 
 from tests.ros.processes import Process, wait_until
-from tests.ros2.lab import Lab
+from tests.ros2.lab import PROGRAMS, Lab
 
 EAR = True
 WATCHED = 60.0
 """Seconds in which nothing may be told."""
+LIVES = 15
 
 
 @pytest.fixture(autouse=True)
@@ -21,15 +22,6 @@ def _both_ways_out(lab: Lab) -> None:
     lab.proxy.stop()
     lab.options = ("--ros2-peer", lab.topology.plan.robot, "--ros2-ear", f"{lab.gateway}:47090")
     lab.start_proxy()
-
-
-def told(lab: Lab) -> set[str]:
-    """What the proxy tells by itself: problems, and findings on its live page."""
-    page = lab.page()
-    shown = [finding["text"] for finding in page.get("findings", ())]
-    broken = [link["text"] for link in page["links"].values() if link["state"] == "broken"]
-    problems = [f"{problem.subject}: {problem.text}" for problem in lab.status().problems]
-    return {*problems, *shown, *broken}
 
 
 def test_nothing_is_told_from_the_start_on(lab: Lab) -> None:
@@ -42,7 +34,7 @@ def test_nothing_is_told_from_the_start_on(lab: Lab) -> None:
     seen = set[str]()
     started = time.monotonic()
     while time.monotonic() - started < WATCHED:
-        seen |= told(lab)
+        seen |= lab.told()
         time.sleep(0.5)
     for reader in readers:
         reader.wait_for_count("^got hello ", 20)
@@ -52,6 +44,31 @@ def test_nothing_is_told_from_the_start_on(lab: Lab) -> None:
     wait_until("all are known again", lambda: len(lab.domain().inside) == 6, 60)
     started = time.monotonic()
     while time.monotonic() - started < WATCHED / 2:
-        seen |= told(lab)
+        seen |= lab.told()
         time.sleep(0.5)
+    assert not seen
+
+
+@pytest.mark.parametrize("vendor", sorted(PROGRAMS))
+@pytest.mark.parametrize(
+    ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
+)
+def test_a_node_that_crashes_again_and_again(lab: Lab, vendor: str, source: str, sink: str) -> None:
+    """A new process at a port ends the former one, which would be known for its lease duration.
+
+    Cyclone DDS takes another port each time. There are `LIVES`, since what a start brings for a
+    moment is told once it goes on for ten seconds.
+    """
+    reader = lab.node("jazzy", sink, "sub", topic="/chatter")
+    seen = set[str]()
+    for number in range(LIVES):
+        word = f"life-{number}"
+        writer = lab.node(vendor, source, "pub", name="crasher", topic="/chatter", word=word)
+        writer.wait_for("^sent 8")
+        if vendor != "cyclone":
+            lab.wait_for_participants(1, 1)
+        seen |= lab.told()
+        if number < LIVES - 1:
+            writer.kill()
+    reader.wait_for_count(f"^got life-{LIVES - 1} ", 5)
     assert not seen

@@ -10,7 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
-from rosproxy.ros2.protocol.rtps import FAST_DDS
+from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS
 from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault, ShortageKind
 from rosproxy.telemetry.text import plural
 
@@ -30,7 +30,7 @@ class DomainProblem(msgspec.Struct, frozen=True):
     owner: str = ""
 
 
-_FAST_DDS_NAME, _CYCLONE_DDS_NAME = VENDORS[FAST_DDS], VENDORS[b"\x01\x10"]
+_FAST_DDS_NAME, _CYCLONE_DDS_NAME = VENDORS[FAST_DDS], VENDORS[CYCLONE_DDS]
 _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.TCP: (
         "it is reached by TCP alone, and the proxy passes on UDP",

@@ -10,9 +10,10 @@ An address that has proved to receive may be forged as any other. So each partic
 for itself: a question names the participant (INFO_DST), and no other one answers.
 """
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from typing import Any
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
@@ -27,7 +28,7 @@ from rosproxy.ros2.protocol.rtps import (
     source_prefix,
     submessages,
 )
-from rosproxy.ros2.registry.participants import Participant
+from rosproxy.ros2.registry.participants import ParticipantTable
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 LEASE_DURATION = 12.0
@@ -114,25 +115,26 @@ class AddressProofs:
             del answered[next(iter(answered))]
         return True
 
-    def expire(
-        self, now: float, inside: Mapping[bytes, Participant], *present: Container[str]
-    ) -> None:
+    def forget(self, address: str, prefix: bytes) -> None:
+        """Forget the answer of a participant."""
+        self._answered.get(address, {}).pop(prefix, None)
+
+    def expire(self, now: float, *present: ParticipantTable[Any]) -> None:
         """Forget addresses without a participant, and answers of participants that have gone.
 
-        ``inside`` are the participants inside, ``present`` the addresses with participants.
+        ``present`` are the participants of both sides.
         """
         for address, until in list(self._until.items()):
-            if any(address in addresses for addresses in present):
+            if any(address in table.count_by_address for table in present):
                 self._renew(address, now)
             elif until < now:
                 del self._until[address]
-        self._expire_answers(now, inside)
+        self._expire_answers(now, present)
 
-    def _expire_answers(self, now: float, inside: Mapping[bytes, Participant]) -> None:
+    def _expire_answers(self, now: float, present: Iterable[ParticipantTable[Any]]) -> None:
         for address, answered in list(self._answered.items()):
             for prefix, until in list(answered.items()):
-                participant = inside.get(prefix)
-                if participant is not None and participant.address == address:
+                if any(table.find(prefix, address) for table in present):
                     answered[prefix] = now + ANSWER_KEPT
                 elif until < now:
                     del answered[prefix]

@@ -30,7 +30,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from rosproxy.ros2.discovery.claimed_addresses import claim_fault
-from rosproxy.ros2.discovery.discovery_rates import Standing, cost
+from rosproxy.ros2.discovery.discovery_rates import cost
 from rosproxy.ros2.discovery.domain_participants import DomainParticipants
 from rosproxy.ros2.discovery.domain_settings import LanRelay, Outgoing, sent_to
 from rosproxy.ros2.protocol.addressing import (
@@ -47,7 +47,6 @@ from rosproxy.ros2.protocol.rtps import (
     source_prefix,
     source_vendor,
 )
-from rosproxy.ros2.registry.locator_ports import NamedBy
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
@@ -145,15 +144,6 @@ class Domain(DomainParticipants):
             sent += self._drop("malformed", source, str(error))
         self._charge(source, sent)
         return sent
-
-    def standing(self, source: str) -> Standing:
-        """What is known of an address."""
-        if self.settings.is_peer(source):
-            return Standing.PROVEN
-        is_proven = self.proofs.has(source)
-        if self.settings.is_inside(source):
-            return Standing.PROVEN if is_proven else Standing.INSIDE
-        return Standing.STRANGER if is_proven else Standing.OUTSIDE
 
     def is_read_at_discovery(self, datagram: bytes, source: str) -> bool:
         """Whether `heard_outside` reads a datagram, which takes long."""
@@ -282,7 +272,8 @@ class Domain(DomainParticipants):
         if source_vendor(message.datagram) == NO_VENDOR or self.own.is_own(prefix):
             return []  # a proxy's own participants are not passed on
         if self.proofs.note(source, message.datagram, now):
-            return [out for insider in self.inside.prove() for out in self._end_for(insider)]
+            sent = self._end_former_processes(prefix, source)
+            return sent + [out for p in self.inside.prove() for out in self._end_for(p)]
         if spdp is None:
             return self.own.told_inside(message, source, now)
         if spdp.ended:
@@ -356,10 +347,11 @@ class Domain(DomainParticipants):
         """Take in what a participant outside tells the proxy's own. Raises RtpsError."""
         sent = list[Outgoing]()
         if self.proofs.note(source, message.datagram, now):
+            sent += self._end_former_processes(message.prefix, source)
             told, ended = self.outside.prove(source)
             inside = self.inside.by_prefix.values()
             sent += [out for outsider in ended for out in self._end_outside(outsider, inside)]
-            sent += self.outside.introduced(told, self.inside.by_prefix.values(), now)
+            sent += self.outside.introduced(told, inside, now)
         return sent + self.own.told_outside(message, source, received)
 
     def _announced_outside(
@@ -409,6 +401,7 @@ class Domain(DomainParticipants):
                 sent += self.own.question_to_announced(message, source)
             return sent
         if is_new:
+            sent += self._end_former_processes(prefix, source)  # it has answered while it waited
             insider.was_inside = self.returning.was_inside(prefix)
             holders = self.ports.displaced_by(prefix, now)
             sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
@@ -554,14 +547,6 @@ class Domain(DomainParticipants):
         if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
             return
         self.ports.note_use(port, datagram, self._named_by(source), now)
-
-    def _named_by(self, source: str) -> NamedBy:
-        """How much it counts that an address outside names a participant."""
-        if self.settings.is_peer(source):
-            return NamedBy.PEER
-        # A participant inside proves its address, too, and sends to ports of the range.
-        is_proven = self.proofs.has(source) and not self.settings.is_inside(source)
-        return NamedBy.PROVEN if is_proven else NamedBy.OTHERS
 
     def _charge(self, source: str, sent: Sequence[Outgoing]) -> None:
         """Charge a source with the datagrams that its own have led to."""

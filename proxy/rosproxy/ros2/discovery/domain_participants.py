@@ -11,7 +11,7 @@ from typing import Self
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.address_proofs import AddressProofs
-from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
+from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates, Standing
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
@@ -24,7 +24,7 @@ from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.announcement import farewell
-from rosproxy.ros2.registry.locator_ports import LocatorPorts
+from rosproxy.ros2.registry.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     LeaseKind,
@@ -105,6 +105,23 @@ class DomainParticipants:
         """Whether `Domain.go_on` has more to do: hundreds may have to meet hundreds."""
         return self.rediscovery.is_busy
 
+    def standing(self, source: str) -> Standing:
+        """How far an address has proved to be what it claims; its rate of discovery follows."""
+        if self.settings.is_peer(source):
+            return Standing.PROVEN
+        is_proven = self.proofs.has(source)
+        if self.settings.is_inside(source):
+            return Standing.PROVEN if is_proven else Standing.INSIDE
+        return Standing.STRANGER if is_proven else Standing.OUTSIDE
+
+    def _named_by(self, source: str) -> NamedBy:
+        """How much it counts that an address outside names a participant."""
+        if self.settings.is_peer(source):
+            return NamedBy.PEER
+        # A participant inside proves its address, too, and sends to ports of the range.
+        is_proven = self.proofs.has(source) and not self.settings.is_inside(source)
+        return NamedBy.PROVEN if is_proven else NamedBy.OTHERS
+
     def is_kept(self, participant: InsideParticipant) -> bool:
         """Whether a participant inside keeps all the ports that it has, for the next process."""
         return self.own.keeper.keeps(participant.prefix, participant.ports)
@@ -122,8 +139,7 @@ class DomainParticipants:
         outsiders = [p for p in self.outside.by_prefix.values() if p.until < now]
         for outsider in outsiders[:ENDED_AT_ONCE]:
             self._forget_outside(outsider)
-        counts = self.inside.count_by_address, self.outside.count_by_address
-        self.proofs.expire(now, self.inside.by_prefix, *counts)
+        self.proofs.expire(now, self.inside, self.outside)
         return sent
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:
@@ -135,6 +151,24 @@ class DomainParticipants:
         sent = list[Outgoing]()
         for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
             sent += self._end_for(leaver)
+        return sent
+
+    def _end_former_processes(self, prefix: bytes, source: str) -> list[Outgoing]:
+        """End the participants of crashed processes at the port of a participant.
+
+        A crashed process sends no dispose message, and would be known until its lease duration is
+        over. A participant that has answered has bound the port, so the former process has gone.
+        The answer of the former process counts no longer: its announcement may be repeated.
+        """
+        if not self.proofs.has_answered(source, prefix):
+            return []
+        sent = list[Outgoing]()
+        for insider in self.inside.former_processes(prefix, source):
+            self.proofs.forget(source, insider.prefix)
+            sent += self._end_for(insider)
+        for outsider in self.outside.former_processes(prefix, source):
+            self.proofs.forget(source, outsider.prefix)
+            sent += self._end_outside(outsider, self.inside.by_prefix.values())
         return sent
 
     def _end_for(self, insider: InsideParticipant) -> list[Outgoing]:

@@ -54,8 +54,8 @@ class OwnParticipants:
         return self.settings.to_outside(self.observer.announcement(*self._reached_from_outside()))
 
     def question_to_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
-        """What asks a participant outside to prove that its address receives, if that is to be."""
-        if outsider.proven:
+        """What asks a participant outside to prove that it receives, if that is to be."""
+        if self.proofs.has_answered(outsider.address, outsider.prefix):
             return []
         question = self.proofs.question(
             outsider.address, outsider.prefix, self._reached_from_outside()

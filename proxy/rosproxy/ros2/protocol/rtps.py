@@ -23,7 +23,8 @@ from enum import IntEnum
 import msgspec
 
 MAGIC = b"RTPS"
-VERSION, NO_VENDOR, RTI, FAST_DDS = b"\x02\x03", b"\x00\x00", b"\x01\x01", b"\x01\x0f"
+VERSION, NO_VENDOR, RTI = b"\x02\x03", b"\x00\x00", b"\x01\x01"
+FAST_DDS, CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"
 HEADER = 20
 """Bytes of a message's header."""
 ALIGNMENT = 4

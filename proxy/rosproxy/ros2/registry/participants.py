@@ -16,7 +16,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.qos import EndpointQos
-from rosproxy.ros2.protocol.rtps import FAST_DDS, NO_VENDOR, RTI
+from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS, NO_VENDOR, RTI
 
 VENDORS = {
     NO_VENDOR: "rosproxy",
@@ -24,12 +24,21 @@ VENDORS = {
     b"\x01\x02": "OpenSplice",
     b"\x01\x03": "OpenDDS",
     FAST_DDS: "Fast DDS",
-    b"\x01\x10": "Cyclone DDS",
+    CYCLONE_DDS: "Cyclone DDS",
     b"\x01\x12": "RustDDS",
     b"\x01\x14": "Dust DDS",
 }
 """Names of implementations, by the vendor id in each message's header (OMG's list). Zero stands for
 none; a proxy's own participants have it."""
+PROCESS_LENGTHS = {FAST_DDS: 8, CYCLONE_DDS: 4}
+"""Bytes that the GUID prefixes of all participants of a process begin with.
+
+Fast DDS: GuidUtils.hpp; Cyclone DDS: ddsi_generate_participant_guid (ddsi_participant.c).
+
+A process of these implementations has the port of its metatraffic locator for itself. Only sockets
+for multicast have SO_REUSEADDR (Fast DDS: UDPv4Transport.cpp, UDPv6Transport.cpp; Cyclone DDS:
+ddsi_udp.c).
+"""
 MOST_ENDPOINTS = 2048
 MOST_ENDPOINT_BYTES_PER_ADDRESS = 4 * 1024 * 1024
 MOST_ENDPOINT_BYTES = 32 * 1024 * 1024
@@ -373,6 +382,24 @@ class ParticipantTable(Generic[AnyParticipant]):
         if address not in self.count_by_address:
             return []
         return [p for p in self.by_prefix.values() if p.address == address]
+
+    def former_processes(self, prefix: bytes, address: str) -> list[AnyParticipant]:
+        """The participants of processes that had the port which a participant has now.
+
+        Empty if the participant is unknown, or if other processes may have the port as well.
+        """
+        holder = self.find(prefix, address)
+        if holder is None or holder.metatraffic is None:
+            return []
+        length = PROCESS_LENGTHS.get(holder.vendor)
+        return [
+            participant
+            for participant in self.at(address)
+            if length is not None
+            and participant.vendor in PROCESS_LENGTHS
+            and participant.metatraffic == holder.metatraffic
+            and participant.prefix[:length] != prefix[:length]
+        ]
 
     def add(self, participant: AnyParticipant) -> None:
         """Add a participant that has come."""
