@@ -88,7 +88,8 @@ def page(text: str) -> str:
         "fields of the status": fields_table("status", definition),
     }
     for name, table in tables.items():
-        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        begin = f"<!-- {name} -->\n"
+        end = f"<!-- end of {name} -->"
         before, rest = text.split(begin)
         text = f"{before}{begin}\n{table}\n\n{end}{rest.split(end)[1]}"
     return text

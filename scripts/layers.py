@@ -16,22 +16,33 @@ ROOT = Path(__file__).resolve().parent.parent
 LOGS = ROOT / "build/test-logs"
 CAP_NET_ADMIN = 1 << 12
 CAP_SYS_ADMIN = 1 << 21
-ALL, MARKED, NONE = "all", "marked", "none"
+ALL = "all"
+MARKED = "marked"
+NONE = "none"
 
-ROS, CLIENTS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNETES, IMAGES = (
-    PREPARATIONS
-) = (
-    "install-ros",
-    "install-clients",
-    "install-browser",
-    "install-jazzy",
-    "install-ros2",
-    "compile-nodes",
-    "install-docker",
-    "install-compose",
-    "install-prometheus",
-    "install-kubernetes",
-    "build-images",
+ROS = "install-ros"
+CLIENTS = "install-clients"
+CHROMIUM = "install-browser"
+JAZZY = "install-jazzy"
+ROS2 = "install-ros2"
+NODES = "compile-nodes"
+ENGINE = "install-docker"
+COMPOSE = "install-compose"
+PROMETHEUS = "install-prometheus"
+KUBERNETES = "install-kubernetes"
+IMAGES = "build-images"
+PREPARATIONS = (
+    ROS,
+    CLIENTS,
+    CHROMIUM,
+    JAZZY,
+    ROS2,
+    NODES,
+    ENGINE,
+    COMPOSE,
+    PROMETHEUS,
+    KUBERNETES,
+    IMAGES,
 )
 ABUSE_TOOLS = "install-abuse"
 COMMANDS = {name: [f"scripts/{name}.sh"] for name in (*PREPARATIONS, ABUSE_TOOLS)} | {

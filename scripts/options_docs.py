@@ -34,7 +34,8 @@ SETTINGS: dict[str, tuple[type, ...]] = {
 def page(text: str) -> str:
     """The page with its tables made anew."""
     for program, classes in SETTINGS.items():
-        begin, end = f"<!-- {program} -->\n", f"<!-- end of {program} -->"
+        begin = f"<!-- {program} -->\n"
+        end = f"<!-- end of {program} -->"
         before, rest = text.split(begin)
         table = "\n".join(_table(setting for kind in classes for setting in declared(kind)))
         text = f"{before}{begin}\n{table}\n\n{end}{rest.split(end)[1]}"

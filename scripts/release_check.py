@@ -249,7 +249,8 @@ def check_chart(release: Release) -> None:
 
 def adapt(chart: Path, release: Release) -> None:
     """Write into a chart where its images and its pages are."""
-    values, about = chart / "values.yaml", chart / "Chart.yaml"
+    values = chart / "values.yaml"
+    about = chart / "Chart.yaml"
     text = values.read_text()
     if release.registry:
         to = rf"\1{release.registry}/\2"
@@ -374,7 +375,8 @@ def main() -> int:
     options = parser.parse_args()
     DIST.mkdir(exist_ok=True)
     try:
-        registry, repository = options.registry.strip("/"), options.repository.strip("/")
+        registry = options.registry.strip("/")
+        repository = options.repository.strip("/")
         release = Release(project_version(), options.tag, options.base_image, registry, repository)
         for name in options.only:
             print(f"{name} …", flush=True)

@@ -60,7 +60,8 @@ def read_cases(report: Path) -> dict[str, Case]:
         passed = not failed and element.find("skipped") is None
         seconds = float(element.get("time", 0))
         if former := cases.get(name):
-            seconds, passed = seconds + former.seconds, passed and former.passed
+            seconds = seconds + former.seconds
+            passed = passed and former.passed
             failed = failed or former.failed
         cases[name] = Case(name, seconds, passed, failed)
     return cases

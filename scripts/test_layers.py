@@ -159,7 +159,8 @@ class Run:
 
     def _run(self, title: str, command: list[str]) -> tuple[int, str]:
         """Run a step; its exit code and what it has printed."""
-        log, began = LOGS / f"{title.replace('/', '-').replace(' ', '-')}.log", time.monotonic()
+        log = LOGS / f"{title.replace('/', '-').replace(' ', '-')}.log"
+        began = time.monotonic()
         self._say(f"{title} …")
         with log.open("wb") as output:
             code = subprocess.run(
@@ -204,7 +205,8 @@ def count(report: Path) -> str:
     def total(name: str) -> int:
         return sum(int(suite.get(name, 0)) for suite in suites)
 
-    failed, skipped = total("failures") + total("errors"), total("skipped")
+    failed = total("failures") + total("errors")
+    skipped = total("skipped")
     passed = total("tests") - failed - skipped
     parts = [f"{passed} passed", f"{failed} failed", f"{skipped} skipped"]
     return ", ".join(parts[: 1 if not failed + skipped else 3])

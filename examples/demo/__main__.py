@@ -53,7 +53,8 @@ def main(seconds: float, quiet: bool) -> None:
     """
     # The inside names resolve nowhere; a resolver that is slow to say so must not slow us down.
     os.environ["RES_OPTIONS"] = "timeout:1 attempts:1"
-    console, scenario = Console(quiet=quiet), Scenario(seconds)
+    console = Console(quiet=quiet)
+    scenario = Scenario(seconds)
     if not asyncio.run(perform(scenario, console)):
         click.echo("interrupted; all processes ended", err=True)
         sys.exit(INTERRUPTED)

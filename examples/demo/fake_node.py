@@ -56,7 +56,9 @@ class FakeNode:
     """A ROS node; see the module."""
 
     def __init__(self, name: str, address: str, host: str = "") -> None:
-        self.name, self.address, self.host = name, address, host or address
+        self.name = name
+        self.address = address
+        self.host = host or address
         self.slave = FakeHttpServer(self._respond)
         self.tcpros = FakeTcpServer(self._serve)
         self.stream: Stream = echo

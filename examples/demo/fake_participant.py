@@ -37,14 +37,17 @@ HEARTBEAT_INTERVAL = 0.1
 LEASE = 100
 """Seconds for which others remember it unheard: what DDS has where nothing is said (9.6.3.2)."""
 ANYBODY = bytes(12)
-PARTICIPANT, SPDP_READER = 0x000001C1, 0x000100C7
-WRITER, READER = 0x00000103, 0x00000104
+PARTICIPANT = 0x000001C1
+SPDP_READER = 0x000100C7
+WRITER = 0x00000103
+READER = 0x00000104
 """The entity id of the writer or reader that it may have; they have no key (9.3.1.2)."""
 TO_READER = 5
 """From the entity id of a writer of SEDP to that of its reader."""
 BUILT_IN = {BuiltinWriter.PUBLICATIONS: (0x04, 0x08), BuiltinWriter.SUBSCRIPTIONS: (0x10, 0x20)}
 """The bits that say whether a participant has a writer of SEDP, and its reader (9.3.2.12)."""
-RELIABILITY, RELIABLE = 0x1A, struct.pack("<IiI", 2, 0, 0)
+RELIABILITY = 0x1A
+RELIABLE = struct.pack("<IiI", 2, 0, 0)
 """The one quality of service that isn't what DDS has where nothing is said."""
 STRING_TYPE = "std_msgs::msg::dds_::String_"
 
@@ -67,7 +70,8 @@ class FakeParticipant(asyncio.DatagramProtocol):
     """
 
     def __init__(self, name: str, address: str, topic: str) -> None:
-        self.name, self.address = name, address
+        self.name = name
+        self.address = address
         self.prefix = VENDOR + os.urandom(10)
         self.dds_topic = f"rt{topic}"
         self.admits: Callable[[str], bool] = lambda _peer: True

@@ -21,11 +21,14 @@ from rosproxy.ros1.protocol.tcpros import encode_header
 
 RATE = 20
 """Messages a second that each talker publishes."""
-FIRST_RETRY, LONGEST_RETRY = 0.1, 20.0
+FIRST_RETRY = 0.1
+LONGEST_RETRY = 20.0
 """Seconds between a listener's attempts to connect."""
 
 ADD_TWO_INTS = {"type": "rospy_tutorials/AddTwoInts", "md5sum": "6a2e34150c00229791cc89ff309fff21"}
-OPERANDS, SUM, LENGTH = struct.Struct("<Iqq"), struct.Struct("<Iq"), struct.Struct("<I")
+OPERANDS = struct.Struct("<Iqq")
+SUM = struct.Struct("<Iq")
+LENGTH = struct.Struct("<I")
 
 
 class Refused(ConnectionError):

@@ -19,8 +19,11 @@ VENDOR = b"\x01\xff"
 """The id of an implementation that OMG's list does not have."""
 MOST_ASKED = 32
 """Samples that an ACKNACK asks for at once: one word of bits; there may be eight (9.4.2.6)."""
-_LITTLE, _FINAL, _PAYLOAD = 0x01, 0x02, 0x04
-_CDR, _PARAMETER_LIST = b"\x00\x01\x00\x00", b"\x00\x03\x00\x00"
+_LITTLE = 0x01
+_FINAL = 0x02
+_PAYLOAD = 0x04
+_CDR = b"\x00\x01\x00\x00"
+_PARAMETER_LIST = b"\x00\x03\x00\x00"
 """How a payload is encoded: CDR_LE, PL_CDR_LE."""
 
 

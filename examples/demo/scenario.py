@@ -82,7 +82,8 @@ class Scenario:
     began: float = field(default_factory=monotonic)
 
     def __post_init__(self) -> None:
-        robot, (first, second, third) = self.layout.robot, self.layout.inside
+        robot = self.layout.robot
+        (first, second, third) = self.layout.inside
         self.master = FakeMaster(robot)
         self.talker = Talker("/inside/talker", first, "talker.inside", topic="/from_inside")
         self.listener = Listener(
@@ -114,7 +115,9 @@ class Scenario:
     @property
     def pairs(self) -> dict[tuple[str, str], tuple[AnyTalker, AnyListener]]:
         """Who talks to whom, by version of ROS and direction."""
-        outwards, inwards, ros2 = "inside to outside", "outside to inside", self.ros2
+        outwards = "inside to outside"
+        inwards = "outside to inside"
+        ros2 = self.ros2
         return {
             ("ROS 1", outwards): (self.talker, self.far_listener),
             ("ROS 1", inwards): (self.far_talker, self.listener),
@@ -179,7 +182,8 @@ class Scenario:
 
     async def _try_without_proxy(self) -> None:
         self.act = "without rosproxy: inside registers at the master"
-        talker, listener = self.talker, self.far_listener
+        talker = self.talker
+        listener = self.far_listener
         await talker.register(self.master.uri)
         self._let_talk(talker)
         self._let_talk(self.ros2.talker)
@@ -206,7 +210,8 @@ class Scenario:
         """Whether discovery and messages have stayed on their side, where there are two sides."""
         if not self.layout.outside_network:
             return
-        inside, received = self.ros2.talker, self.ros2.far_listener.received
+        inside = self.ros2.talker
+        received = self.ros2.far_listener.received
         told = f"{inside.locators[0]}: {inside.turned_away} datagrams turned away"
         self.tell(f"ROS 2 without rosproxy: {told}")
         self._check("ROS 2: without the proxy nothing crosses", not received, told)
@@ -286,7 +291,8 @@ class Scenario:
         heard = len(self.far_listener.received), len(self.ros2.listener.received)
         self.act = "restart: same command, no state on disk"
         self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
-        ready, received = monotonic(), self.far_listener.received
+        ready = monotonic()
+        received = self.far_listener.received
         await self._until(lambda: len(received) > heard[0], "messages flow again")
         await self._until(self._service_answers, "the service answers again")
         took = {"message": received[heard[0]][1] - ready, "service call": monotonic() - ready}
@@ -374,7 +380,8 @@ def count(
     missing = talker.sent.keys() - {*received}
     last = max(before & {*received}, default=0)
     cut_off = {number for number in missing & before if number > last}
-    lost, twice = len(missing - cut_off), len(received) - len({*received})
+    lost = len(missing - cut_off)
+    twice = len(received) - len({*received})
     strange = {*received} - talker.sent.keys()
     told = f"sent {len(talker.sent)}, received {len(received)}"
     if cut_off:

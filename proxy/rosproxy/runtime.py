@@ -23,10 +23,13 @@ class Runtime:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.settings, self.instance = settings, uuid.uuid4().hex
+        self.settings = settings
+        self.instance = uuid.uuid4().hex
         self._loop = asyncio.get_running_loop()
         self._started = self.now()
-        self.metrics, self.tasks, self.problems = Metrics(), Tasks(), Problems()
+        self.metrics = Metrics()
+        self.tasks = Tasks()
+        self.problems = Problems()
         self.outside_changed = asyncio.Event()
         self.refusals = Refusals(self.metrics, self.problems, self.now)
         self.policy = AccessPolicy(

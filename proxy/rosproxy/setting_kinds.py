@@ -110,10 +110,8 @@ class Setting(NamedTuple):
 
 def declared(settings: type) -> list[Setting]:
     """The settings of a dataclass or struct, in its order; a field without an `Option` is none."""
-    hints, parameters = (
-        get_type_hints(settings, include_extras=True),
-        signature(settings).parameters,
-    )
+    hints = get_type_hints(settings, include_extras=True)
+    parameters = signature(settings).parameters
     return [
         _setting(name, hints[name], parameter.default)
         for name, parameter in parameters.items()

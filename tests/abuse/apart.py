@@ -15,9 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 # 198.18.0.0/15 is for tests of networks (RFC 2544): nothing else on this machine has it.
-APART, INSIDE = "198.18.2.1", "198.18.2.0/24"
+APART = "198.18.2.1"
+INSIDE = "198.18.2.0/24"
 """The proxy's address inside, and its inside network."""
-APART_HOST, APART_MASTER = "198.18.1.254", "198.18.1.1"
+APART_HOST = "198.18.1.254"
+APART_MASTER = "198.18.1.1"
 """What outside knows the proxy's machine by, and the master's address."""
 NODES = tuple(f"198.18.2.{number}" for number in range(11, 31))
 STRANGERS = tuple(f"198.18.1.{number}" for number in range(11, 31))

@@ -6,7 +6,8 @@ Whichever the machine has; in version 1 each is a group of its own.
 from pathlib import Path
 
 ROOT = Path("/sys/fs/cgroup")
-V1_MEMORY, V1_PIDS = ROOT / "memory", ROOT / "pids"
+V1_MEMORY = ROOT / "memory"
+V1_PIDS = ROOT / "pids"
 
 
 class Cgroup:

@@ -48,7 +48,8 @@ LONGEST_ANSWER = 0.3
 """Seconds that an answer of /healthz may take."""
 PATIENT = {"probe_interval": 5, "probe_timeout": 20, "cleanup_after": 0, "linger": 600}
 """The fakes answer late: they live in the process that makes the neighbours' huge documents."""
-LOG, STATUS = 64 * 1024, MEBIBYTE
+LOG = 64 * 1024
+STATUS = MEBIBYTE
 PRIORITY = -15
 """Of the test, and of all that it starts, among the processes of this machine (nice)."""
 
@@ -110,7 +111,8 @@ class Abused(Process):
     @contextmanager
     def watched(self, growth: int = GROWTH) -> Iterator[None]:
         """Hold what nobody may lose; memory may grow by ``growth`` bytes."""
-        before, written = self.most_memory(), len("".join(self.log))
+        before = self.most_memory()
+        written = len("".join(self.log))
         with Health(*self.admin, self.pid) as health:
             yield
         assert health.longest < LONGEST_ANSWER

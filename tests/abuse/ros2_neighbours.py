@@ -47,9 +47,12 @@ class Participant:
     """
 
     def __init__(self, prefix: bytes, address: str, port: int, vendor: bytes = FAST_DDS) -> None:
-        self.prefix, self.address, self.port = prefix, address, port
+        self.prefix = prefix
+        self.address = address
+        self.port = port
         self.vendor = vendor
-        self.meta, self.data = udp(address, port), udp(address, port + 1)
+        self.meta = udp(address, port)
+        self.data = udp(address, port + 1)
 
     def close(self) -> None:
         """End, without a word."""

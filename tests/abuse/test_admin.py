@@ -27,7 +27,8 @@ GOOD = bytes([1, 15, 1]) + bytes(9)
 EVIL = NODES[1:6]
 PORTS = 64
 ANNOUNCED = APART, WELL_KNOWN
-PARTICIPANTS, WRITERS = 4, 2048
+PARTICIPANTS = 4
+WRITERS = 2048
 """Participants at one address, and writers of each: more than the proxy remembers."""
 WRITER_BYTES = 1200
 """Bytes that such a writer takes at most."""

@@ -45,7 +45,8 @@ async def test_documents_with_too_many_elements_and_with_as_many_as_there_may_be
         for target, method in ((lease, b"publisherUpdate"), (abused.master, b"registerService")):
             whole = many_publishers(490_000, method)
             assert (await exchange(target, post(whole), NODE)).status == 413
-        many, few = many_publishers(18_000, b"registerService"), many_publishers(9_900)
+        many = many_publishers(18_000, b"registerService")
+        few = many_publishers(9_900)
         calls = [exchange(abused.master, post(many), NODE) for _ in range(10)]
         calls += [exchange(lease, post(few)) for _ in range(10)]
         replies = await asyncio.gather(*calls)

@@ -69,7 +69,8 @@ async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node
     Some call before the operator has told for the first time after the start.
     """
     apart = start_apart(admin_token_hash=hash_token(TOKEN))
-    node, late = await make_node(address=NODES[0]), await make_node("/late", NODES[1])
+    node = await make_node(address=NODES[0])
+    late = await make_node("/late", NODES[1])
 
     async def select(*addresses: str) -> None:
         told = json.dumps({"selected": addresses}).encode()
@@ -133,7 +134,8 @@ async def test_dead_uris_of_many_sources(abused, make_node):
 
 async def test_forged_addresses_of_others(apart, apart_master, make_node):
     """Neither a node that never joined nor one outside is published by somebody else."""
-    evil, node = await make_node("/evil", NODES[0]), await make_node("/good", NODES[1])
+    evil = await make_node("/evil", NODES[0])
+    node = await make_node("/good", NODES[1])
     victims = [await make_node("/victim", NODES[2]), await make_node("/robot", STRANGERS[0])]
     lease = await apart.publish(node)
     with apart.watched():

@@ -33,7 +33,8 @@ async def seen_by(master, node, topic: str):
 
 async def test_names_that_are_looked_up_while_there_is_no_thread(abused, make_node):
     """After 64 look-ups for which no thread could be started no name was looked up any more."""
-    node, other = await make_node(), await make_node("/other", OTHER_NODE)
+    node = await make_node()
+    other = await make_node("/other", OTHER_NODE)
     late = await make_node("/late", host=OF_NODE)
     lease = await abused.publish(node)
     with abused.watched():
@@ -59,7 +60,8 @@ async def test_names_that_hang(start_apart, make_node):
     """One neighbour's names go to a name server that never answers; another's still resolve."""
     with a_silent_name_server({"goodbox": NODES[1]}):
         apart = start_apart()
-        node, other = await make_node("/node", NODES[0]), await make_node("/other", NODES[2])
+        node = await make_node("/node", NODES[0])
+        other = await make_node("/other", NODES[2])
         named = await make_node("/named", NODES[1], host="goodbox")
         lease = await apart.publish(node)
         with apart.watched():

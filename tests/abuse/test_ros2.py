@@ -44,9 +44,13 @@ from tests.unit.ros2.protocol.messages import (
     submessage,
 )
 
-GOOD, ROBOT = bytes([1, 15, 1]) + bytes(9), bytes([1, 15, 2]) + bytes(9)
-LAPTOP, NEWCOMER = bytes([1, 15, 4]) + bytes(9), bytes([1, 15, 5]) + bytes(9)
-EVIL, EAR, VICTIM = NODES[1], NODES[19], STRANGERS[9]
+GOOD = bytes([1, 15, 1]) + bytes(9)
+ROBOT = bytes([1, 15, 2]) + bytes(9)
+LAPTOP = bytes([1, 15, 4]) + bytes(9)
+NEWCOMER = bytes([1, 15, 5]) + bytes(9)
+EVIL = NODES[1]
+EAR = NODES[19]
+VICTIM = STRANGERS[9]
 SECRET = "0123456789abcdef"
 """What the proxy and its LAN relay share."""
 PORTS = 64
@@ -136,8 +140,10 @@ def described(number: int, count: int) -> bytes:
 
 def heavy(number: int) -> list[bytes]:
     """Datagrams of a participant that are made to take time and memory."""
-    own, sequences = prefix(number % 60), range(number * 256 + 1, number * 256 + 257)
-    qos, named = parameter_list([(0x1234, b"")] * 40), (Pid.TOPIC_NAME, b"\4\0\0\0rt/\0")
+    own = prefix(number % 60)
+    sequences = range(number * 256 + 1, number * 256 + 257)
+    qos = parameter_list([(0x1234, b"")] * 40)
+    named = (Pid.TOPIC_NAME, b"\4\0\0\0rt/\0")
     kinds = [
         [
             data(described(sequence, 200), writer=SEDP_WRITERS, sequence=sequence)

@@ -31,7 +31,8 @@ from tests.unit.ros2.protocol.messages import data, fragment, message, payload, 
 READER = bytes([1, 16, 1]) + bytes(9)
 """The prefix of a participant inside of Cyclone DDS."""
 EVIL = STRANGERS[3]
-COUNT, PER_SECOND = 6000, 3000
+COUNT = 6000
+PER_SECOND = 3000
 """Datagrams of a flood."""
 USER_WRITER = 0x00001203
 

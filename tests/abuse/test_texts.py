@@ -50,7 +50,8 @@ async def test_uris_of_a_megabyte_for_one_node(abused, node):
 
 async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
     """With the longest names, until it is refused: 2 MB of names, which JSON makes more of."""
-    evil, node = await make_node("/evil", OTHER_NODE), await make_node()
+    evil = await make_node("/evil", OTHER_NODE)
+    node = await make_node()
     lease = await abused.publish(node)
     with abused.watched(REGISTRATIONS):
         for number in range(6):
@@ -69,8 +70,10 @@ async def test_a_node_that_registers_as_much_as_it_may(abused, make_node):
 
 async def test_subscribers_with_long_names(abused, make_node):
     """From outside, as many as a port takes of one address."""
-    node, other = await make_node(), await make_node("/other", OTHER_NODE)
-    lease, other_lease = await abused.publish(node), await abused.publish(other)
+    node = await make_node()
+    other = await make_node("/other", OTHER_NODE)
+    lease = await abused.publish(node)
+    other_lease = await abused.publish(other)
     with abused.watched(SUBSCRIBERS):
         async with AsyncExitStack() as stack:
             for number in range(400):
@@ -83,7 +86,8 @@ async def test_subscribers_with_long_names(abused, make_node):
 
 async def test_names_that_forge_lines_of_the_log(abused, master, make_node):
     """Wherever a neighbour may say something: calls, headers, replies, and thousands of times."""
-    evil, node = await make_node("/evil", OTHER_NODE), await make_node()
+    evil = await make_node("/evil", OTHER_NODE)
+    node = await make_node()
     lease = await abused.publish(node)
     await evil.publish(abused.master)
     theirs = abused.lease(evil)

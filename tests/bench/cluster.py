@@ -28,9 +28,11 @@ from tests.bench.crowded_cluster import CrowdedCluster
 from tests.bench.world import cpu_seconds, resident
 
 PATH = "rosproxy-operator"
-SIZES, QUICK_SIZES = (10, 100, 1000), (10,)
+SIZES = (10, 100, 1000)
+QUICK_SIZES = (10,)
 PODS_A_NODE = 30
-SECONDS, QUICK_SECONDS = 60.0, 10.0
+SECONDS = 60.0
+QUICK_SECONDS = 10.0
 """How long it is watched when nothing happens, and while others' pods come and go."""
 CHURN = 20.0
 """Others' pods that come and go in a second."""
@@ -118,11 +120,15 @@ class Bench:
     def __init__(
         self, plane: ControlPlane, cluster: CrowdedCluster, operator: Operator, started: float
     ) -> None:
-        self.plane, self.cluster, self.operator, self.started = plane, cluster, operator, started
+        self.plane = plane
+        self.cluster = cluster
+        self.operator = operator
+        self.started = started
 
     async def rest(self, quiet: float = 5.0) -> None:
         """Wait until the operator has asked nothing but what it asks by the clock for a while."""
-        end, before = time.monotonic() + PATIENCE, -1
+        end = time.monotonic() + PATIENCE
+        before = -1
         while True:
             asked = self.plane.asked()
             written = sum(
@@ -137,7 +143,9 @@ class Bench:
     async def over(self, seconds: float) -> tuple[float, float, dict[str, int]]:
         """Shares of a core of the operator and the API server meanwhile, and the requests."""
         pids = self.operator.pid, self.plane.api_server
-        before, asked, since = [*map(cpu_seconds, pids)], self.plane.asked(), time.monotonic()
+        before = [*map(cpu_seconds, pids)]
+        asked = self.plane.asked()
+        since = time.monotonic()
         await asyncio.sleep(seconds)
         took = time.monotonic() - since
         own, api = ((cpu_seconds(p) - b) / took for p, b in zip(pids, before, strict=True))

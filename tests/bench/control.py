@@ -22,7 +22,8 @@ from xmlrpc.client import dumps, loads
 from tests.bench.book import DIRECT, Book
 from tests.bench.world import GATEWAY, HOST, MASTER, MASTER_PORT, OUTSIDE, World, world
 
-CALL_SECONDS, QUICK_SECONDS = 0.5, 0.1
+CALL_SECONDS = 0.5
+QUICK_SECONDS = 0.1
 WARM_UP_CALLS = 20
 TOPICS = 100
 ENDING_TOPICS = 10
@@ -164,7 +165,8 @@ CALLS: dict[str, Step] = {
 @contextmanager
 def proxy(machines: World, loop: str) -> Iterator[Way]:
     """A proxy on an event loop, and a rospy node behind it."""
-    shift, name = 1000 * LOOPS[loop], f"/bench_{loop}"
+    shift = 1000 * LOOPS[loop]
+    name = f"/bench_{loop}"
     port = MASTER_PORT + shift
     argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER, "--advertise-host"]
     argv += [HOST, "--port-range", f"{45000 + shift}-{45099 + shift}", "--log-level", "info"]

@@ -25,7 +25,8 @@ class Slave(asyncio.Protocol):
     """One connection to the slave API of a node."""
 
     def __init__(self, number: int) -> None:
-        self._number, self._data = number, b""
+        self._number = number
+        self._data = b""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -69,7 +70,8 @@ def register(master: str, uri: str, number: int) -> None:
 
 
 async def main(master: str, address: str, port: int, count: int) -> None:
-    loop, limit = asyncio.get_running_loop(), asyncio.Semaphore(AT_ONCE)
+    loop = asyncio.get_running_loop()
+    limit = asyncio.Semaphore(AT_ONCE)
     for number in range(count):
         await loop.create_server(partial(Slave, number), address, port + number)
 

@@ -14,7 +14,8 @@ from aiohttp import web
 
 from tests.bench.control_plane import ControlPlane
 
-ROBOTS, OTHERS = "robots", "others"
+ROBOTS = "robots"
+OTHERS = "others"
 MASTER = "http://10.96.7.7:11311"
 """Where pods find their proxy: the RosProxy's Service is given the address that they know."""
 ADMIN_PORT = 11312
@@ -31,7 +32,8 @@ class CrowdedCluster:
     """Nodes, pods, and who looks after them. ``made`` is when the proxy of a node was seen."""
 
     def __init__(self, plane: ControlPlane) -> None:
-        self.plane, self.made = plane, dict[str, float]()
+        self.plane = plane
+        self.made = dict[str, float]()
         self._seen = asyncio.Condition()
         self._bound: set[str] = set()
         self._numbers = itertools.count(1)
@@ -86,7 +88,8 @@ class CrowdedCluster:
 
     async def add_robot(self, node: str) -> float:
         """A labelled pod; when it was bound."""
-        name, labels = f"robot-{node}", {"rosproxy.io/inject": "true", "app": "robot"}
+        name = f"robot-{node}"
+        labels = {"rosproxy.io/inject": "true", "app": "robot"}
         path = f"/api/v1/namespaces/{ROBOTS}/pods"
         body = _pod(name, node, labels)
         body["metadata"]["annotations"] = {"rosproxy.io/master-uri": MASTER}  # by the webhook
@@ -138,7 +141,8 @@ class CrowdedCluster:
                     await self._look_after(event["object"])
 
     async def _look_after(self, pod: dict[str, Any]) -> None:
-        meta, node = pod["metadata"], pod["metadata"]["annotations"]["rosproxy.io/node"]
+        meta = pod["metadata"]
+        node = pod["metadata"]["annotations"]["rosproxy.io/node"]
         path = f"/api/v1/namespaces/{ROBOTS}/pods/{meta['name']}"
         async with self._seen:
             self.made.setdefault(node, time.monotonic())

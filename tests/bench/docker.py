@@ -26,11 +26,13 @@ from tests.docker.engine import docker, running_engine, wait_until
 from tests.docker.images import PROXY, ROS, build_image
 
 PATH = "rosproxy-operator"
-SIZES, QUICK_SIZES = (20, 100, 200), (20,)
+SIZES = (20, 100, 200)
+QUICK_SIZES = (20,)
 SHARE = 10
 """Containers of one master and network."""
 PORTS = 12
-SECONDS, QUICK_SECONDS = 30.0, 5.0
+SECONDS = 30.0
+QUICK_SECONDS = 5.0
 """How long it is watched when nothing happens."""
 AT_ONCE = 8
 FIRST_MASTER = 21400
@@ -65,7 +67,8 @@ def _measure_size(book: Book, size: int, seconds: float, folder: Path) -> None:
         stack.callback(remove_proxies)
         stack.enter_context(_masters(size // SHARE))
         names = stack.enter_context(_containers(size))
-        early, late = names[::2], names[1::2]
+        early = names[::2]
+        late = names[1::2]
         _docker_all("start", early)
         options = ("--proxy-image", PROXY, "--ports", str(PORTS), "--log-level", "debug")
         operator = Process(folder, *options)
@@ -79,7 +82,9 @@ def _measure_size(book: Book, size: int, seconds: float, folder: Path) -> None:
         _rest(operator)
         add("CPU of the operator until then, s", cpu_seconds(pid))
 
-        seen, cpu, since = len(_looks(operator)), cpu_seconds(pid), time.monotonic()
+        seen = len(_looks(operator))
+        cpu = cpu_seconds(pid)
+        since = time.monotonic()
         _docker_all("start", late)
         add("half of the containers started, s", time.monotonic() - since)
         _rest(operator)
@@ -89,7 +94,9 @@ def _measure_size(book: Book, size: int, seconds: float, folder: Path) -> None:
         add("that: one look, median, s", median(looks))
         add("that: one look, longest, s", max(looks))
 
-        seen, cpu, since = len(_looks(operator)), cpu_seconds(pid), time.monotonic()
+        seen = len(_looks(operator))
+        cpu = cpu_seconds(pid)
+        since = time.monotonic()
         time.sleep(seconds)
         looks = [look.seconds for look in _looks(operator)[seen:]]
         took = time.monotonic() - since
@@ -112,7 +119,8 @@ def _rest(operator: Process, quiet: float = 6.0) -> None:
     def done() -> int:
         return sum(look.actions > 0 for look in _looks(operator))
 
-    end, before = time.monotonic() + PATIENCE, -1
+    end = time.monotonic() + PATIENCE
+    before = -1
     while (now := done()) != before:
         assert time.monotonic() < end, f"it does not come to rest: {operator.logs()[-3000:]}"
         before = now

@@ -70,7 +70,8 @@ class Node:
 
     def _publish(self, image: Image, rate: float, seconds: float, window: str, path: str) -> str:
         left = Window(path, int(window))
-        begin, count = time.monotonic(), 0
+        begin = time.monotonic()
+        count = 0
         while (now := time.monotonic()) < begin + seconds:
             if rate > 0:
                 time.sleep(max(0.0, begin + count / rate - now))
@@ -82,7 +83,8 @@ class Node:
         return f"sent {count}"
 
     def on(self, topic: str, path: str) -> str:
-        self._path, self._arrivals = path, []
+        self._path = path
+        self._arrivals = []
         options = {"queue_size": 1000, "buff_size": RECEIVE_BUFFER, "tcp_nodelay": True}
         self._subscriber = rospy.Subscriber(topic, Image, self._take, **options)
         return "on"

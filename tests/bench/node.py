@@ -22,7 +22,8 @@ class SlaveApi:
     """What master and subscribers call."""
 
     def __init__(self, address: str, port: int) -> None:
-        self._address, self._port = address, port
+        self._address = address
+        self._port = port
 
     def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> list[Any]:
         tcpros = ["TCPROS", self._address, self._port]

@@ -15,10 +15,13 @@ from tests.bench.book import DIRECT, Book
 from tests.bench.world import INSIDE, MASTER, World, cpu_seconds, resident, world
 from tests.ros.processes import Process
 
-SIZES, QUICK_SIZES = (1, 10, 100, 1000), (1, 10, 100)
+SIZES = (1, 10, 100, 1000)
+QUICK_SIZES = (1, 10, 100)
 OPTIONS = ("--port-range", "41000-43999", "--log-level", "info", "--cleanup-after", "5")
 FIRST_SLAVE = 50000
-IDLE_SECONDS, QUICK_IDLE_SECONDS = 10.0, 6.0  # probes come every 5 s
+# probes come every 5 s
+IDLE_SECONDS = 10.0
+QUICK_IDLE_SECONDS = 6.0
 SETTLE_SECONDS = 12.0
 """What registering has left to do: the first two probes of each node make the connection that is
 kept, and what the master knows is read once more."""
@@ -62,7 +65,8 @@ def measure(book: Book, machines: World, size: int, idle: float) -> None:
     with machines.proxy("auto", *OPTIONS) as proxy:
         proxy.process.wait_for(f"recovered {size} nodes", timeout=PATIENCE)
         book.add("recovery, s", PATH, time.perf_counter() - started, size)
-        began, used = time.perf_counter(), cpu_seconds(proxy.pid)
+        began = time.perf_counter()
+        used = cpu_seconds(proxy.pid)
         nodes.kill()
         wait_until(lambda: topics_at_master(machines) == 0, "the topics are gone")
         book.add("clean-up, s", PATH, time.perf_counter() - began, size)
@@ -81,7 +85,8 @@ def seconds_of(process: Process) -> float:
 def busy(pid: int, seconds: float) -> float:
     """CPU seconds per second of a process that is left alone."""
     time.sleep(SETTLE_SECONDS)
-    before, started = cpu_seconds(pid), time.perf_counter()
+    before = cpu_seconds(pid)
+    started = time.perf_counter()
     time.sleep(seconds)
     return (cpu_seconds(pid) - before) / (time.perf_counter() - started)
 

@@ -16,9 +16,11 @@ from tests.bench.world import World, cpu_seconds, world
 from tests.browser.webdriver import Browser
 from tests.ros.processes import wait_until
 
-SIZES, QUICK_SIZES = (10, 100, 1000), (10, 100)
+SIZES = (10, 100, 1000)
+QUICK_SIZES = (10, 100)
 PORT = 11312
-WATCHED, QUICK_WATCHED = 10.0, 3.0
+WATCHED = 10.0
+QUICK_WATCHED = 3.0
 """Seconds for which frames are counted."""
 PATIENCE = 60
 FIRST_ROWS = "return document.querySelector('#rows tr') ? performance.now() : null"
@@ -55,7 +57,8 @@ def measure(book: Book, machines: World, size: int, seconds: float) -> None:
             add("first rows, s", first_rows(browser))
             time.sleep(1)  # what is shown first is laid out
             browser.run(COUNT_FRAMES)
-            began, used = time.perf_counter(), cpu_seconds(server.pid)
+            began = time.perf_counter()
+            used = cpu_seconds(server.pid)
             time.sleep(seconds)
             gaps = browser.run("return gaps")
             took = time.perf_counter() - began
@@ -88,7 +91,8 @@ def events(count: int) -> tuple[int, list[int]]:
     """How many bytes the first event has, and so many after it."""
     connection = http.client.HTTPConnection("127.0.0.1", PORT, timeout=PATIENCE)
     connection.request("GET", "/events")
-    reply, sizes = connection.getresponse(), list[int]()
+    reply = connection.getresponse()
+    sizes = list[int]()
     while len(sizes) <= count:
         line = reply.readline()
         assert line, "the stream has ended"

@@ -17,7 +17,8 @@ from pathlib import Path
 
 from tests.bench.book import Book, Line
 
-BEGIN, END = "<!-- results: written by a program -->", "<!-- end of results -->"
+BEGIN = "<!-- results: written by a program -->"
+END = "<!-- end of results -->"
 MISSING = "-"
 TITLES = {
     "streams": "Bytes, from a node inside to subscribers outside",

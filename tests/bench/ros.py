@@ -16,10 +16,12 @@ from tests.bench.ways import KERNEL, PLANES, SPLICE, tcpros_address
 from tests.bench.world import INSIDE, MASTER, PROXY, World, world
 
 LIBRARIES = ("rospy", "roscpp")
-IMAGE, SMALL = 6_000_000, 1024
+IMAGE = 6_000_000
+SMALL = 1024
 WINDOW = 4
 """Images on their way at most: enough to keep both ends busy, few enough that none is dropped."""
-SECONDS, QUICK_SECONDS = 0.8, 0.5
+SECONDS = 0.8
+QUICK_SECONDS = 0.5
 PATIENCE = 1.0
 """Seconds without another message after which what is missing counts as lost."""
 _NUMBERS = itertools.count(1)
@@ -97,7 +99,8 @@ def measure(book: Book, site: Site, kind: Kind, pair: Pair, seconds: float) -> N
     publisher = site.nodes[pair.publisher, pair.role]
     subscriber = site.nodes[pair.subscriber, other]
     number = next(_NUMBERS)
-    topic, path = f"/images_{number}", site.world.folder / f"{number}.socket"
+    topic = f"/images_{number}"
+    path = site.world.folder / f"{number}.socket"
     try:
         subscriber.ask("on", topic, path)
         sent = publisher.ask("go", topic, kind.size, kind.rate, seconds, WINDOW, path)
@@ -112,11 +115,13 @@ def measure(book: Book, site: Site, kind: Kind, pair: Pair, seconds: float) -> N
 
 def wait_for_rest(subscriber: RosNode, sent: int) -> None:
     """Until all have arrived, or no more come."""
-    count, since = 0, time.monotonic()
+    count = 0
+    since = time.monotonic()
     while count < sent and time.monotonic() < since + PATIENCE:
         time.sleep(0.02)
         if (now := int(subscriber.ask("count")[1])) > count:
-            count, since = now, time.monotonic()
+            count = now
+            since = time.monotonic()
 
 
 def enter(

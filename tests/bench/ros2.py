@@ -38,9 +38,12 @@ FIRST_PORT = 41000
 NETWORK = "172.31.0.0/24"
 SECOND = "172.31.0.3"
 """Another address of the inside machine: the proxy serves at most 64 participants at one."""
-SECONDS, QUICK_SECONDS = 2.0, 1.0
-SIZES, QUICK_SIZES = (1, 10, 100), (1, 10)
-IDLE_SECONDS, QUICK_IDLE_SECONDS = 10.0, 5.0
+SECONDS = 2.0
+QUICK_SECONDS = 1.0
+SIZES = (1, 10, 100)
+QUICK_SIZES = (1, 10)
+IDLE_SECONDS = 10.0
+QUICK_IDLE_SECONDS = 5.0
 MOST_ROUNDS = 3
 """Rounds of the crowds, each of which waits until the proxy has been up for a while."""
 PATIENCE = 120.0

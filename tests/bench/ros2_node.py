@@ -78,7 +78,8 @@ class Talker:
 
     def go(self, size: str, rate: str, seconds: str) -> str:
         """Send at a rate for some seconds."""
-        count, began = 0, time.monotonic()
+        count = 0
+        began = time.monotonic()
         while (now := time.monotonic()) < began + float(seconds):
             time.sleep(max(0.0, began + count / float(rate) - now))
             self._stream.publish(message(int(size)))
@@ -91,7 +92,8 @@ class Talker:
 
     def off(self) -> str:
         """Microseconds that each message of a stream took, which is over."""
-        ages, self._ages[:] = list(self._ages), []
+        ages = list(self._ages)
+        self._ages[:] = []
         return " ".join(map(str, ["ages", *ages]))
 
 

@@ -15,7 +15,9 @@ from tests.bench.ways import PEERS, PLANES, Way, all_ways
 from tests.bench.world import cpu_seconds, cpu_seconds_of, family, machine_cpu_seconds, resident
 
 SIZES = (1, 10, 100, 1000)
-STREAM_SECONDS, PING_SECONDS, QUICK_SECONDS = 0.8, 0.3, 0.3
+STREAM_SECONDS = 0.8
+PING_SECONDS = 0.3
+QUICK_SECONDS = 0.3
 MESSAGE = 1024
 STALL_SECONDS = 1.0
 MEMORY_ROUNDS = 2

@@ -24,7 +24,10 @@ from tests.bench.world import ADDRESSES, HOST, MASTER, World, world
 
 PORT = 46000
 """Where the peers listen on the host; not in rosproxy's default range."""
-BY_HAND, KERNEL, SPLICE, COPY = "nft by hand", "rosproxy kernel", "rosproxy splice", "rosproxy copy"
+BY_HAND = "nft by hand"
+KERNEL = "rosproxy kernel"
+SPLICE = "rosproxy splice"
+COPY = "rosproxy copy"
 PLANES = {KERNEL: "kernel", SPLICE: "splice", COPY: "copy"}
 INWARDS = {"rosproxy kernel, inwards": "kernel", "rosproxy splice, inwards": "splice"}
 PEERS = ("socat", "haproxy", "nginx")
@@ -118,7 +121,8 @@ def _note_missing(book: Book, wanted: tuple[str, ...], ways: list[Way]) -> None:
 @contextmanager
 def node(place: World, master: str, role: str = "inside") -> Iterator[tuple[str, int]]:
     """A node on a machine, registered; the address of its TCPROS server."""
-    wire, address = str(compiled("wire")), ADDRESSES[role]
+    wire = str(compiled("wire"))
+    address = ADDRESSES[role]
     argv = (sys.executable, "-m", "tests.bench.node", master, wire, address)
     with place.running(role, *argv) as process:
         port = int(process.wait_for(r"^port (\d+)")[1])

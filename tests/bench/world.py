@@ -23,9 +23,11 @@ from examples.demo.proxy_process import clean_environment
 from tests.ros.processes import Process, descendants, stop_all
 from tests.ros.topology import Place, run_command
 
-OUTSIDE, HOST = "10.78.0.2", "10.78.0.1"
+OUTSIDE = "10.78.0.2"
+HOST = "10.78.0.1"
 """The outside machine, and what it knows the host by."""
-INSIDE, GATEWAY = "172.31.0.2", "172.31.0.1"
+INSIDE = "172.31.0.2"
+GATEWAY = "172.31.0.1"
 """The inside machine, and what it knows the host by."""
 MASTER_PORT = 11311
 MASTER = f"http://{OUTSIDE}:{MASTER_PORT}/"
@@ -84,7 +86,8 @@ class World:
             self.run(role, "sysctl", "-q", "-p", "-", text=_SETTINGS)
 
     def _link(self, role: str, device: str, gateway: str) -> None:
-        place, host = self.places[role].namespace, self.places["host"].namespace
+        place = self.places[role].namespace
+        host = self.places["host"].namespace
         peer = ("peer", "name", "eth0", "netns", place)
         run_command("ip", "-n", host, "link", "add", device, "type", "veth", *peer)
         ends = (host, device, gateway), (place, "eth0", self.places[role].address)
@@ -232,7 +235,8 @@ def _seconds(pid: int) -> float:
         nanoseconds = int(Path(f"/proc/{pid}/schedstat").read_text().split()[0])
     except OSError:
         return 0.0
-    own, reaped = sum(map(int, stat[11:13])) / _TICKS, sum(map(int, stat[13:15])) / _TICKS
+    own = sum(map(int, stat[11:13])) / _TICKS
+    reaped = sum(map(int, stat[13:15])) / _TICKS
     return reaped + (nanoseconds / 1e9 if stat[17] == "1" else own)
 
 

@@ -31,7 +31,8 @@ def lab_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     """One master and one proxy for all tests."""
     remove_leftovers()
     compiled_node()
-    topology, forks = Topology(SHARED), Forks()
+    topology = Topology(SHARED)
+    forks = Forks()
     topology.build()
     lab = Lab(topology, tmp_path_factory.mktemp("lab"), forks)
     try:

@@ -80,9 +80,11 @@ class MadeUpProxy:
         self.took: list[float] = []
 
     async def documents(self) -> AsyncGenerator[dict[str, Any]]:
-        measures, epoch = Measures(), time.time() - time.monotonic()
+        measures = Measures()
+        epoch = time.time() - time.monotonic()
         for second in range(10**9):
-            now, status = time.monotonic(), status_of(self._nodes, second)
+            now = time.monotonic()
+            status = status_of(self._nodes, second)
             measures.read_relays(relayed(status, SystemState()), now)
             document = await asyncio.to_thread(
                 graph_document, status, None, measures, (), now, epoch

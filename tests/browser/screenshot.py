@@ -16,7 +16,8 @@ from tests.ros.forks import Forks
 from tests.ros.lab import Lab
 from tests.ros.topology import SHARED, Topology, remove_leftovers
 
-WIDTH, HIGH = 1200, 960
+WIDTH = 1200
+HIGH = 960
 
 
 def paint(lab: Lab, folder: Path) -> bytes:
@@ -43,7 +44,8 @@ def main() -> int:
         return 2
     remove_leftovers()
     compiled_node()
-    topology, forks = Topology(SHARED), Forks()
+    topology = Topology(SHARED)
+    forks = Forks()
     with tempfile.TemporaryDirectory() as folder:
         topology.build()
         lab = Lab(topology, Path(folder), forks)

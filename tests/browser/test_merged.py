@@ -72,7 +72,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     """A master outside and the proxy on px."""
     remove_leftovers()
     compiled_node()
-    topology, forks = Topology(PLAN), Forks()
+    topology = Topology(PLAN)
+    forks = Forks()
     topology.build()
     lab = Lab(topology, tmp_path_factory.mktemp("lab"), forks)
     lab.proxy_options = ADMIN
@@ -135,7 +136,8 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
         ("master (master)", "robot, outside"),
     ):
         assert [cells[2] for cells in node_rows(browser, name)] == [where]
-    ok, red = colour(browser, "ok"), colour(browser, "broken")
+    ok = colour(browser, "ok")
+    red = colour(browser, "broken")
     assert box_colour(browser, "two") == ok
     assert line(browser, "/talker", "/hearer")["colour"] == ok
 

@@ -140,7 +140,8 @@ def test_status_is_in_the_definition() -> None:
     """The API server drops fields that the definition does not have, without a word."""
     body = {"metadata": {"name": "a", "namespace": "b", "uid": "c", "generation": 1},
             "spec": {"ros": "1,2", "master": {"uri": "http://robot:11311"}}}  # fmt: skip
-    own, id = rosproxy(body), Name("b", "rosproxy-a-n-012345")
+    own = rosproxy(body)
+    id = Name("b", "rosproxy-a-n-012345")
     ports = PortRange(11400, 11431)
     proxy = ProxyPod(Pod(id, "u"), own.id, "c", "n", ports, "f", "rosproxy:1", ready=True)
     pod = Pod(Name("b", "talker"), "v", node="n", ip="192.0.2.3")

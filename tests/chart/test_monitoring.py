@@ -130,7 +130,8 @@ def test_panels_can_be_told_apart_and_do_not_overlap() -> None:
     taken: set[tuple[int, int]] = set()
     for panel in all_panels:
         at = panel["gridPos"]
-        across, down = range(at["x"], at["x"] + at["w"]), range(at["y"], at["y"] + at["h"])
+        across = range(at["x"], at["x"] + at["w"])
+        down = range(at["y"], at["y"] + at["h"])
         cells = set(itertools.product(across, down))
         assert across[-1] < 24
         assert not cells & taken, panel["title"]

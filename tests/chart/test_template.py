@@ -213,7 +213,8 @@ def test_two_operators() -> None:
 
 def test_operators_are_apart_and_go_one_by_one() -> None:
     manifests = objects()
-    (pod,), (budget,) = operator(manifests), of_kind(manifests, "PodDisruptionBudget")
+    (pod,) = operator(manifests)
+    (budget,) = of_kind(manifests, "PodDisruptionBudget")
     assert budget["spec"]["maxUnavailable"] == 1
     (apart,) = pod["topologySpreadConstraints"]
     assert apart["topologyKey"] == "kubernetes.io/hostname"
@@ -223,7 +224,8 @@ def test_operators_are_apart_and_go_one_by_one() -> None:
 
 def test_operators_have_a_right_to_their_lease_alone() -> None:
     manifests = objects()
-    (lease,), (pod,) = of_kind(manifests, "Lease"), operator(manifests)
+    (lease,) = of_kind(manifests, "Lease")
+    (pod,) = operator(manifests)
     assert "spec" not in lease  # so that upgrades leave alone who holds it
     name = lease["metadata"]["name"]
     assert f"--lease={NAMESPACE}/{name}" in pod["containers"][0]["args"]
@@ -293,7 +295,8 @@ def test_helms_test_may_name_its_master() -> None:
     manifests = objects(
         {"namespaces": ["robots"], "allow": {"masters": ["http://192.0.2.*:11311"]}}
     )
-    (pod,), (rosproxy,) = operator(manifests), of_kind(manifests, "RosProxy")
+    (pod,) = operator(manifests)
+    (rosproxy,) = of_kind(manifests, "RosProxy")
     service = rosproxy["spec"]["master"]["service"]["name"]
     master = f"http://{service}.{rosproxy['metadata']['namespace']}.svc:11311"
     assert f"--allow-master={master}" in pod["containers"][0]["args"]

@@ -11,7 +11,8 @@ from tests.ros.forks import Forks
 from tests.ros.lab import Lab
 from tests.ros.topology import Plan, PortMap, Topology, remove_leftovers
 
-NETWORKS, PORTS = (("c1",),), PortMap(45000, 45099, 45000)
+NETWORKS = (("c1",),)
+PORTS = PortMap(45000, 45099, 45000)
 PLANS = {
     "out": Plan("out", NETWORKS, PORTS),
     "both": Plan("both", NETWORKS, PORTS, isolated=True),
@@ -42,7 +43,8 @@ def make_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MakeLab]:
     if problem:
         pytest.fail(problem, pytrace=False)
     remove_leftovers()
-    forks, labs = Forks(), dict[str, Lab]()
+    forks = Forks()
+    labs = dict[str, Lab]()
 
     def make(plan: Plan) -> Lab:
         if plan.name not in labs:

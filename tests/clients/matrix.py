@@ -12,7 +12,10 @@ PEERS = ("rospy", "roscpp")
 SIDES = {"inside": ("c1", "out"), "outside": ("out", "c1")}
 """Where the library's node runs, and where its peers do."""
 
-SERVE, SERVE_ON, CALL, CALL_ON = "serve", "serve persistently", "call", "call persistently"
+SERVE = "serve"
+SERVE_ON = "serve persistently"
+CALL = "call"
+CALL_ON = "call persistently"
 PARAMETERS = "parameters"
 LIMITS: dict[str, tuple[str, ...]] = {
     "rosrust": (SERVE_ON, CALL_ON),

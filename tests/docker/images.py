@@ -16,7 +16,9 @@ from pathlib import Path
 
 from tests.docker.engine import ROOT, build, docker, run, running_engine
 
-PROXY, OPERATOR, ROS = "rosproxy:test", "rosproxy-operator:test", "rosproxy-test-ros:latest"
+PROXY = "rosproxy:test"
+OPERATOR = "rosproxy-operator:test"
+ROS = "rosproxy-test-ros:latest"
 ROS2 = "rosproxy-test-ros2:latest"
 HAPROXY = "rosproxy-test-haproxy:latest"
 _HERE = ROOT / "tests/docker"

@@ -92,7 +92,8 @@ def addresses(number: int) -> tuple[str, str]:
 def plug(container: str, number: int, namespace: str = "") -> None:
     """Lay a cable between a container and this host, or another network namespace."""
     interface = "eth0"
-    here, process = cable(number), str(inspect(container)["State"]["Pid"])
+    here = cable(number)
+    process = str(inspect(container)["State"]["Pid"])
     host_address, address = addresses(number)
     near = ("nsenter", f"--net={namespace}") if namespace else ()
     far = ("nsenter", "--target", process, "--net")

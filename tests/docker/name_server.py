@@ -47,7 +47,8 @@ def reply(query: bytes, names: Mapping[str, str]) -> bytes:
 
 def question(query: bytes) -> tuple[str, int]:
     """The name asked for, and where it ends."""
-    labels, at = [], 12
+    labels = []
+    at = 12
     while length := query[at]:
         labels.append(query[at + 1 : at + 1 + length].decode("ascii", "replace"))
         at += 1 + length

@@ -11,7 +11,9 @@ from typing import Any
 from tests.docker.engine import wait_until
 from tests.docker.machines import Machine, addresses, join, machine, reach
 
-ADDRESSED, NAMED, LAPTOP = 77, 78, 79
+ADDRESSED = 77
+NAMED = 78
+LAPTOP = 79
 HOST_ADDRESS, ROBOT_ADDRESS = addresses(ADDRESSED)
 MASTER_URI = f"http://{ROBOT_ADDRESS}:11311"
 

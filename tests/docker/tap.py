@@ -65,7 +65,8 @@ class EngineTap:
                 self._act("before")
             with contextlib.suppress(OSError):
                 engine.sendall(data)
-            is_rest, missing = missing > 0, body_to_come(data) if is_write else 0
+            is_rest = missing > 0
+            missing = body_to_come(data) if is_write else 0
             if (is_write or is_rest) and not missing:
                 self._act("during")
 

@@ -117,7 +117,8 @@ def test_renamed_container_goes_on(controller: Controller, net: Inside, named: R
 def test_container_moves_to_another_network(
     library: str, controller: Controller, net: Inside, named: Robot
 ) -> None:
-    old, new = net.network(), net.network()
+    old = net.network()
+    new = net.network()
     node = talker(net, old, named, library)
     proxy = the_proxy()
     ear = named.node("ear", library, "sub", "--topic", "/out")
@@ -139,7 +140,8 @@ def test_container_moves_to_another_network(
 def test_nodes_of_two_networks_hear_each_other(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    first, second = net.network(), net.network("--internal")
+    first = net.network()
+    second = net.network("--internal")
     speaking = net.node(first, "roscpp", "pub", "--topic", "/across", "--word", "neighbour")
     hearing = net.node(second, "rospy", "sub", "--topic", "/across")
 
@@ -151,7 +153,8 @@ def test_nodes_of_two_networks_hear_each_other(
 
 def test_container_of_two_networks(controller: Controller, net: Inside, named: Robot) -> None:
     """It is served on both; leaving one of them cuts nothing."""
-    first, second = net.network(), net.network()
+    first = net.network()
+    second = net.network()
     node = net.node(first, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create")
     docker("network", "connect", second, node.name)
     docker("start", node.name)
@@ -180,7 +183,8 @@ def proxy_free_network(node: Container, proxy: Proxy, *networks: str) -> str:
 def test_network_can_be_removed_when_its_containers_are_gone(
     controller: Controller, net: Inside
 ) -> None:
-    network, remaining = net.network(), net.network()
+    network = net.network()
+    remaining = net.network()
     node = net.idle(network)
     net.idle(remaining)
     proxy = the_proxy()

@@ -76,7 +76,8 @@ def test_killed_before_each_step_of_a_first_proxy(
 ) -> None:
     network = idle.network()
     idle.idle(network)
-    killed, whole = start_process(engine=tap.url), start_process()
+    killed = start_process(engine=tap.url)
+    whole = start_process()
     for step in count(1):
         if not killed_at(step, "before", tap, killed):
             break
@@ -95,7 +96,8 @@ def test_killed_during_each_step_of_a_replacement(
     """
     network = idle.network()
     idle.idle(network)
-    killed, whole = start_process(engine=tap.url), start_process()
+    killed = start_process(engine=tap.url)
+    whole = start_process()
     whole.once("--once")
     first = good(network).ports[0]
     for step in count(1):
@@ -130,7 +132,8 @@ def test_traffic_goes_on_without_the_controller(
 ) -> None:
     controller = start_controller()
     with traffic(net, named, net.network(), library) as flow:
-        before, number = time.time(), the_proxy().id
+        before = time.time()
+        number = the_proxy().id
 
         controller.kill()
         flow.wait(since=time.time())

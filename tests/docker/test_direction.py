@@ -26,7 +26,8 @@ def told_direction() -> str:
 def test_containers_on_an_internal_network_hear_and_are_heard(
     library: str, controller: Controller, net: Inside, named: Robot
 ) -> None:
-    network, service = net.network("--internal"), f"/{unique('far').replace('-', '_')}"
+    network = net.network("--internal")
+    service = f"/{unique('far').replace('-', '_')}"
     with traffic(net, named, network, library) as flow:
         flow.wait()
         assert told_direction() == "both"
@@ -39,7 +40,8 @@ def test_containers_on_an_internal_network_hear_and_are_heard(
         finally:
             named.end("far")
 
-        proxy, lost = the_proxy(), time.time()
+        proxy = the_proxy()
+        lost = time.time()
         docker("rm", "--force", proxy.name)
 
         flow.wait(since=recovered(lost), seconds=40)
@@ -63,7 +65,8 @@ def test_udpros_of_the_robot_reaches_a_container_that_asks_for_it(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
     """And the reverse, for which no port is published; also after the proxy was removed."""
-    network, words = net.network("--internal"), ("--topic", "/quick", "--udp", "1")
+    network = net.network("--internal")
+    words = ("--topic", "/quick", "--udp", "1")
     back = ("--topic", "/back", "--rate", "20", "--word", "back")
     named.node("mouth", "roscpp", "pub", "--topic", "/quick", "--rate", "20", "--word", "quick")
     listener = net.node(network, "roscpp", "sub", *words, labels=(ENABLE, "rosproxy.udp=true"))

@@ -87,7 +87,8 @@ def test_everything_comes_back_with_the_engine(
     """
     for ear in ears.values():
         ear.wait_for("inside")
-    ports, process = the_proxy().ports, controller.process
+    ports = the_proxy().ports
+    process = controller.process
 
     engine.end(how)
     assert process is not None
@@ -109,7 +110,8 @@ def test_nobody_notices_an_engine_with_live_restore(
     how: signal.Signals, engine: PrivateEngine, controller: Process, ears: dict[str, Log]
 ) -> None:
     """Containers go on without the engine, and so does the proxy."""
-    began, number = time.time(), the_proxy().id
+    began = time.time()
+    number = the_proxy().id
 
     engine.end(how)
     time_without = time.time()

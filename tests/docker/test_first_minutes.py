@@ -39,7 +39,8 @@ def test_a_label_names_the_master_and_no_variable_does(
     start_controller: Callable[..., Controller], net: Inside, named: Robot
 ) -> None:
     controller = start_controller()
-    network, labels = net.network(), (ENABLE, f"rosproxy.master-uri={named.master_uri}")
+    network = net.network()
+    labels = (ENABLE, f"rosproxy.master-uri={named.master_uri}")
     first = net.idle(network, uri="", labels=labels)
 
     text = told(controller, first.name)
@@ -172,7 +173,8 @@ def test_the_hosts_address_as_the_containers_own(
 ) -> None:
     """As manuals of drivers have it: roslaunch ends with it, and starts without."""
     controller = start_controller()
-    network, command = net.network(), ("sh", "-c", ROSLAUNCH)
+    network = net.network()
+    command = ("sh", "-c", ROSLAUNCH)
     first = net.run(network, *command, options=("--env", f"ROS_IP={named.host_address}"))
 
     text = told(controller, first.name)

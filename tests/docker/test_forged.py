@@ -24,7 +24,8 @@ def proxy(controller: Controller, net: Inside) -> Proxy:
 @pytest.fixture(params=["sandbox", "proxy"])
 def forged_image(request: pytest.FixtureRequest, proxy: Proxy, ros_image: str) -> Iterator[str]:
     """An image with all that an image can have of one of a proxy's containers."""
-    tag, made = unique("image"), docker("create", ros_image, "true")
+    tag = unique("image")
+    made = docker("create", ros_image, "true")
     name = proxy.sandbox if request.param == "sandbox" else proxy.name
     changes = [f'LABEL {key}="{value}"' for key, value in inspect(name)["Config"]["Labels"].items()]
     changes += ["USER 10001:10001", 'ENTRYPOINT ["sleep"]', 'CMD ["infinity"]']
@@ -44,8 +45,10 @@ def forged_image(request: pytest.FixtureRequest, proxy: Proxy, ros_image: str) -
 def test_image_with_the_labels_of_a_proxy_is_told_and_left_alone(
     controller: Controller, net: Inside, proxy: Proxy, forged_image: str
 ) -> None:
-    before, ports = (proxy.id, inspect(proxy.sandbox)["Id"]), proxy.ports
-    alone, joined = net.network(), net.network()
+    before = (proxy.id, inspect(proxy.sandbox)["Id"])
+    ports = proxy.ports
+    alone = net.network()
+    joined = net.network()
     forged = net.run(alone, image=forged_image, labels=(), uri="")
     wait_until(lambda: forged.name in controller.problems(), 60, controller.logs)
     text = next(line for line in controller.problems().splitlines() if forged.name in line)
@@ -98,7 +101,8 @@ def test_label_takes_no_name_of_a_server_of_others(controller: Controller, net: 
 def test_proxy_is_bounded_and_has_no_token_and_its_controller_knows_it_anyway(
     controller: Controller, net: Inside, proxy: Proxy
 ) -> None:
-    inspection, before = inspect(proxy.name), proxy.id
+    inspection = inspect(proxy.name)
+    before = proxy.id
     host = inspection["HostConfig"]
     assert (host["Memory"], host["PidsLimit"]) == (1024**3, 8192)
     names = {variable.partition("=")[0] for variable in inspection["Config"]["Env"]}

@@ -87,7 +87,8 @@ def test_proxy_containers_have_no_rights(controller: Controller, net: Inside) ->
 
     for name in (proxy.name, proxy.sandbox):
         inspection = inspect(name)
-        host, config = inspection["HostConfig"], inspection["Config"]
+        host = inspection["HostConfig"]
+        config = inspection["Config"]
         assert config["User"] == "10001:10001"
         assert host["ReadonlyRootfs"]
         assert host["CapDrop"] == ["ALL"]
@@ -175,7 +176,8 @@ def test_labels_name_master_ports_host_and_network(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
     """A container of two networks, started with the proxy's name as its master's."""
-    wanted, other = net.network(), net.network()
+    wanted = net.network()
+    other = net.network()
     labels = (ENABLE, f"rosproxy.master-uri={named.master_uri}", "rosproxy.ports=9",
               f"rosproxy.advertise-host={named.address[:-1]}1",
               f"rosproxy.network={wanted}")  # fmt: skip

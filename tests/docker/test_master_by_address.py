@@ -99,7 +99,8 @@ def test_a_network_in_common_that_is_not_the_way_outwards(
 
 
 def test_networks_joined_later_and_left(controller: Controller, near: Inside, robot: Robot) -> None:
-    first, second = near.network(), near.network()
+    first = near.network()
+    second = near.network()
     node = addressed_talker(near, first, robot)
     ear = robot.node("ear", "roscpp", "sub", "--topic", "/out")
     try:

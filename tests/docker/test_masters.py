@@ -12,7 +12,8 @@ from tests.docker.inside import ENABLE, Inside
 from tests.docker.machines import cable
 from tests.docker.robot import Robot, named_robot
 
-ROVER, MOVER = 80, 82
+ROVER = 80
+MOVER = 82
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +122,8 @@ def test_a_master_given_by_address_gets_another_one(
         controller = Process(tmp_path, *options, names={robot.name: robot.address})
         controller.start()
         try:
-            network, old = net.network(), f"http://{robot.address}:11311"
+            network = net.network()
+            old = f"http://{robot.address}:11311"
             named = (ENABLE, f"rosproxy.master-uri={robot.master_uri}")
             node = net.node(network, "rospy", "pub", "--topic", "/out", "--word", "inside",
                             uri=old, labels=named)  # fmt: skip

@@ -16,7 +16,8 @@ from tests.docker.traffic import traffic
 
 
 def test_expose_by_default(start_controller: Callable[..., Controller], net: Inside) -> None:
-    network, other = net.network(), net.network()
+    network = net.network()
+    other = net.network()
     net.idle(network, labels=())
     net.idle(other, labels=("rosproxy.enable=false",))
     start_controller("--expose-by-default")
@@ -43,7 +44,10 @@ def test_updated_image_replaces_the_proxy(
     start_controller("--proxy-image", moving_image)
     with traffic(net, named, net.network(), library) as flow:
         before = the_proxy()
-        name, number, ports, token = before.name, before.id, before.ports, secret(before)
+        name = before.name
+        number = before.id
+        ports = before.ports
+        token = secret(before)
         changed = time.time()
 
         update(moving_image)
@@ -85,7 +89,8 @@ def test_data_plane_of_the_controller_is_for_those_who_ask_for_none(
     network = net.network()
     with traffic(net, named, network, "rospy") as flow:
         wait_forwarded(flow)
-        former, ports = inspect(the_proxy().sandbox)["Id"], the_proxy().ports
+        former = inspect(the_proxy().sandbox)["Id"]
+        ports = the_proxy().ports
         changed = time.time()
 
         net.idle(network, labels=(ENABLE, "rosproxy.data-plane=copy"))

@@ -13,7 +13,8 @@ def test_a_label_hides_a_topic_from_outside(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
     """Inside hears it; no moment shows it, also when the proxy is lost, which was made before."""
-    network, topic = net.network(), f"/{unique('hidden').replace('-', '_')}"
+    network = net.network()
+    topic = f"/{unique('hidden').replace('-', '_')}"
     listener = net.node(network, "roscpp", "sub", "--topic", topic)
     wait_until(lambda: named.knows_proxied(listener.node), 30, listener.log.read)
     publish = (network, "rospy", "pub", "--topic", topic, "--word", "inside")

@@ -85,7 +85,8 @@ def test_range_grows_in_place(
     start_controller()
     network = net.network()
     with traffic(net, named, network, "roscpp") as flow:
-        before, uri = the_proxy().ports, named.uri(flow.talker.node)
+        before = the_proxy().ports
+        uri = named.uri(flow.talker.node)
         net.idle(network, labels=(ENABLE, "rosproxy.ports=12"))
         changed = time.time()
 

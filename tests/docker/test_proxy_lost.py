@@ -46,7 +46,8 @@ HOLDER_LOSSES: dict[str, Callable[[Proxy], object]] = {
 def test_lost_ports_come_back(how: str, flow: Traffic) -> None:
     """roscpp alone: rospy outside gets no word of it but by TCP keep-alive, after a minute."""
     proxy = the_proxy()
-    ports, lost = proxy.ports, time.time()
+    ports = proxy.ports
+    lost = time.time()
 
     HOLDER_LOSSES[how](proxy)
 
@@ -69,7 +70,8 @@ CASES = [
 @pytest.mark.parametrize(("how", "flow"), CASES, indirect=["flow"])
 def test_lost_proxy_comes_back_on_its_ports(how: str, flow: Traffic) -> None:
     proxy = the_proxy()
-    ports, networks = proxy.ports, proxy.networks
+    ports = proxy.ports
+    networks = proxy.networks
     lost = time.time()
 
     LOSSES[how](proxy)

@@ -61,7 +61,8 @@ def test_topics(vendor_inside: str, vendor_outside: str, lan: Outside, inside2: 
 @pytest.mark.parametrize("vendor", ["jazzy", "cyclone"])
 def test_one_more_where_a_proxy_is(vendor: str, lan: Outside, inside2: Inside2) -> None:
     """On a network that the proxy is on, and on one that it has to join."""
-    ear, network = lan.node("jazzy", "sub", "/out"), inside2.made.network()
+    ear = lan.node("jazzy", "sub", "/out")
+    network = inside2.made.network()
     inside2.node(network, "jazzy", "pub", "/out", "--word", "first")
     ear.log.wait_for("first")
 
@@ -127,7 +128,8 @@ def test_a_container_that_is_gone_takes_its_participants_with_it(
     network = inside2.made.network()
     neighbour = inside2.node(network, "jazzy", "pub", "/other", "--word", "neighbour")
     node = inside2.node(network, "jazzy", "pub", "/out")
-    watcher, ear = lan.node("jazzy", "names", "/any"), lan.node("jazzy", "sub", "/other")
+    watcher = lan.node("jazzy", "names", "/any")
+    ear = lan.node("jazzy", "sub", "/other")
     wait_for_line(watcher.log, rf"^nodes .*\b{node.node}\b")
     wait_for_line(watcher.log, rf"^nodes .*\b{neighbour.node}\b")
     proxy = the_proxy()
@@ -149,7 +151,8 @@ def test_a_neighbour_without_a_label_is_not_let_in(lan: Outside, inside2: Inside
     secret = inside2.node(network, "jazzy", "pub", "/secret", labels=())
     wait_for_line(secret.log, "^sent ")
     inside2.node(network, "jazzy", "pub", "/out", "--word", "inside")
-    ear, spy = lan.node("jazzy", "sub", "/out"), lan.node("jazzy", "sub", "/secret")
+    ear = lan.node("jazzy", "sub", "/out")
+    spy = lan.node("jazzy", "sub", "/secret")
 
     ear.log.wait_for("inside", count=50)
 
@@ -159,10 +162,12 @@ def test_a_neighbour_without_a_label_is_not_let_in(lan: Outside, inside2: Inside
 
 def test_a_network_that_its_proxy_has_left_is_heard_again(lan: Outside, inside2: Inside2) -> None:
     """The proxy leaves a network with the last container there, and comes back with the next."""
-    other, network = inside2.made.network(), inside2.made.network()
+    other = inside2.made.network()
+    network = inside2.made.network()
     inside2.node(other, "jazzy", "pub", "/other", "--word", "neighbour")
     first = inside2.node(network, "jazzy", "pub", "/out", "--word", "first")
-    neighbour, ear = lan.node("jazzy", "sub", "/other"), lan.node("jazzy", "sub", "/out")
+    neighbour = lan.node("jazzy", "sub", "/other")
+    ear = lan.node("jazzy", "sub", "/out")
     ear.log.wait_for("first")
     proxy = the_proxy()
 

@@ -160,7 +160,8 @@ def test_the_flush_deletes_entries_for_its_udp_ports_alone(
     proxy = the_proxy()
     flush = flush_of(proxy)
     wait_until(lambda: has_ended(flush), 30, lambda: docker("ps", "--all"))
-    first, relay = proxy.ports[0], proxy.ports[-1]
+    first = proxy.ports[0]
+    relay = proxy.ports[-1]
     deleted = [("udp", HERE, first), ("udp", HERE, relay - 1), ("udp", "2001:db8::1", first)]
     kept = [("udp", HERE, relay), ("udp", HERE, first - 1), ("tcp", HERE, first)]
     for entry in (*deleted, *kept):

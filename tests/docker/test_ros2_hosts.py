@@ -45,7 +45,8 @@ class Host:
 @contextmanager
 def between(engine: PrivateEngine) -> Iterator[None]:
     """A cable between this machine and the other engine's network namespace."""
-    near, far = cable(NUMBER), "eth0"
+    near = cable(NUMBER)
+    far = "eth0"
     into = ("nsenter", f"--net={engine.namespace}")
     run("ip", "link", "add", near, "type", "veth", "peer", "name", far, "netns", engine.name)
     try:
@@ -100,7 +101,9 @@ def test_containers_on_two_hosts(hosts: tuple[Host, Host], ros2_image: str) -> N
     for index, host in enumerate(hosts):
         with host.used():
             inside = Inside2(Inside(ros2_image, ""))
-            network, own, other = inside.made.network(), index, 1 - index
+            network = inside.made.network()
+            own = index
+            other = 1 - index
             inside.node(network, "jazzy", "pub", f"/from{own}", "--word", f"host{own}")
             inside.node(network, "kilted", "serve", f"/serve{own}", "--word", f"host{own}")
             listener = inside.node(network, "jazzy", "sub", f"/from{other}")

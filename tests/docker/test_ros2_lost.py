@@ -45,7 +45,9 @@ def test_what_is_lost_comes_back(how: str, flow: Flow) -> None:
     """On the same ports, which participants keep for their proxy."""
     proxy = the_proxy()
     wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
-    before, port_range, former = ports(proxy), proxy.ports, runs(proxy)
+    before = ports(proxy)
+    port_range = proxy.ports
+    former = runs(proxy)
     lost = time.time()
 
     LOSSES[how](proxy)

@@ -111,7 +111,8 @@ def test_range_grows_in_place(
         flow = Flow(lan, inside2)
         proxy = the_proxy()
         wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
-        before, participant_ports = proxy.ports, ports(proxy)
+        before = proxy.ports
+        participant_ports = ports(proxy)
         changed = time.time()
 
         inside2.made.idle(inside2.made.network(), labels=(ENABLE, "rosproxy.ports=40"))
@@ -158,7 +159,8 @@ def test_a_new_image_replaces_proxy_and_ear(
         flow = Flow(lan, inside2)
         proxy = the_proxy()
         wait_until(lambda: ports_are_kept(proxy), 30, lambda: str(domain(proxy).inside))
-        before, participant_ports = ids(proxy), ports(proxy)
+        before = ids(proxy)
+        participant_ports = ports(proxy)
         changed = time.time()
 
         update(moving_image)

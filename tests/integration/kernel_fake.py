@@ -84,7 +84,8 @@ class FakeTools(Tools):
     def _apply(self, words: list[str]) -> None:
         match words:
             case ["table", _, name, "{"]:
-                self.name, self.table = name, {}
+                self.name = name
+                self.table = {}
             case ["delete", "table", *_]:
                 self.table = None
             case ["map" | "set", name, *_] if self.table is not None:

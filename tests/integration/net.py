@@ -20,7 +20,9 @@ from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
 MASTER = "127.0.1.1"
 OUTSIDE = "127.0.1.9"
 PROXY = "127.0.2.1"
-NODE, OTHER_NODE, THIRD_NODE = "127.0.2.11", "127.0.2.12", "127.0.2.13"
+NODE = "127.0.2.11"
+OTHER_NODE = "127.0.2.12"
+THIRD_NODE = "127.0.2.13"
 HOST = "127.0.3.1"
 """What outside knows the proxy's machine by."""
 
@@ -100,7 +102,8 @@ class Wire:
     """A raw TCP connection."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader, self.writer = reader, writer
+        self.reader = reader
+        self.writer = writer
 
     @property
     def sock(self) -> socket.socket:

@@ -269,7 +269,8 @@ async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, maste
         await loop.sock_sendall(sock, post(xml("getParam", "/n", "/p")))
         return sock
 
-    idle, slow = await open_reader(NODE), await open_reader(OTHER_NODE)
+    idle = await open_reader(NODE)
+    slow = await open_reader(OTHER_NODE)
     loop = asyncio.get_running_loop()
     passes = proxy.ros1.context.unread_calls
     await until(lambda: passes.used == 2, "both replies are under way")
@@ -303,7 +304,8 @@ async def test_a_source_with_too_many_connections_is_refused_and_others_are_not(
 
 async def test_connections_to_one_port_are_bounded(make_proxy, make_node):
     proxy = await make_proxy(max_connections_per_lease=16)
-    busy, other = await make_node("/one"), await make_node("/other", OTHER_NODE)
+    busy = await make_node("/one")
+    other = await make_node("/other", OTHER_NODE)
     for node in (busy, other):
         await node.publish(proxy.master)
     async with AsyncExitStack() as stack:

@@ -47,7 +47,8 @@ class Peer:
             writer.write(REPLY)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.accepted, self.open = self.accepted + 1, self.open + 1
+        self.accepted = self.accepted + 1
+        self.open = self.open + 1
         try:
             await self.serve(reader, writer)
         except (OSError, asyncio.IncompleteReadError):
@@ -110,7 +111,8 @@ def answer(peer: Peer) -> asyncio.Event:
 
     async def late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await peer.request(reader)
-        due, ended = asyncio.create_task(event.wait()), asyncio.create_task(reader.read())
+        due = asyncio.create_task(event.wait())
+        ended = asyncio.create_task(reader.read())
         await asyncio.wait([due, ended], return_when=asyncio.FIRST_COMPLETED)
         writer.write(REPLY)
         due.cancel()
@@ -243,7 +245,9 @@ class Pieces:
     """A long body; ``fails`` after so many pieces."""
 
     def __init__(self, count: int, fails: bool = False) -> None:
-        self.size, self._count, self._fails = count * 70_000, count, fails
+        self.size = count * 70_000
+        self._count = count
+        self._fails = fails
         self.given = 0
 
     async def pieces(self) -> AsyncIterator[bytes]:

@@ -83,7 +83,8 @@ async def test_a_node_master_and_peers_over_ipv6(
 
 
 async def test_both_stacks_on_the_same_ports(proxy6: Proxy, make_node: Any) -> None:
-    four, other = await make_node("/four"), await make_node("/other", OTHER_NODE)
+    four = await make_node("/four")
+    other = await make_node("/other", OTHER_NODE)
     proxy6.master = PROXY, proxy6.settings.master_port
     await four.publish(proxy6.master)
     endpoint = proxy6.endpoint(four)

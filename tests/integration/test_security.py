@@ -109,7 +109,8 @@ async def test_a_forged_caller_api_does_not_open_a_door_to_an_ordinary_service(
 async def test_somebody_elses_registration_opens_no_further_port_of_a_node(
     proxy, make_node, victim
 ):
-    evil, other = await make_node("/evil"), await make_node("/other", OTHER_NODE)
+    evil = await make_node("/evil")
+    other = await make_node("/other", OTHER_NODE)
     forged = f"rosrpc://{OTHER_NODE}:{victim.port}"
     door = "registerService", "/door", forged, other.uri
     # In the node's own name: first as the only one who registers it, then next to the node itself.
@@ -210,7 +211,8 @@ async def test_a_forged_claim_does_not_displace_the_real_node(master, make_proxy
     proxy = await make_proxy()
     node = await make_node()
     await node.publish(proxy.master)
-    port, uri = proxy.endpoint(node).port, proxy.uri(node)
+    port = proxy.endpoint(node).port
+    uri = proxy.uri(node)
     await proxy.stop()
     topics = [f"/forged{i}" for i in range(20)]
     await forge(master, "/evil", port, f"{OTHER_NODE}:1", *topics)

@@ -38,7 +38,9 @@ class Refused(AssertionError):
 
     def __init__(self, status: int, text: str, warnings: str) -> None:
         super().__init__(f"{status}: {text}")
-        self.status, self.text, self.warnings = status, text, warnings
+        self.status = status
+        self.text = text
+        self.warnings = warnings
 
 
 def path(resource: str, namespace: str = "", name: str = "", rest: str = "") -> str:

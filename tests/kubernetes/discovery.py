@@ -60,7 +60,8 @@ def _pods(namespace: str) -> Iterator[Json]:
         address = body["status"].get("podIP")
         if not address:
             continue
-        spec, labels = body["spec"], _pod_labels(body)
+        spec = body["spec"]
+        labels = _pod_labels(body)
         for container in [*spec["containers"], *spec.get("initContainers", [])]:
             ports = container.get("ports", [])
             for port in ports:
@@ -96,7 +97,8 @@ def _by_name(resource: str, namespace: str) -> dict[str, Json]:
 
 
 def _pod_labels(body: Json) -> Labels:
-    metadata, status = body["metadata"], body["status"]
+    metadata = body["metadata"]
+    status = body["status"]
     return {
         f"{_META}namespace": metadata["namespace"],
         f"{_META}pod_name": metadata["name"],

@@ -19,7 +19,9 @@ from tests.kubernetes.cluster.network import plug_in_robot, unplug_robot
 from tests.kubernetes.pods import Namespace, Pod, unique
 from tests.kubernetes.rosproxies import Proxy, RosProxy
 
-NAME, ADDRESS, CABLE = "rosproxy-cluster-robot2", "10.88.0.51", "rpxrobot2"
+NAME = "rosproxy-cluster-robot2"
+ADDRESS = "10.88.0.51"
+CABLE = "rpxrobot2"
 _CYCLONE = (
     "<CycloneDDS><Domain><Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>"
     '<Peer Address="$(ROS_STATIC_PEERS)"/></Peers></Discovery></Domain></CycloneDDS>'

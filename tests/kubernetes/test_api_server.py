@@ -15,7 +15,8 @@ from tests.kubernetes.traffic import flow
 def test_traffic_goes_on_and_the_operator_finds_back(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
-        before, restarts = made.the_proxy(), _restarts()
+        before = made.the_proxy()
+        restarts = _restarts()
         killed = time.time()
         cluster("restart-apiserver")
         up = time.time()

@@ -89,7 +89,8 @@ def serves(net: Namespace, made: RosProxy) -> None:
 @pytest.mark.parametrize("turn", [1, 2])
 def test_the_leader_is_killed(turn: int, net: Namespace, made: RosProxy) -> None:
     """What is made while kube-proxy still leads to the one that is dead may come by unwired."""
-    uids, before = {proxy.uid_then for proxy in made.proxies}, release.holder()
+    uids = {proxy.uid_then for proxy in made.proxies}
+    before = release.holder()
     with pods_all_the_while(net) as pods:
         release.kill_operator()
         took = wait_other(before)
@@ -107,7 +108,8 @@ def test_the_leader_is_killed(turn: int, net: Namespace, made: RosProxy) -> None
 
 
 def test_the_leader_is_stopped(net: Namespace, made: RosProxy) -> None:
-    uids, before = {proxy.uid_then for proxy in made.proxies}, release.holder()
+    uids = {proxy.uid_then for proxy in made.proxies}
+    before = release.holder()
     with pods_all_the_while(net) as pods:
         release.operator().remove(wait=False)
         took = wait_other(before)

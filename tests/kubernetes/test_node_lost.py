@@ -21,7 +21,8 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
     """
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     # The API server reaches Services by way of node1: that is so in this cluster only.
-    other, lost_node = "node1", "node2"
+    other = "node1"
+    lost_node = "node2"
     _leader_on(lost_node)
     webhook = release.operator().ip
     with (

@@ -83,7 +83,8 @@ def world(robot2: Robot2) -> Iterator[World]:
 
 
 def _fill(made: World, robot2: Robot2) -> None:
-    pod, robot = made.pod, robot2.node
+    pod = made.pod
+    robot = robot2.node
     pod("jazzy", "pub", "/one", "--word", "one", on="node1")
     pod("kilted", "pub", "/two", "--word", "two", on="node2")
     pod("cyclone", "pub", "/cyclone", "--word", "cyclone", on="node1")
@@ -130,7 +131,8 @@ def test_actions(world: World) -> None:
 
 
 def test_what_users_are_told(world: World) -> None:
-    of, count = world.rosproxy, len(world.pods)
+    of = world.rosproxy
+    count = len(world.pods)
 
     of.wait_for("Ready", reason="Serving")
     of.wait_for("PortsReachable")
@@ -148,7 +150,8 @@ def test_what_users_are_told(world: World) -> None:
     assert "participants of domain 0" in of.condition("Ready")["message"]
     assert sum(line["participants"] for line in status["perNode"]) == count
     assert "Domain" in kubectl("-n", of.namespace, "describe", "rosproxy", of.name)
-    (pod, *_), port = world.pods, of.service["spec"]["ports"][0]
+    (pod, *_) = world.pods
+    port = of.service["spec"]["ports"][0]
     assert pod.environment["ROS_STATIC_PEERS"] == status["staticPeers"]
     assert (port["protocol"], port["port"]) == ("UDP", 7410)
     assert len(ears(of)) == len(NODES)
@@ -207,10 +210,12 @@ LOSSES: dict[str, Callable[[RosProxy, Proxy], object]] = {
 @pytest.mark.parametrize("how", LOSSES)
 def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None:
     """On the same ports, for the same participants; outside and inside hear on."""
-    of, flows = world.rosproxy, world.flows
+    of = world.rosproxy
+    flows = world.flows
     proxy = of.the_proxy("node1")
     _wait_until_ports_are_kept(world)
-    before, lost = leased(proxy), time.time()
+    before = leased(proxy)
+    lost = time.time()
 
     LOSSES[how](of, proxy)
 
@@ -231,7 +236,8 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
 
 def _wait_until_ports_are_kept(world: World) -> None:
     """Until all participants have met, so that they have all of their ports, and keep them."""
-    of, now = world.rosproxy, time.time()
+    of = world.rosproxy
+    now = time.time()
     for log, text in world.flows.values():
         log.wait_for(text, since=now)
     wait_until(
@@ -242,7 +248,8 @@ def _wait_until_ports_are_kept(world: World) -> None:
 
 def test_on_other_ports_participants_meet_anew(world: World) -> None:
     """Of a RosProxy that forbids the former ones."""
-    of, changed = world.rosproxy, time.time()
+    of = world.rosproxy
+    changed = time.time()
 
     of.change(portWindow={"first": 13000, "last": 13199})
 
@@ -261,7 +268,8 @@ def test_another_image_of_the_proxies(world: World) -> None:
     """It is changed in place: the same pods, the same ports; one proxy after the other."""
     of = world.rosproxy
     _wait_until_ports_are_kept(world)
-    before, started = _all_leased(of), time.time()
+    before = _all_leased(of)
+    started = time.time()
 
     release.upgrade(proxy={"image": {"tag": release.other_image()}})
     wait_until(lambda: all(of.the_proxy(on).restarts > 0 for on in NODES), 90, of.tell)
@@ -277,14 +285,16 @@ def test_another_image_of_the_proxies(world: World) -> None:
 
 def test_a_node_is_stopped_and_comes_back(world: World) -> None:
     """The robot and the other node's pods hear each other meanwhile; then all do again."""
-    of, lost_node = world.rosproxy, "node2"
+    of = world.rosproxy
+    lost_node = "node2"
     ports = of.the_proxy(lost_node).ports
     back = world.heard["the robot hears /two"], world.heard["jazzy on node2 hears /one"]
     lost = time.time()
     cluster("stop-node", lost_node)
     try:
         of.wait_status(lambda told: not of.on(lost_node).get("ready"), "it is told", 60)
-        outward, inward = world.flows["outward"], world.flows["inward"]
+        outward = world.flows["outward"]
+        inward = world.flows["inward"]
         outside = max(log.longest_gap(text, lost, time.time()) for log, text in (outward, inward))
         assert outside < UNNOTICED, outside
     finally:

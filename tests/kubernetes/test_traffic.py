@@ -43,7 +43,8 @@ def world(_release: None, robot: Robot) -> Iterator[World]:
 
 
 def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> None:
-    place, mark = (library, on), f"{library}_{on}"
+    place = (library, on)
+    mark = f"{library}_{on}"
     other = NODES[1 - NODES.index(on)]
     # As in a tutorial: with the URI of the robot's master, and the label.
     made.talkers[place] = net.node(

@@ -20,7 +20,8 @@ def test_helm_test() -> None:
 def test_upgrade_of_the_operator_only(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
-        before, started = made.the_proxy(), time.time()
+        before = made.the_proxy()
+        started = time.time()
         release.upgrade(log={"level": "debug"})
         release.wait_operator()
         traffic.wait(since=time.time())
@@ -34,7 +35,8 @@ def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
     other = release.other_image()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "rospy") as traffic:
-        before, started = made.the_proxy(), time.time()
+        before = made.the_proxy()
+        started = time.time()
         release.upgrade(proxy={"image": {"tag": other}})
         wait_until(lambda: made.the_proxy().restarts == 1, 60, made.tell)
         traffic.wait(since=time.time(), seconds=60)

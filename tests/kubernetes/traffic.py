@@ -63,7 +63,9 @@ def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Itera
     """Twenty messages and five calls a second, which cost a processor more."""
     wait_for_service(net)
     mark = unique("flow").replace("-", "_")
-    out, back, service = f"/out_{mark}", f"/in_{mark}", f"/serve_{mark}"
+    out = f"/out_{mark}"
+    back = f"/in_{mark}"
+    service = f"/serve_{mark}"
     talker = net.node(library, "pub", "--topic", out, "--word", "inside", on=on)
     listener = net.node(library, "sub", "--topic", back, on=on)
     server = net.node(library, "serve", "--service", service, on=on)

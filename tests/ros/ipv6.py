@@ -40,7 +40,8 @@ class Topology6(Topology):
         sysctl(self.places["px"], "net.ipv6.conf.all.forwarding=1")
 
     def _join(self, role: str) -> None:
-        place, proxy = self.places[role], self.places["px"]
+        place = self.places[role]
+        proxy = self.places["px"]
         peer = ("peer", "name", "eth0", "netns", place.namespace)
         ip("-n", proxy.namespace, "link", "add", f"{role}0", "type", "veth", *peer)
         # Without duplicate address detection they can be used at once.

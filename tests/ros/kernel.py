@@ -21,7 +21,8 @@ LIMIT = 60.0
 
 def talk(lab: Lab, library: str = "rospy", sink: str = "rospy") -> tuple[str, Process, Process]:
     """A publisher inside and a subscriber outside, connected: name and processes."""
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    topic = f"/{lab.unique('topic')}"
+    name = lab.unique("talker")
     sender = lab.node(library, "c1", "pub", name=name, topic=topic, rate=50)
     lab.wait_registered(name)
     receiver = lab.node(sink, "out", "sub", topic=topic)
@@ -42,7 +43,8 @@ def node_status(lab: Lab, name: str) -> dict[str, Any]:
 
 def in_table(lab: Lab, name: str) -> bool:
     """Whether ``rosproxy status`` tells as many connections through the kernel as its JSON does."""
-    plane, text = plane_of(lab, name), lab.rosproxy("status").output
+    plane = plane_of(lab, name)
+    text = lab.rosproxy("status").output
     counted = text.replace("1 connection ", "1 connections ")
     return f"{plane['connections']} connections through port {plane['port']}" in counted
 
@@ -136,7 +138,8 @@ def end_without_a_trace(lab: Lab, family: str = "ipv4") -> None:
 
 def status_of_unanswered(lab: Lab) -> tuple[str, dict[str, Any]]:
     """A topic that a subscriber gets though nothing comes back through the kernel; its node."""
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    topic = f"/{lab.unique('topic')}"
+    name = lab.unique("talker")
     lab.node("roscpp", "c1", "pub", name=name, topic=topic, rate=50)
     lab.wait_registered(name)
     with dropping(lab):
@@ -163,7 +166,8 @@ def other_proxy(lab: Lab, prefix: tuple[str, ...] = (), path: str = "") -> Itera
     assert lab.proxy is not None
     before = lab.proxy_prefix, lab.proxy_path
     lab.proxy.stop()
-    lab.proxy_prefix, lab.proxy_path = prefix, path or lab.proxy_path
+    lab.proxy_prefix = prefix
+    lab.proxy_path = path or lab.proxy_path
     lab.ensure_running()
     try:
         yield

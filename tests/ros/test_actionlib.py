@@ -5,7 +5,8 @@ from __future__ import annotations
 from tests.ros.combinations import each_way_in_turn
 from tests.ros.lab import Lab
 
-SUCCEEDED, PREEMPTED = 3, 2
+SUCCEEDED = 3
+PREEMPTED = 2
 
 
 @each_way_in_turn("server", "client")

@@ -19,7 +19,8 @@ NOWHERE = {"ROS_HOSTNAME": "a-name-that-resolves-nowhere"}
 
 def exchange_messages(lab: Lab, library: str, sink: str, **options: Any) -> None:
     """A publisher in c1, started with `options`, is heard in `sink`; and the other way."""
-    forward_topic, back_topic = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
+    forward_topic = f"/{lab.unique('there')}"
+    back_topic = f"/{lab.unique('back')}"
     lab.node(library, "c1", "pub", topic=forward_topic, **options)
     receiver = lab.node(library, "c1", "sub", topic=back_topic, **options)
     lab.node("roscpp", sink, "sub", topic=forward_topic).wait_for_count("^got hello ", 3)
@@ -29,7 +30,8 @@ def exchange_messages(lab: Lab, library: str, sink: str, **options: Any) -> None
 
 def call_both_ways(lab: Lab, library: str, sink: str, **options: Any) -> None:
     """A server in c1, started with `options`, is called from `sink`; and the other way."""
-    forward_service, back_service = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
+    forward_service = f"/{lab.unique('there')}"
+    back_service = f"/{lab.unique('back')}"
     lab.node(library, "c1", "serve", service=forward_service, **options)
     lab.node("roscpp", sink, "call", service=forward_service).wait_for("^reply ask 0 ")
     lab.node("rospy", sink, "serve", service=back_service)
@@ -68,7 +70,8 @@ def test_a_node_bound_to_loopback_is_named_in_the_log_with_the_fix(lab: Lab, lib
     """With ROS_IP=127.0.0.1 both libraries listen on loopback only: nobody can reach them."""
     assert lab.proxy is not None
     since = lab.proxy.mark()
-    name, topic = lab.unique("lonely"), f"/{lab.unique('topic')}"
+    name = lab.unique("lonely")
+    topic = f"/{lab.unique('topic')}"
     lab.node(library, "c1", "pub", name=name, topic=topic, env={"ROS_IP": "127.0.0.1"})
     lab.node("rospy", "out", "sub", topic=topic)
     warning = lab.proxy.wait_for(rf"^.*WARNING.*/{name}\b.*loopback.*$", since=since)[0]

@@ -145,7 +145,8 @@ def test_a_node_that_answers_survives_the_news_that_it_is_gone(lab: Lab, library
 @each_library
 def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) -> None:
     """Heard outside and inside, by those who listened before and after; it lives on."""
-    name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
+    name = lab.unique("stray")
+    topic = f"/{lab.unique('t')}"
     before = {
         (role, peer): lab.node(peer, role, "sub", topic=topic)
         for role in ("out", "c2")
@@ -180,7 +181,8 @@ def assert_no_gap(receiver: Process) -> None:
 @each_library
 def test_a_stray_subscriber_is_adopted(lab: Lab, library: str) -> None:
     """It hears those that it could hear before without a gap, and those that come later."""
-    name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
+    name = lab.unique("stray")
+    topic = f"/{lab.unique('t')}"
     outside = lab.node("roscpp", "out", "pub", topic=topic)
     outside.wait_for("^sent ")
     node = stray(lab, library, "sub", name=name, topic=topic)
@@ -210,7 +212,8 @@ def test_a_stray_server_is_adopted(lab: Lab, library: str) -> None:
 @pytest.mark.direct
 @each_library
 def test_a_stray_under_a_name_that_only_its_container_knows(lab: Lab, library: str) -> None:
-    name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
+    name = lab.unique("stray")
+    topic = f"/{lab.unique('t')}"
     stray(lab, library, "pub", name=name, topic=topic, env={})
     assert "c1box" in (lab.node_uri(name) or "")
     assert arrived(lab)["adopted"] == 1
@@ -257,7 +260,8 @@ def test_strays_that_the_master_reaches_are_not_shut_down(
     lab: Lab, library: str, tmp_path: Path
 ) -> None:
     """Adopted while the master could end them; and then registering around the proxy again."""
-    name, more = lab.unique("stray"), tmp_path / "more"
+    name = lab.unique("stray")
+    more = tmp_path / "more"
     with reached_by_the_master(lab, "c1"):
         node = stray(
             lab, library, "more", name=name, topic=f"/{name}/a", then=f"/{name}/b", when=more
@@ -284,7 +288,8 @@ def provider(lab: Lab, service: str) -> str:
 @each_library
 def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> None:
     """Half of its registrations go around the proxy after it has been adopted."""
-    nodes, names = [], [lab.unique("stray") for _ in range(4)]
+    nodes = []
+    names = [lab.unique("stray") for _ in range(4)]
     with reached_by_the_master(lab, "c1"), before_the_proxy(lab, "c1"):
         for name in names:
             options = {"env": {"ROS_IP": lab.place("c1").address}, "topic": f"/{name}/t"}
@@ -307,7 +312,8 @@ def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> N
 def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
     lab: Lab, library: str, tmp_path: Path
 ) -> None:
-    name, more = lab.unique("stray"), tmp_path / "more"
+    name = lab.unique("stray")
+    more = tmp_path / "more"
     node = stray(
         lab, library, "more", name=name, topic=f"/{name}/a", then=f"/{name}/b", when=more, last=1
     )
@@ -324,7 +330,8 @@ def test_a_stray_that_registers_through_the_proxy_before_the_news(
     lab: Lab, library: str, tmp_path: Path
 ) -> None:
     """Its connection to the master is lost; the next registration takes the others along."""
-    name, more = lab.unique("stray"), tmp_path / "more"
+    name = lab.unique("stray")
+    more = tmp_path / "more"
     with reached_by_the_master(lab, "c1"):
         node = stray(
             lab, library, "more", name=name, topic=f"/{name}/a", then=f"/{name}/b", when=more
@@ -347,7 +354,8 @@ def end_connections(place: Place, master: str) -> None:
 @contextlib.contextmanager
 def address_changed(place: Place, after: str) -> Iterator[None]:
     """The machine has another address, as a container that was taken off its network and back."""
-    before, gateway = place.address, place.address.rpartition(".")[0] + ".1"
+    before = place.address
+    gateway = place.address.rpartition(".")[0] + ".1"
 
     def change(old: str, new: str) -> None:
         ip("-n", place.namespace, "addr", "del", f"{old}/24", "dev", "eth0")
@@ -367,7 +375,9 @@ def test_a_container_that_has_moved(
     lab: Lab, library: str, measure: Measure, tmp_path: Path
 ) -> None:
     """Heard again on the same port, outside and inside; and it can register more."""
-    name, more, place = lab.unique("moved"), tmp_path / "more", lab.place("c3")
+    name = lab.unique("moved")
+    more = tmp_path / "more"
+    place = lab.place("c3")
     options = {"topic": f"/{name}/a", "then": f"/{name}/b", "when": more}
     env = {"ROS_IP": place.address}
     node = lab.node(library, "c3", "more", name=name, env=env, **options)
@@ -380,7 +390,8 @@ def test_a_container_that_has_moved(
         peer.wait_for_count("^got ", 3)
     # The proxy ends connections that are idle for 75 s; one that is kept hangs with its address.
     end_connections(place, lab.place("px").address)
-    before, old = lab.node_uri(name), place.address
+    before = lab.node_uri(name)
+    old = place.address
     with address_changed(place, old.rpartition(".")[0] + ".99"):
         marks = [peer.mark() for peer in peers]
         moved = time.time()

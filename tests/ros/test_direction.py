@@ -26,7 +26,8 @@ PROXY_OPTIONS = ("--direction", "out")
 
 @each_library
 def test_inside_is_heard_and_hears_nobody(lab: Lab, library: str) -> None:
-    topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
+    topic = f"/{lab.unique('topic')}"
+    service = f"/{lab.unique('service')}"
     name = lab.unique("talker")
     lab.node(library, "out", "pub", name=name, topic=topic)
     deaf = lab.node(library, "c1", "sub", topic=topic)
@@ -65,7 +66,8 @@ def test_nodes_of_outside_may_run_beside_the_proxy(
     lab: Lab, beside: dict[str, str], outside_library: str, inside_library: str
 ) -> None:
     """On its machine, by an address that is the proxy's own as well."""
-    topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
+    topic = f"/{lab.unique('topic')}"
+    service = f"/{lab.unique('service')}"
     host_env = {"ROS_IP": OUT_HOST}
     lab.node(outside_library, "host", "pub", topic=topic, env=host_env)
     lab.node(outside_library, "host", "serve", service=service, env=host_env)

@@ -47,13 +47,16 @@ def greet(lab: Lab, address: tuple[str, int], **fields: str) -> dict[str, str]:
 def test_what_is_denied_is_not_reached_by_a_known_address_either(
     lab: Lab, outside_library: str, inside_library: str
 ) -> None:
-    topic, service, name = f"/{lab.unique('t')}", f"/{lab.unique('s')}", lab.unique("talker")
+    topic = f"/{lab.unique('t')}"
+    service = f"/{lab.unique('s')}"
+    name = lab.unique("talker")
     lab.node(outside_library, "out", "pub", name=name, topic=topic, rate=20)
     lab.node(outside_library, "out", "serve", service=service).wait_for("^ready")
     receiver = lab.node(inside_library, "c1", "sub", topic=topic)
     receiver.wait_for_count("^got ", 5)
     lab.node(inside_library, "c2", "call", service=service, count=3).wait_for("^done")
-    talker, server = told(lab, "lookupNode", f"/{name}"), told(lab, "lookupService", service)
+    talker = told(lab, "lookupNode", f"/{name}")
+    server = told(lab, "lookupService", service)
     assert "error" not in greet(lab, talker, topic=topic)
     assert "error" not in greet(lab, server, service=service)
 
@@ -86,7 +89,8 @@ def test_who_wants_datagrams_alone_is_told_what_that_needs(lab: Lab) -> None:
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_the_live_page_shows_what_comes_in_by_the_proxy(lab: Lab, library: str) -> None:
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    topic = f"/{lab.unique('topic')}"
+    name = lab.unique("talker")
     lab.node(library, "out", "pub", name=name, topic=topic, rate=20)
     lab.node(library, "c1", "sub", topic=topic).wait_for_count("^got ", 5)
     shown = lab.wait_shown(topic, carried="splice", state="ok", flows=True)

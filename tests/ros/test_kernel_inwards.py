@@ -102,7 +102,8 @@ def test_who_is_not_selected_gets_nothing(lab: Lab) -> None:
     """The kernel sends on what comes from those alone who may use the proxy as their master."""
     topic, _, receiver = talk(lab, "rospy", "roscpp")
     port = wait_forwarded(lab, name_of(lab, topic))["port"]
-    c1_address, c2_address = lab.place("c1").address, lab.place("c2").address
+    c1_address = lab.place("c1").address
+    c2_address = lab.place("c2").address
     code = f"import socket, time; socket.create_connection(('{lab.place('px').address}', {port}), "
     code += "2); time.sleep(1)"
 

@@ -67,7 +67,8 @@ def test_a_graceful_stop_leaves_nothing_in_the_kernel(lab: Lab) -> None:
 
 def test_the_port_of_a_killed_node_refuses(lab: Lab) -> None:
     name, sender, _ = talk(lab, "roscpp")
-    port, host = kernel.wait_forwarded(lab, name)["port"], PROXY_ADDRESSES["out"]
+    port = kernel.wait_forwarded(lab, name)["port"]
+    host = PROXY_ADDRESSES["out"]
     assert not kernel.refuses(lab, port, host)
     sender.kill()
     wait_until("the port refuses", lambda: kernel.refuses(lab, port, host), LIMIT)

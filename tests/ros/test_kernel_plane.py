@@ -48,7 +48,8 @@ def test_the_kernel_forwards_a_topic(lab: Lab, publisher: str, subscriber: str) 
 
 
 def test_an_inside_node_in_no_common_network_is_forwarded_too(lab: Lab) -> None:
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    topic = f"/{lab.unique('topic')}"
+    name = lab.unique("talker")
     lab.node("roscpp", "c1", "pub", name=name, topic=topic, rate=50)
     lab.wait_registered(name)
     receiver = lab.node("roscpp", "c2", "sub", topic=topic)

@@ -45,7 +45,8 @@ def test_the_published_master_tells_its_published_address(lab: Lab) -> None:
 
 
 def test_parameters_and_tools_through_the_published_master(lab: Lab) -> None:
-    key, name = f"/{lab.unique('value')}", lab.unique("talker")
+    key = f"/{lab.unique('value')}"
+    name = lab.unique("talker")
     lab.ask_master("setParam", key, {"a": [1, 2.0, ""]})
     assert lab.ask_master("getParam", key, role="c2") == {"a": [1, 2.0, ""]}
     node = lab.node("rospy", "c2", "pub", name=name, topic=f"/{name}/topic")

@@ -171,7 +171,8 @@ def test_a_killed_service_is_missed_and_its_successor_found(
 @pytest.mark.direct
 @each_library
 def test_a_publisher_that_comes_back_at_the_same_port_is_heard(lab: Lab, library: str) -> None:
-    name, ports = lab.unique("phoenix"), {"xmlrpc_port": 40001, "tcpros_port": 40002}
+    name = lab.unique("phoenix")
+    ports = {"xmlrpc_port": 40001, "tcpros_port": 40002}
     topic = f"/{name}/topic"
     for text in ("first", "second"):
         node = lab.node("rospy", "out", "pub", name=name, topic=topic, word=text, **ports)
@@ -199,7 +200,8 @@ def test_tools_go_on_after_the_proxy_was_killed(lab: Lab, library: str) -> None:
 @pytest.mark.direct
 def test_a_port_that_the_proxy_needs_itself_is_named_with_the_fix(lab: Lab) -> None:
     assert lab.proxy is not None
-    since, name = lab.proxy.mark(), lab.unique("unlucky")
+    since = lab.proxy.mark()
+    name = lab.unique("unlucky")
     own = lab.topology.plan.ports.last
     node = lab.node("rospy", "out", "pub", name=name, topic=f"/{name}", xmlrpc_port=own)
     node.wait_for("^sent ")

@@ -35,7 +35,8 @@ def test_services(lab: Lab, server: str, client: str, source: str, sink: str) ->
 @each_library
 def test_the_same_name_in_use_on_both_networks(lab: Lab, library: str) -> None:
     """ROS's own rule holds: the newer node ends the older one of the same name."""
-    name, topic = lab.unique("same"), f"/{lab.unique('topic')}"
+    name = lab.unique("same")
+    topic = f"/{lab.unique('topic')}"
     older = lab.node(library, "c1", "pub", name=name, topic=topic, word="older")
     receiver = lab.node(library, "c2", "sub", topic=topic)
     receiver.wait_for("^got older ")

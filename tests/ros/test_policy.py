@@ -59,7 +59,8 @@ def lease(lab: Lab, name: str) -> tuple[str, int]:
 
 def greet(lab: Lab, name: str, **fields: str) -> dict[str, str]:
     """What a TCPROS header is answered with that is sent to a node from outside."""
-    place, header = lab.place("out"), {"callerid": "/spy", "md5sum": "*", **fields}
+    place = lab.place("out")
+    header = {"callerid": "/spy", "md5sum": "*", **fields}
     with place.entered(), socket.create_connection(lease(lab, name), timeout=20) as conn:
         conn.sendall(encode_header(header))
         stream = conn.makefile("rb")
@@ -69,7 +70,8 @@ def greet(lab: Lab, name: str, **fields: str) -> dict[str, str]:
 @pytest.mark.smoke
 @PAIRS
 def test_a_hidden_topic_is_heard_inside_alone(lab: Lab, first: str, second: str) -> None:
-    name, topic = lab.unique("talker"), f"/hidden/{lab.unique('topic')}"
+    name = lab.unique("talker")
+    topic = f"/hidden/{lab.unique('topic')}"
     early = lab.node(second, "c2", "sub", topic=topic)
     early.wait_for("^ready")
     lab.node(first, "c1", "pub", name=name, topic=topic, rate=20)
@@ -92,7 +94,8 @@ def test_a_hidden_topic_is_heard_inside_alone(lab: Lab, first: str, second: str)
 
 @PAIRS
 def test_a_hidden_service_is_called_inside_alone(lab: Lab, first: str, second: str) -> None:
-    name, service = lab.unique("server"), f"/hidden/{lab.unique('service')}"
+    name = lab.unique("server")
+    service = f"/hidden/{lab.unique('service')}"
     lab.node(first, "c1", "serve", name=name, service=service).wait_for("^ready")
     caller = lab.node(second, "c2", "call", service=service, count=3, rate=50)
     caller.wait_for("^done")
@@ -113,7 +116,8 @@ def test_a_change_cuts_outside_and_leaves_inside(lab: Lab, first: str, second: s
     assert answer["hidden"] == 1
     assert answer["cut"] >= 1
     assert topic not in lab.run("out", "rostopic", "list", "-p").output
-    before, heard = outside.mark(), len(inside.wait_for_count("^got ", 1))
+    before = outside.mark()
+    heard = len(inside.wait_for_count("^got ", 1))
     inside.wait_for_count("^got ", heard + 20)
     assert "got " not in outside.output(before)
     assert tell(lab)["shown"] == 1
@@ -133,7 +137,8 @@ def test_audit_changes_nothing_and_tells(lab: Lab) -> None:
 
 @each_library
 def test_hidden_topics_are_known_to_a_proxy_that_was_killed(lab: Lab, library: str) -> None:
-    name, topic = lab.unique("talker"), f"/hidden/{lab.unique('topic')}"
+    name = lab.unique("talker")
+    topic = f"/hidden/{lab.unique('topic')}"
     lab.node(library, "c1", "pub", name=name, topic=topic, rate=20)
     early = lab.node("rospy", "c2", "sub", topic=topic)
     early.wait_for_count("^got ", 5)
@@ -151,7 +156,8 @@ def test_hidden_topics_are_known_to_a_proxy_that_was_killed(lab: Lab, library: s
 
 @each_library
 def test_hidden_services_are_found_by_a_proxy_that_was_killed(lab: Lab, library: str) -> None:
-    name, service = lab.unique("server"), f"/hidden/{lab.unique('service')}"
+    name = lab.unique("server")
+    service = f"/hidden/{lab.unique('service')}"
     lab.node(library, "c1", "serve", name=name, service=service).wait_for("^ready")
     lab.wait_registered(name)
     assert lab.proxy
@@ -164,7 +170,8 @@ def test_hidden_services_are_found_by_a_proxy_that_was_killed(lab: Lab, library:
 
 @PAIRS
 def test_what_is_denied_of_outside_is_hidden_inside(lab: Lab, first: str, second: str) -> None:
-    topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
+    topic = f"/{lab.unique('topic')}"
+    service = f"/{lab.unique('service')}"
     tell(lab, f"deny subscribe {topic}", f"deny call {service}", "deny get-param /secret/*")
     lab.node(first, "out", "pub", topic=topic, word="far", rate=20).wait_for("^sent ")
     lab.node(first, "out", "serve", service=service).wait_for("^ready")

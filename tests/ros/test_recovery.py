@@ -58,7 +58,8 @@ def next_time(process: Process, pattern: str, started: float) -> float:
 def test_messages_flow_again_after_the_proxy_was_killed(
     lab: Lab, publisher: str, subscriber: str, source: str, sink: str, measure: Measure
 ) -> None:
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    topic = f"/{lab.unique('topic')}"
+    name = lab.unique("talker")
     sender = lab.node(publisher, source, "pub", name=name, topic=topic, rate=100)
     receiver = lab.node(subscriber, sink, "sub", topic=topic)
     receiver.wait_for_count("^got ", 5)

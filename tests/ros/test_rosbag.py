@@ -20,7 +20,8 @@ def test_rosbag_records_and_plays(
     lab: Lab, library: str, source: str, sink: str, tmp_path: Path
 ) -> None:
     """Recorded at the sink from a node of the source, played there to a node of the source."""
-    topic, bag = f"/{lab.unique('recorded')}", tmp_path / "test.bag"
+    topic = f"/{lab.unique('recorded')}"
+    bag = tmp_path / "test.bag"
     lab.node(library, source, "pub", topic=topic, rate=50)
     recorder = lab.start(sink, "rosbag", "record", "-O", str(bag), topic)
     wait_until("the recorder has subscribed", lambda: lab.users(topic)[1])

@@ -28,7 +28,8 @@ def test_rosparam_set_get_list_and_delete(lab: Lab, side: str) -> None:
 
 @each_side
 def test_rosparam_dump_and_load(lab: Lab, side: str, tmp_path: Path) -> None:
-    key, copy = f"/{lab.unique('origin')}", f"/{lab.unique('copy')}"
+    key = f"/{lab.unique('origin')}"
+    copy = f"/{lab.unique('copy')}"
     value = {"list": [1, 2.5, "x"], "deep": {"flag": False, "empty": ""}}
     lab.ask_master("setParam", key, value, role=OTHER[side])
     lab.run(side, "rosparam", "dump", str(tmp_path / "p.yaml"), key)

@@ -51,7 +51,8 @@ def test_a_persistent_connection_carries_every_call(
 def test_requests_and_answers_of_1_mb_arrive_unharmed(
     lab: Lab, server: str, client: str, source: str, sink: str
 ) -> None:
-    service, size = f"/{lab.unique('bigservice')}", 1024 * 1024
+    service = f"/{lab.unique('bigservice')}"
+    size = 1024 * 1024
     serving = lab.node(server, source, "serve", service=service)
     caller = lab.node(client, sink, "call", service=service, size=size, count=2)
     replies = [match[1] for match in caller.wait_for_count(rf"^reply (.* size {size} crc \w+)", 2)]

@@ -32,7 +32,8 @@ LOOKED_AFTER = 45.0
 @pytest.fixture(params=["splice", "kernel"])
 def lab_with_plane(lab: Lab, request: pytest.FixtureRequest) -> Iterator[Lab]:
     """A proxy that relays connections itself, or has the kernel forward them."""
-    before, lab.proxy_options = lab.proxy_options, ("--data-plane", request.param)
+    before = lab.proxy_options
+    lab.proxy_options = ("--data-plane", request.param)
     restart_proxy(lab)
     yield lab
     lab.proxy_options = before
@@ -41,7 +42,8 @@ def lab_with_plane(lab: Lab, request: pytest.FixtureRequest) -> Iterator[Lab]:
 def test_a_subscriber_that_gave_up_after_a_restart_hears_its_publisher_again(
     lab_with_plane: Lab,
 ) -> None:
-    lab, topic = lab_with_plane, f"/{lab_with_plane.unique('topic')}"
+    lab = lab_with_plane
+    topic = f"/{lab_with_plane.unique('topic')}"
     lab.node("roscpp", "c1", "pub", topic=topic, rate=50)
     nodes = {
         name: lab.node(library, "out", "sub", name=name, topic=topic, udp=udp)
@@ -72,7 +74,8 @@ def test_a_subscriber_that_gave_up_after_a_restart_hears_its_publisher_again(
 def test_what_the_kernel_forwards_is_not_interrupted_by_a_restart(
     lab_with_plane: Lab, library: str
 ) -> None:
-    lab, topic = lab_with_plane, f"/{lab_with_plane.unique('topic')}"
+    lab = lab_with_plane
+    topic = f"/{lab_with_plane.unique('topic')}"
     lab.node("roscpp", "c1", "pub", topic=topic, rate=50)
     name = lab.unique("ear")
     receiver = lab.node(library, "out", "sub", name=name, topic=topic)

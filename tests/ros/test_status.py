@@ -27,7 +27,8 @@ def status_of(lab: Lab, name: str) -> dict[str, Any]:
 @each_library
 def test_status_shows_a_node_with_its_addresses_and_connections(lab: Lab, library: str) -> None:
     name = lab.unique("shown")
-    topic, service = f"/{name}/topic", f"/{name}/service"
+    topic = f"/{name}/topic"
+    service = f"/{name}/service"
     lab.node(library, "c1", "pub", name=name, topic=topic)
     lab.node(library, "c2", "serve", name=f"{name}_server", service=service).wait_for("^ready")
     lab.node(library, "out", "sub", name=f"{name}_sub", topic=topic).wait_for_count("^got ", 3)
@@ -61,7 +62,8 @@ def counted(lab: Lab, topic: str, side: str) -> float:
 def test_metrics_count_the_messages_of_nodes_inside(lab: Lab, library: str) -> None:
     """Once each, though two hear them; of what comes in as well."""
     name = lab.unique("counted")
-    outward, inward = f"/{name}/outward", f"/{name}/inward"
+    outward = f"/{name}/outward"
+    inward = f"/{name}/inward"
     publisher = lab.node(library, "c1", "pub", name=name, topic=outward)
     lab.node("roscpp", "out", "pub", topic=inward)
     for role, topic in (("out", outward), ("out", outward), ("c2", inward)):

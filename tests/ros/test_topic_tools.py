@@ -10,7 +10,8 @@ from tests.ros.lab import Lab
 
 @each_direction
 def test_topic_tools_relay(lab: Lab, source: str, sink: str) -> None:
-    topic, again = f"/{lab.unique('source')}", f"/{lab.unique('again')}"
+    topic = f"/{lab.unique('source')}"
+    again = f"/{lab.unique('again')}"
     lab.node("rospy", source, "pub", topic=topic)
     lab.start(sink, "/usr/lib/topic_tools/relay", topic, again)
     lab.node("rospy", source, "sub", topic=again).wait_for_count("^got hello ", 5)
@@ -18,7 +19,8 @@ def test_topic_tools_relay(lab: Lab, source: str, sink: str) -> None:
 
 @each_direction
 def test_topic_tools_throttle(lab: Lab, source: str, sink: str) -> None:
-    topic, slow = f"/{lab.unique('source')}", f"/{lab.unique('slow')}"
+    topic = f"/{lab.unique('source')}"
+    slow = f"/{lab.unique('slow')}"
     lab.node("roscpp", source, "pub", topic=topic, rate=50)
     lab.start(sink, "/usr/lib/topic_tools/throttle", "messages", topic, "5", slow)
     lines = lab.node("roscpp", source, "sub", topic=slow).wait_for_count(

@@ -37,7 +37,9 @@ class Second:
     """The proxy on px2."""
 
     def __init__(self, lab: Lab) -> None:
-        self._lab, self._master, self._host = lab, MASTER_URI, OUT_HOST
+        self._lab = lab
+        self._master = MASTER_URI
+        self._host = OUT_HOST
         if lab.topology.plan == IN_A_ROW:
             self._master = f"http://{lab.place('px').address}:{MASTER_PORT}"
             self._host = lab.place("px2").address

@@ -47,7 +47,8 @@ def relays(lab: Lab, topic: str) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("size", [0, 10000], ids=["small", "in-several-datagrams"])
 @pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
 def test_messages_come_by_udp(lab: Lab, first: str, size: int, source: str, sink: str) -> None:
-    topic, name = f"/{lab.unique('udp')}", lab.unique("udp_talker")
+    topic = f"/{lab.unique('udp')}"
+    name = lab.unique("udp_talker")
     if first == "subscriber":
         receiver = listener(lab, sink, topic)
         receiver.wait_for("^ready")

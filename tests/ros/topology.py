@@ -189,7 +189,8 @@ class Topology:
         self.places["host"].addresses.append(self.plan.host)
 
     def _join_inside(self, number: int, members: tuple[str, ...]) -> None:
-        bridge, subnet = f"br{number}", f"172.30.{number}"
+        bridge = f"br{number}"
+        subnet = f"172.30.{number}"
         self._add_bridge(bridge, f"{subnet}.1")
         for role in (*self._proxies_on(number), *members):
             last = {"px": 2, "px2": 3}.get(role) or 10 + int(role[1:])

@@ -8,7 +8,9 @@ from dataclasses import replace
 from tests.ros.topology import ADVERTISED_NAME, Place, Plan, Topology, give, ip, run_command, sysctl
 from tests.ros2.machines import PLAN, PORTS
 
-HOST6, ROBOT6, GATEWAY6 = "fd77::1", "fd77::2", "fd30::1"
+HOST6 = "fd77::1"
+ROBOT6 = "fd77::2"
+GATEWAY6 = "fd30::1"
 PLAN6 = replace(PLAN, name="v", host=HOST6, robot=ROBOT6)
 DUAL = replace(PLAN, name="w", host=ADVERTISED_NAME, robot="robot")
 
@@ -64,7 +66,8 @@ class Topology6(Topology):
 
     def _wire(self, role: str, bridge: str, gateways: Sequence[str]) -> None:
         """Connect a machine; outside has a route to inside on purpose, as in IPv4."""
-        host, place = self.places["host"].namespace, self.places[role]
+        host = self.places["host"].namespace
+        place = self.places[role]
         peer = ("peer", "name", "eth0", "netns", place.namespace)
         ip("-n", host, "link", "add", f"{role}-1", "type", "veth", *peer)
         ip("-n", host, "link", "set", f"{role}-1", "master", bridge, "up")

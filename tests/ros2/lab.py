@@ -44,7 +44,8 @@ class Lab:
     """A robot outside, containers inside, and the proxy at the boundary."""
 
     def __init__(self, topology: Topology, folder: Path) -> None:
-        self.topology, self.folder = topology, folder
+        self.topology = topology
+        self.folder = folder
         self.proxy_prefix: tuple[str, ...] = ()
         self.proxy_role = "px"
         self.port_range = PORTS.bound

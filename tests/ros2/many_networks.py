@@ -13,8 +13,10 @@ from rosproxy.ros2.servers.groups import GROUP, GroupEars, send_through
 from tests.integration.net import PATIENCE
 
 PORT = 7400
-AT_ONCE, IN_ALL = 25, 60
-MESSAGE, END = b"message", b"end"
+AT_ONCE = 25
+IN_ALL = 60
+MESSAGE = b"message"
+END = b"end"
 """What is sent, and what is sent after it: a socket has heard all before the end."""
 
 
@@ -23,7 +25,8 @@ class Hearing:
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
-        self.sources, self.ends = list[str](), list[str]()
+        self.sources = list[str]()
+        self.ends = list[str]()
         self.opened = 0
         self.ears = GroupEars(PORT, self._begin, self._end)
         self.ears.open([socket.AF_INET])
@@ -69,7 +72,8 @@ def networks() -> Iterator[str]:
 
 
 async def main() -> None:
-    hearing, coming = Hearing(), networks()
+    hearing = Hearing()
+    coming = networks()
     present = [next(coming) for _ in range(AT_ONCE)]
     joined = [len(hearing.ears.join(present))]
     first = await hearing.heard(present)

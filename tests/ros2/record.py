@@ -30,7 +30,10 @@ PORT = "c1-1"
 """The port of the bridge where the publisher is: all passes there that the two send each other."""
 ROLES = "c1", "c2"
 EACH = 2
-ETH_P_ALL, ETHERNET, IPV4, UDP = 0x0003, 14, b"\x08\x00", 17
+ETH_P_ALL = 0x0003
+ETHERNET = 14
+IPV4 = b"\x08\x00"
+UDP = 17
 LONG = {"cyclone": {"user_data": 2000}}
 """What makes an announcement so long that it is sent in fragments; Fast DDS does so from 64 KB."""
 HEARD = 20

@@ -28,7 +28,8 @@ GOT = {
 PROGRAM = {"jazzy": "rclpy", "kilted": "rclpy", "cyclone": "cyclone"}
 
 
-OUTWARD, INWARD = ("c1", "c2", "out"), ("out", "out", "c1")
+OUTWARD = ("c1", "c2", "out")
+INWARD = ("out", "out", "c1")
 
 
 @pytest.mark.parametrize(

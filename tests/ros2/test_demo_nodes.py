@@ -13,7 +13,8 @@ from tests.ros2.lab import NODES, Lab
 
 def demo_node(lab: Lab, kind: str, topic: str) -> Process:
     """Start a node of the demonstration inside."""
-    place, proxy = lab.place("c1"), lab.place("px")
+    place = lab.place("c1")
+    proxy = lab.place("px")
     argv = [sys.executable, str(NODES / "demo_node.py"), kind, place.address, proxy.address, topic]
     env = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     node = Process(f"demo {kind}", place, argv, env, lab.folder / "demo.log")

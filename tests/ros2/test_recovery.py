@@ -19,7 +19,8 @@ from tests.unit.ros2.protocol.messages import data, message, payload
 def test_ten_participants_get_their_ports_again(lab: Lab) -> None:
     readers = []
     for number in range(10):
-        role, topic = ("c1", "c2")[number % 2], f"/topic{number}"
+        role = ("c1", "c2")[number % 2]
+        topic = f"/topic{number}"
         readers.append(lab.node("jazzy", role, "sub", topic=topic, depth=100))
     readers.append(lab.node("jazzy", "out", "sub", topic="/outward", depth=100))
     for number in range(10):

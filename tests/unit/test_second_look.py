@@ -58,7 +58,8 @@ def test_what_failed_is_tried_again_and_nothing_else(
         for again in (False, True)
     ]
     assert codes == [1, int(wrong)]
-    first, again = read_cases(layer.report()), read_cases(layer.report(again=True))
+    first = read_cases(layer.report())
+    again = read_cases(layer.report(again=True))
     late = {"test_it.py::test_late[a/b.c]", "test_it.py::test_cleaned_up_late"}
     failed = late | ({"test_it.py::test_wrong"} if wrong else set())
     assert {case.name for case in first.values() if case.failed} == failed

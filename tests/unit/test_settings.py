@@ -97,7 +97,8 @@ def test_a_good_value(option: str, value: Any, name: str, expected: Any) -> None
 
 
 TIMES = ["probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval"]
-NAN, INFINITY = float("nan"), float("inf")
+NAN = float("nan")
+INFINITY = float("inf")
 BAD: list[tuple[str, str, list[Any]]] = [
     # option, part of the complaint, values given
     ("master_uri", "missing", [None]),
@@ -183,7 +184,8 @@ def test_a_lan_relay_needs_a_secret() -> None:
 def test_a_bad_value_names_its_option(name: str, complaint: str, value: Any) -> None:
     with pytest.raises(SettingError) as caught:
         parse_settings({**GIVEN, name: value})
-    message, option = str(caught.value), "--" + name.replace("_", "-")
+    message = str(caught.value)
+    option = "--" + name.replace("_", "-")
     assert complaint in message
     assert message.startswith(caught.value.option + ": ")
     assert "\n" not in message
@@ -215,7 +217,8 @@ def test_policy_comes_from_a_variable_as_one_text() -> None:
             "ROSPROXY_POLICY_LAYERS": '[{"name": "web", "rules": ["deny serve *"]}]',
         }
     )
-    (own,), (told,) = settings.policy, settings.policy_layers
+    (own,) = settings.policy
+    (told,) = settings.policy_layers
     assert (own.name, own.mode.value) == ("--policy", "audit")
     assert format_rules(own.rules) == "allow publish /a/*; deny publish * by /b"
     assert (told.name, format_rules(told.rules)) == ("web", "deny serve *")

@@ -8,7 +8,9 @@ import uuid
 import rclpy
 from std_msgs.msg import String
 
-NAMESPACE, ROSPROXY, ON = os.environ["NAMESPACE"], os.environ["ROSPROXY"], os.environ["ON_NODE"]
+NAMESPACE = os.environ["NAMESPACE"]
+ROSPROXY = os.environ["ROSPROXY"]
+ON = os.environ["ON_NODE"]
 ECHO = "/" + os.environ["NODE_NAME"]
 STARTED = time.monotonic()
 DEADLINE = STARTED + float(os.environ["TIMEOUT"])
@@ -25,7 +27,8 @@ def fail(what, advice):
 
 def wait_for_answer():
     """On which node the answer comes from; None if none has come in time."""
-    question, found = uuid.uuid4().hex, []
+    question = uuid.uuid4().hex
+    found = []
     questions = node.create_publisher(String, ECHO + "/ping", 10)
 
     def hear(answer):

@@ -7,7 +7,8 @@ import time
 import uuid
 from urllib.parse import urlsplit
 
-NAMESPACE, ROSPROXY = os.environ["NAMESPACE"], os.environ["ROSPROXY"]
+NAMESPACE = os.environ["NAMESPACE"]
+ROSPROXY = os.environ["ROSPROXY"]
 ECHO = "/" + os.environ["NODE_NAME"]
 STARTED = time.monotonic()
 DEADLINE = STARTED + float(os.environ["TIMEOUT"])
@@ -31,7 +32,8 @@ def wait_for(found, what, advice):
         try:
             value = found()
         except (OSError, rosgraph.MasterException) as error:
-            value, why = None, " (%s)" % error
+            value = None
+            why = " (%s)" % error
         if value:
             return value
         time.sleep(0.5)

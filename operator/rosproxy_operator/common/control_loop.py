@@ -64,8 +64,10 @@ class ControlLoop:
     """Looks again and again. `wake`, `wake_in` and `retry` belong to the event loop's thread."""
 
     def __init__(self, pace: Pace, metrics: CommonMetrics) -> None:
-        self._pace, self._metrics = pace, metrics
-        self._woken, self._back = asyncio.Event(), asyncio.Event()
+        self._pace = pace
+        self._metrics = metrics
+        self._woken = asyncio.Event()
+        self._back = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._failures = 0
@@ -147,7 +149,8 @@ class ControlLoop:
         """Why the loop is not alive; None if it is. May be asked from any thread."""
         if self._loop is None:
             return None
-        now, since = self._loop.time(), self._looking_since
+        now = self._loop.time()
+        since = self._looking_since
         if now - self._beat_at > LONGEST_BEAT:
             return f"the event loop has not run for {now - self._beat_at:.0f} s"
         if since is not None and now - since > self._pace.longest:
@@ -165,7 +168,8 @@ class ControlLoop:
         """
         self._woken.clear()
         self._back.clear()
-        awaiting, self._awaiting_look = self._awaiting_look, []
+        awaiting = self._awaiting_look
+        self._awaiting_look = []
         self._looking_since = asyncio.get_running_loop().time()
         try:
             async with asyncio.timeout(self._pace.longest):
@@ -181,11 +185,13 @@ class ControlLoop:
         else:
             if self._failures:
                 log.info("looks succeed again")
-            self._failures, self._error = 0, None
+            self._failures = 0
+            self._error = None
             self._metrics.looks.labels("ok").inc()
             self._metrics.up.set(1)
         finally:
-            self._looking_since, self._looked_at = None, asyncio.get_running_loop().time()
+            self._looking_since = None
+            self._looked_at = asyncio.get_running_loop().time()
             for ended in awaiting:
                 if not ended.done():  # whoever waited may have given up
                     ended.set_result(None)
@@ -202,7 +208,8 @@ class ControlLoop:
     async def _pause(self, resync: float) -> None:
         """Wait until it is time for another look."""
         if self._failures:
-            reason, seconds = self._back, PAUSES[min(self._failures, len(PAUSES)) - 1]
+            reason = self._back
+            seconds = PAUSES[min(self._failures, len(PAUSES)) - 1]
         else:
             reason = self._woken
             seconds = resync if self._again_in is None else min(resync, self._again_in)

@@ -43,7 +43,8 @@ class MasterResolver:
         ``fallback`` are addresses for hosts that can't be resolved. ``excluded`` are no master's:
         they are the proxies' own, which answer to their masters' names.
         """
-        self._fallback, self._excluded = fallback, frozenset(excluded)
+        self._fallback = fallback
+        self._excluded = frozenset(excluded)
         wanted = {host for host in hosts if not is_address(host)}
         self._asked_at = {host: self._asked_at.get(host, 0.0) for host in wanted}
         self._resolved = {host: self._resolved[host] for host in wanted if host in self._resolved}
@@ -51,7 +52,8 @@ class MasterResolver:
 
     async def refresh(self) -> None:
         """Resolve anew what is due."""
-        now, previous = time.monotonic(), dict(self._resolved)
+        now = time.monotonic()
+        previous = dict(self._resolved)
         await self._ask(
             [host for host, when in self._asked_at.items() if now >= when + self._age(host)]
         )

@@ -42,7 +42,8 @@ from rosproxy.page.page_document import (
 )
 
 Json = dict[str, Any]
-PROXY, PARTICIPANT = "proxy", "participant"
+PROXY = "proxy"
+PARTICIPANT = "participant"
 _LONG_TEXTS = ("text", "fix")
 _MOST_LEFT_OUT = 10**9
 Row = TypeVar("Row", PageNode, PageLink, PageFinding, PageProxy)

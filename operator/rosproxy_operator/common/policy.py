@@ -15,7 +15,9 @@ from rosproxy.setting_kinds import SettingError
 
 ADMINISTRATOR = "administrator"
 """Name of the layer that the operator's options make, which is for every proxy."""
-_LAYERS, _AWAIT = POLICY_VARIABLES = ("ROSPROXY_POLICY_LAYERS", "ROSPROXY_AWAIT_POLICY")
+_LAYERS = "ROSPROXY_POLICY_LAYERS"
+_AWAIT = "ROSPROXY_AWAIT_POLICY"
+POLICY_VARIABLES = (_LAYERS, _AWAIT)
 """The variables that a proxy gets at its creation; they are not part of its fingerprint."""
 AWAITED = 3.0
 """Seconds that a proxy waits for its operator: as long as it waits for news of a new caller."""

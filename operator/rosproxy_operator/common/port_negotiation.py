@@ -49,7 +49,8 @@ class PortsExhausted(Exception):
             f"no {count} free ports in a row between {window.first} and {window.last}: "
             f"{sum(free)} of {len(window)} are free, {max(free, default=0)} at most in a row"
         )
-        self.count, self.window = count, window
+        self.count = count
+        self.window = window
 
 
 def negotiate(

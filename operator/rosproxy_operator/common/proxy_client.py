@@ -51,7 +51,8 @@ class ProxyError(Exception):
         self, message: str, away: bool = False, status: int = 0, unreadable: bool = False
     ) -> None:
         super().__init__(message)
-        self.is_unreachable, self.status = away, status
+        self.is_unreachable = away
+        self.status = status
         self.is_unreadable = unreadable
         self.lacks_master = status == 503
 
@@ -85,7 +86,8 @@ class ProxyClient:
         within += WITHIN
         text = await self._ask("GET", admin, path, token, within=within, longest=LONGEST_STATUS)
         answer = _read(text, admin)
-        version, status = answer.get("version"), answer.get("status")
+        version = answer.get("version")
+        status = answer.get("status")
         if not isinstance(version, str):
             raise _no_rosproxy(admin)
         try:

@@ -34,7 +34,8 @@ class ProxySession:
     """Tells one proxy what it is to know. Every call raises ProxyError."""
 
     def __init__(self, client: ProxyClient, admin: HostPort, token: str) -> None:
-        self.admin, self.token = admin, token
+        self.admin = admin
+        self.token = token
         self._client = client
         self._policy: tuple[PolicyLayer, ...] | None = None
         self._callers: AllowedCallers | None = None
@@ -76,7 +77,8 @@ class ProxySession:
     async def tell_callers(self, callers: AllowedCallers) -> None:
         """Tell who may use it, whether or not it knows."""
         run = self._runs
-        peers, former = callers.peers, callers.former_leases
+        peers = callers.peers
+        former = callers.former_leases
         await self._client.selected(self.admin, self.token, callers.addresses, peers, former)
         if run == self._runs:
             self._callers = callers

@@ -3,7 +3,8 @@
 import difflib
 from functools import lru_cache
 
-VERY_NEAR, NEAR = 0.9, 0.75
+VERY_NEAR = 0.9
+NEAR = 0.75
 """How near a name is that can hardly be another program's; and one that begins as ours do."""
 
 

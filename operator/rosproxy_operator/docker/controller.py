@@ -122,11 +122,14 @@ class DockerController:
         decide: Decide = plan,
         mistakes: Sequence[Problem] = (),
     ) -> None:
-        self._settings, self._metrics, self._decide = settings, metrics, decide
+        self._settings = settings
+        self._metrics = metrics
+        self._decide = decide
         self._mistakes = mistakes
         pace = Pace("engine", resync, DEBOUNCE, LONGEST_LOOK)
         self._loop = loop = ControlLoop(pace, metrics)
-        self.dead, self.unready = loop.dead, loop.unready
+        self.dead = loop.dead
+        self.unready = loop.unready
         self._tasks = Tasks()
         self._engine = engine = DockerClient()
         self.engine_url = engine.url
@@ -216,7 +219,8 @@ class DockerController:
             len(planned.actions),
             planned.again_in,
         )
-        self._memory, self._last = planned.memory, (snapshot, planned)
+        self._memory = planned.memory
+        self._last = (snapshot, planned)
         if snapshot.state.busy and not self._observer.waiting:
             self._loop.wake_in(SETTLED)  # no event says when the list is right
         self._proxy_sync.update(snapshot, planned.members)  # first, as new containers' calls wait

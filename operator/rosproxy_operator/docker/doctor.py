@@ -40,7 +40,8 @@ def examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
 
 async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
     status = await host.now()
-    engine, limit = DockerClient(), asyncio.Semaphore(AT_ONCE)
+    engine = DockerClient()
+    limit = asyncio.Semaphore(AT_ONCE)
 
     async def ask(name: str) -> list[DoctorFinding]:
         async with limit:

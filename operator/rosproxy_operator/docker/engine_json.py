@@ -180,7 +180,8 @@ def read_container(
     # was created without one; newer engines store "bridge" instead (moby: container_routes.go).
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
-    name, short_id = name_of(row), row["Id"][:12]
+    name = name_of(row)
+    short_id = row["Id"][:12]
     aliases = {key: _aliases(endpoint) for key, endpoint in endpoints(inspected).items()}
     started = dig(inspected, "State", "StartedAt") or ""
     variables = environment(inspected)

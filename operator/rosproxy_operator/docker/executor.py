@@ -121,8 +121,11 @@ class Executor:
         counted: Callable[[Action, str], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._tasks, self._finished, self._now = tasks, finished, now
-        self._port_taken, self._counted = port_taken, counted
+        self._tasks = tasks
+        self._finished = finished
+        self._now = now
+        self._port_taken = port_taken
+        self._counted = counted
         self._busy: dict[Job, asyncio.Task[None]] = {}
         self._failures: dict[Job, _Failure] = {}
         self._ended_at: dict[Job, float] = {}
@@ -246,7 +249,9 @@ class DockerApplier:
     """Carries out actions, each in a thread."""
 
     def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
-        self._engine, self._settings, self._proxies = engine, settings, proxies
+        self._engine = engine
+        self._settings = settings
+        self._proxies = proxies
 
     async def carry_out(self, action: Action, snapshot: DockerSnapshot) -> None:
         """Carry out an action that was planned from a look. Raises EngineError."""
@@ -332,7 +337,9 @@ class DockerApplier:
             return redirect_config(action, self._settings)
         if isinstance(action, CreateFlush):
             return flush_config(action, self._settings)
-        secret, masters, key = snapshot.state.secret, snapshot.state.masters, action.key
+        secret = snapshot.state.secret
+        masters = snapshot.state.masters
+        key = action.key
         address = "" if key.is_ros2 else masters.get(master(key).host.lower(), "")
         return container_config(action, self._settings, secret, address)
 

@@ -47,7 +47,8 @@ class HostStatus:
     """
 
     def __init__(self, settings: PlanSettings, operator: HostPort | None) -> None:
-        self.settings, self.operator = settings, operator
+        self.settings = settings
+        self.operator = operator
 
     async def now(self) -> Json:
         """The document (`host_document`), with ``operator``: who has told it, or None.

@@ -12,7 +12,8 @@ MOST_PORTS = 1000
 """Ports that a proxy can have: each costs rules and, by default, a process of the engine."""
 NOWHERE = "none"
 """What stands for no LAN."""
-LEAST_MEMORY, MOST_MEMORY = 64 * 1024**2, 1024**4
+LEAST_MEMORY = 64 * 1024**2
+MOST_MEMORY = 1024**4
 """Bytes that a proxy may be bounded to: one that does nothing has 32 MiB."""
 LEAST_PIDS = 256
 """Threads that a proxy needs for a hundred connections."""

@@ -56,11 +56,13 @@ class ProxyUpdater:
         self._former_leases = former_leases
         self.error: ProxyError | None = None
         self.silent_since: float | None = time.monotonic()
-        self._name, self._answered = name, answered
+        self._name = name
+        self._answered = answered
         self._session = ProxySession(proxies, access.admin, access.token)
         self._news = ProxyNews()
         self._status = ProxyStatus()
-        self._looked, self._selecting = asyncio.Event(), asyncio.Event()
+        self._looked = asyncio.Event()
+        self._selecting = asyncio.Event()
 
     def update(self, network_facts: NetworkFacts) -> None:
         """Take note of what a look has found."""
@@ -76,7 +78,8 @@ class ProxyUpdater:
 
     async def _keep_selected(self) -> None:
         """Tell after each look which addresses may use the proxy as their master."""
-        failures, logged = 0, ""
+        failures = 0
+        logged = ""
         while True:
             await self._selecting.wait()
             self._selecting.clear()
@@ -86,7 +89,8 @@ class ProxyUpdater:
                 former_leases = {} if self.leases else self._former_leases
                 callers = AllowedCallers(addresses, former_leases=former_leases)
                 await self._session.tell_callers(callers)
-                failures, logged = 0, ""
+                failures = 0
+                logged = ""
             except ProxyError as error:
                 # Not logged before all pauses are used up, which takes 19 s, and then once.
                 if not error.is_unreachable and failures >= len(PAUSES) and str(error) != logged:
@@ -173,8 +177,10 @@ class DockerProxySync:
         settings: PlanSettings,
         answered: Callable[[], None],
     ) -> None:
-        self._tasks, self._proxies = tasks, proxies
-        self._settings, self._answered = settings, answered
+        self._tasks = tasks
+        self._proxies = proxies
+        self._settings = settings
+        self._answered = answered
         self._running: dict[str, tuple[ProxyUpdater, asyncio.Task[None]]] = {}
         self._leases: dict[str, Leases] = {}
 

@@ -255,7 +255,8 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
         policy=administrators_policy(options["policy"], options["policy_mode"]),
         proxy_bounds=make_proxy_bounds(options),
     )
-    window, ports = settings.port_window, settings.ports
+    window = settings.port_window
+    ports = settings.ports
     if len(window) < ports:
         raise SettingError("--port-window", f"{window} has {len(window)} ports, --ports is {ports}")
     return settings

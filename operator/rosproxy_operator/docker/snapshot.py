@@ -117,7 +117,8 @@ class Inspector:
     """
 
     def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
-        self._engine, self._late = engine, late
+        self._engine = engine
+        self._late = late
         self._cached: dict[str, tuple[object, Json]] = {}
         self._asking: dict[str, asyncio.Task[bool]] = {}
         self._marks: dict[str, object] = {}
@@ -160,7 +161,8 @@ class Inspector:
         what they are for. A doubt is good for one look at least, however late that is.
         """
         now = time.monotonic()
-        since, self._updated = min(now - DOUBT, self._updated), now
+        since = min(now - DOUBT, self._updated)
+        self._updated = now
         self._looks += 1
         self._doubted = {key: at for key, at in self._doubted.items() if at >= since}
         doubtful = own.keys() if self._all_doubted >= since else self._doubted.keys() & own.keys()
@@ -185,7 +187,8 @@ class Inspector:
 
     def _mark(self, row: Json, own: Collection[str], doubtful: Collection[str]) -> object:
         """The state that an inspection is of; if that changes, the container is inspected anew."""
-        key, signature = row["Id"], engine_json.signature(row)
+        key = row["Id"]
+        signature = engine_json.signature(row)
         if key not in own:
             return signature
         if key in doubtful:
@@ -238,7 +241,9 @@ class DockerObserver:
         masters: MasterResolver,
         late: Callable[[], None],
     ) -> None:
-        self._engine, self._settings, self._masters = engine, settings, masters
+        self._engine = engine
+        self._settings = settings
+        self._masters = masters
         self._inspector = Inspector(engine, late)
         self._fresh = secrets.token_hex(32)
         self._has_looked = False
@@ -259,7 +264,8 @@ class DockerObserver:
         there, unless an older one is known.
         """
         # First: ports that the engine opens meanwhile are not foreign.
-        listening, bound = host.listening_ports(), host.bound_udp_ports()
+        listening = host.listening_ports()
+        bound = host.bound_udp_ports()
         rows, net_rows, image = await asyncio.gather(
             in_thread(self._engine.containers),
             in_thread(self._engine.networks),
@@ -323,7 +329,8 @@ class DockerObserver:
         own_by_role: dict[str, list[Any]] = {role: [] for role in _KINDS}
         busy: set[str] = set()
         for row in rows:
-            own, forged = self._read_own(row), ""
+            own = self._read_own(row)
+            forged = ""
             inspected = self._inspector.get(row["Id"])
             if own is None and inspected is None:
                 continue

@@ -92,8 +92,12 @@ class ClusterApplier:
         counted: Count,
         doubted: Callable[[], None] = lambda: None,
     ) -> None:
-        self._api, self._proxies, self._tasks, self._counted = api, proxies, tasks, counted
-        self._doubted, self._stale = doubted, set[Name]()
+        self._api = api
+        self._proxies = proxies
+        self._tasks = tasks
+        self._counted = counted
+        self._doubted = doubted
+        self._stale = set[Name]()
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
@@ -108,7 +112,8 @@ class ClusterApplier:
 
     def forget(self) -> None:
         """Drop what is remembered: another operator has acted meanwhile."""
-        self.failures, self.problems = {}, {}
+        self.failures = {}
+        self.problems = {}
         self._stale.clear()
         self._retiring.clear()
         self._retired.clear()

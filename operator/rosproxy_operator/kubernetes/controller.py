@@ -73,15 +73,22 @@ class KubernetesController:
         metrics: ClusterMetrics,
         term: Callable[[], int] = lambda: 1,
     ) -> None:
-        self._settings, self._api, self._metrics = settings, api, metrics
-        self._term, self._acting = term, 0
+        self._settings = settings
+        self._api = api
+        self._metrics = metrics
+        self._term = term
+        self._acting = 0
         pace = Pace("API server", settings.resync, DEBOUNCE, LONGEST_LOOK)
         self._loop = loop = ControlLoop(pace, metrics)
-        self.wake, self.dead, self.unready = loop.wake_threadsafe, loop.dead, loop.unready
+        self.wake = loop.wake_threadsafe
+        self.dead = loop.dead
+        self.unready = loop.unready
         self.retry = loop.retry
-        self._tasks, self._proxies = Tasks(), ProxyClient()
+        self._tasks = Tasks()
+        self._proxies = ProxyClient()
         self._key = TokenKey(api, settings.key_secret)
-        kinds, corrected = watched_collections(api), metrics.view_corrections.inc
+        kinds = watched_collections(api)
+        corrected = metrics.view_corrections.inc
         self._store = ClusterStore(
             kinds, api.namespaces_of(PLURAL), loop.wake, loop.retry, corrected
         )
@@ -92,7 +99,9 @@ class KubernetesController:
         metrics.watch_jobs(lambda: applier.busy, lambda: applier.failed)
         leads = self._leads
         self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, self._wake_for, leads)
-        self._state, self._due, self._stood_by = ClusterState(), PlanSchedule(), -STANDING_BY
+        self._state = ClusterState()
+        self._due = PlanSchedule()
+        self._stood_by = -STANDING_BY
         self._reflectors: list[Reflector] = []
         self._secret = b""
         self._problems: dict[str, list[ClusterFinding]] = {}
@@ -152,10 +161,13 @@ class KubernetesController:
             await self._tasks.cancel()
             await self._proxy_sync.forget()
             self._applier.forget()
-            self._problems, self._log = {}, ProblemLog()  # ending a term solves none
+            # ending a term solves none
+            self._problems = {}
+            self._log = ProblemLog()
             self._state = ClusterState(former=self._state.former)
             self._report(ClusterSnapshot())
-        self._acting, self._stood_by = self._term(), -STANDING_BY
+        self._acting = self._term()
+        self._stood_by = -STANDING_BY
         self._due.mark_all_due()
 
     async def _stand_by(self) -> float:
@@ -179,7 +191,8 @@ class KubernetesController:
             self._secret = await in_thread(self._key.read)
         self._due.at_once(await self._sandbox.read(self._store.snapshot()))
         # No await before all is planned: so the snapshot has exactly the changes noted so far.
-        touched, observed = self._store.take_changes(), self._store.snapshot(self._secret)
+        touched = self._store.take_changes()
+        observed = self._store.snapshot(self._secret)
         observed = self._sandbox.with_messages(observed)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(
@@ -198,10 +211,13 @@ class KubernetesController:
 
     def _planned(self, observed: ClusterSnapshot, scope: Partition | None) -> ClusterPlan:
         """The plan for a part of the cluster, None for all; the state that it returns is kept."""
-        now, timestamp, settings = time.monotonic(), stamp(time.time()), self._settings.plan
+        now = time.monotonic()
+        timestamp = stamp(time.time())
+        settings = self._settings.plan
         if scope is None:
             planned = plan(observed, settings, self._state, now, timestamp)
-            self._state, self._problems = planned.state, {}
+            self._state = planned.state
+            self._problems = {}
         else:
             state = partition_state(self._state, scope)
             planned = plan(partition_snapshot(observed, scope), settings, state, now, timestamp)

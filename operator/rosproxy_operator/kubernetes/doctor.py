@@ -45,7 +45,8 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     """All findings; of proxies about these nodes and topics, if any. Raises ApiError."""
     api = Api(namespaces)
     try:
-        rosproxies, own_pods = api.rosproxies(), api.own_pods()
+        rosproxies = api.rosproxies()
+        own_pods = api.own_pods()
         facts = DoctorFacts(api, namespaces)
         findings = [
             *cluster_findings(rosproxies),
@@ -63,7 +64,8 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
 
 def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
     """What the doctor in a pod finds."""
-    namespace, name = pod["namespace"], pod["name"]
+    namespace = pod["namespace"]
+    name = pod["name"]
     subject = f"proxy {namespace}/{name}"
     try:
         output = _run(namespace, name, command(names))

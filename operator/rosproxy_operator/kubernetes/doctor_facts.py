@@ -37,7 +37,8 @@ class DoctorFacts:
     """Asks the API server. ``refused`` are findings about what it has not answered."""
 
     def __init__(self, api: Api, namespaces: Sequence[str]) -> None:
-        self._api, self._places = api, tuple(namespaces) or ("",)
+        self._api = api
+        self._places = tuple(namespaces) or ("",)
         self.refused: list[DoctorFinding] = []
 
     def webhook(self) -> WebhookFacts:
@@ -98,7 +99,8 @@ class DoctorFacts:
                 text = f"not looked at: you lack the right to {right}"
                 fix = f"kubectl auth can-i {right}; ask whoever has it to run this"
             else:
-                text, fix = f"could not be looked at: {error}", ""
+                text = f"could not be looked at: {error}"
+                fix = ""
             self.refused.append(warning(subject, subject, text, fix))
             return None
 

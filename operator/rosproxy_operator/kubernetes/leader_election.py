@@ -48,9 +48,12 @@ class LeaderElection:
     """
 
     def __init__(self, api: Api, lease: Name | None, metrics: ClusterMetrics) -> None:
-        self._api, self._lease, self._metrics = api, lease, metrics
+        self._api = api
+        self._lease = lease
+        self._metrics = metrics
         self._candidate = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
-        self._leaving, self._lock = False, asyncio.Lock()
+        self._leaving = False
+        self._lock = asyncio.Lock()
         self._shown = (-1, "")  # no term has this number, so the first state is reported
         self._error = ""
         metrics.leader.set(lease is None)
@@ -142,10 +145,12 @@ class LeaderElection:
 
     def _show(self, changed: Callable[[], None]) -> None:
         """Report who leads, if that has changed."""
-        term, record = self.term(), self._candidate.record
+        term = self.term()
+        record = self._candidate.record
         rival = record.holder if record and record.holder != self._candidate.name else ""
         holder = self._candidate.name if term else rival
-        previous, self._shown = self._shown, (term, holder)
+        previous = self._shown
+        self._shown = (term, holder)
         if self._shown == previous:
             return
         self._metrics.leader.set(bool(term))

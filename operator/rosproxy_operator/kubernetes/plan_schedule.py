@@ -14,7 +14,8 @@ class PlanSchedule:
 
     def __init__(self) -> None:
         self._at: dict[str, float] = {}
-        self._all_due, self._all_at = True, 0.0
+        self._all_due = True
+        self._all_at = 0.0
 
     def mark_all_due(self) -> None:
         """Everything is due."""
@@ -52,7 +53,9 @@ class PlanSchedule:
     ) -> None:
         """A part was planned just now, None: all; it is due again in ``again_in`` seconds."""
         if scope is None:
-            self._all_due, self._all_at, self._at = False, now, {}
+            self._all_due = False
+            self._all_at = now
+            self._at = {}
             planned = {rosproxy.id.namespace for rosproxy in observed.rosproxies}
             planned |= {proxy.of.namespace for proxy in observed.proxies}
         else:

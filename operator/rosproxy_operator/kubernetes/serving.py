@@ -67,7 +67,8 @@ class ClusterServing:
         controller: KubernetesController,
         webhook: tuple[Injector, WebhookServer] | None,
     ) -> None:
-        self._settings, self._controller = settings, controller
+        self._settings = settings
+        self._controller = controller
         self._webhook = webhook
         self._ending = threading.Event()
         self._running: tuple[asyncio.AbstractEventLoop, asyncio.Task[None]] | None = None
@@ -126,7 +127,8 @@ class ClusterServing:
             self._running = None
 
     async def _operate(self) -> None:
-        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        loop = asyncio.get_running_loop()
+        task = asyncio.current_task()
         loop.set_exception_handler(_log_exception)
         if task is not None:
             self._running = loop, task

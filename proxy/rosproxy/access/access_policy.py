@@ -43,12 +43,15 @@ class AccessPolicy:
         metrics: Metrics,
         refusals: Refusals,
     ) -> None:
-        self._metrics, self._refusals = metrics, refusals
-        self._option_layers, self._operator_layers = tuple(option_layers), tuple(operator_layers)
+        self._metrics = metrics
+        self._refusals = refusals
+        self._option_layers = tuple(option_layers)
+        self._operator_layers = tuple(operator_layers)
         self._file_layers = tuple[PolicyLayer, ...]()
         self._operator_told = asyncio.Event()
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
-        self.version, self.empty = 0, False
+        self.version = 0
+        self.empty = False
         self._note_change()
 
     @property

@@ -28,8 +28,10 @@ class PolicyFile:
     def __init__(
         self, path: str, mode: PolicyMode, policy: AccessPolicy, problems: Problems
     ) -> None:
-        self._path, self._mode = Path(path), mode
-        self._policy, self._problems = policy, problems
+        self._path = Path(path)
+        self._mode = mode
+        self._policy = policy
+        self._problems = problems
         self._last_signature: tuple[int, ...] | None = None
 
     def read(self) -> None:

@@ -128,7 +128,8 @@ def matches(glob: str, name: str) -> bool:
 def _parse(tokens: list[str]) -> Rule:
     if len(tokens) not in (3, 5) or (len(tokens) == 5 and tokens[3] != "by"):
         raise ValueError("must be ACTION KIND GLOB [by GLOB]")
-    action, kind = _ACTIONS.get(tokens[0]), _KINDS.get(tokens[1])
+    action = _ACTIONS.get(tokens[0])
+    kind = _KINDS.get(tokens[1])
     if action is None:
         raise ValueError(f"the action must be {' or '.join(_ACTIONS)}, not {tokens[0][:20]!r}")
     if kind is None:

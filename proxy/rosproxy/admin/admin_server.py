@@ -113,7 +113,8 @@ class AdminServer:
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         method = "GET" if request.method == "HEAD" else request.method
-        page, route = self._pages().get(request.path), self._routes.get((method, request.path))
+        page = self._pages().get(request.path)
+        route = self._routes.get((method, request.path))
         if not self._answers_by_that_name(request, route):
             return web.Response(status=403, text=refusal(request.headers.get("Host", "")))
         if page is not None and method == "GET":
@@ -173,7 +174,8 @@ class AdminServer:
         """Answer once the state is another one than the caller knows (``since``)."""
         if not self._may_post(request):
             return self._forbidden(f"GET {CHANGES}")
-        since, transport = request.query.get("since", ""), request.transport
+        since = request.query.get("since", "")
+        transport = request.transport
         try:
             within = float(request.query.get("within", "0"))
         except ValueError:

@@ -16,7 +16,8 @@ from rosproxy.telemetry.text import listed, plural, quoted
 FEW_FREE = 0.1
 """Share of the range that should be free at least."""
 
-HOST, RANGE = "advertised host", "published range"
+HOST = "advertised host"
+RANGE = "published range"
 BY_ADDRESS = "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
 _OF_THIS_HOST = (
     "--advertise-host ADDRESS, the address of this host in the network of the robots "
@@ -94,7 +95,9 @@ def _is_reached(trial: PortProbe) -> bool | None:
 
 def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
     """How many ports are left, and who else has some."""
-    used, free, blocked = ports.used, ports.free, ports.blocked
+    used = ports.used
+    free = ports.free
+    blocked = ports.blocked
     larger_range = (
         "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
         "was refused"

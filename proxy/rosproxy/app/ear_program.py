@@ -16,7 +16,8 @@ def run_ear(settings: EarSettings) -> None:
 
 
 async def _run(settings: EarSettings) -> None:
-    ending, ear = stop_event(), Ear(settings)
+    ending = stop_event()
+    ear = Ear(settings)
     try:
         with setting_error_if_taken("--bind", settings.bind):
             ear.start()

@@ -30,11 +30,13 @@ class PolicySources:
     """Takes in rules while the proxy runs."""
 
     def __init__(self, runtime: Runtime, stacks: Sequence[Stack]) -> None:
-        self._runtime, self._stacks = runtime, stacks
+        self._runtime = runtime
+        self._stacks = stacks
 
     def start(self) -> None:
         """Read the file, and look at it from now on. Raises SettingError."""
-        runtime, settings = self._runtime, self._runtime.settings
+        runtime = self._runtime
+        settings = self._runtime.settings
         if not settings.policy_file:
             return
         file = PolicyFile(
@@ -77,7 +79,8 @@ def read_policy_file(settings: Settings) -> None:
     Its rules count together with those of the options, as they do in a running proxy.
     """
     if settings.policy_file:
-        metrics, problems = Metrics(), Problems()
+        metrics = Metrics()
+        problems = Problems()
         refusals = Refusals(metrics, problems, time.monotonic)
         policy = AccessPolicy(settings.policy, settings.policy_layers, metrics, refusals)
         _read(PolicyFile(settings.policy_file, PolicyMode(settings.policy_mode), policy, problems))

@@ -63,7 +63,8 @@ class App:
         )
 
     def _make_page(self) -> Page:
-        runtime, settings = self.runtime, self.settings
+        runtime = self.runtime
+        settings = self.settings
         admin = default_url(str(settings.admin))
 
         def look() -> AsyncGenerator[dict[str, Any]]:

@@ -48,7 +48,8 @@ class SelfCheck:
     """Looks into the setting-up of a running proxy and notes what is wrong."""
 
     def __init__(self, runtime: Runtime, stacks: Sequence[Stack]) -> None:
-        self._runtime, self._stacks = runtime, stacks
+        self._runtime = runtime
+        self._stacks = stacks
         self._findings: dict[str, list[DoctorFinding]] = {}
         self._probing = asyncio.Lock()
         self._addresses: list[str] = []
@@ -135,7 +136,8 @@ class SelfCheck:
         # Where no port was free, what was found before holds. Where the host's name leads nowhere,
         # that is reported.
         if self._addresses and result is not None:
-            self._result, self._tried_at = result, self._runtime.now()
+            self._result = result
+            self._tried_at = self._runtime.now()
             findings = list(published_range(probed, settings.advertise_host, ports))
             self._note(RANGE, findings)
             self._tell_ready(findings)

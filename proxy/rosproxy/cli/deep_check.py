@@ -32,7 +32,8 @@ def deep_check(settings: Settings) -> list[DoctorFinding]:
 
 async def _check(settings: Settings) -> list[DoctorFinding]:
     runtime = Runtime(settings)
-    host, ports = settings.advertise_host, settings.ports
+    host = settings.advertise_host
+    ports = settings.ports
     facts = DoctorFacts(
         advertise_host=host,
         advertised_addresses=tuple(await resolve(host)),

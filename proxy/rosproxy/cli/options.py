@@ -32,7 +32,9 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
     """
 
     def __init__(self, name: str, read: Callable[[str], Any], separable: bool = True) -> None:
-        self.name, self._read, self._separable = name, read, separable
+        self.name = name
+        self._read = read
+        self._separable = separable
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The value of a text. Raises click.BadParameter."""
@@ -84,7 +86,8 @@ def settings_options(*settings: type) -> Callable[[Command], Command]:
 
 def click_option(setting: Setting, prefix: str = "") -> Callable[[Command], Command]:
     """The option of a setting; with ``prefix``, before its name, that of a program for others."""
-    option, form = setting.option, _form(setting)
+    option = setting.option
+    form = _form(setting)
     if setting.default not in (None, "", ()):
         form |= {"default": setting.default, "show_default": option.default or True}
     name = f"--{prefix}{setting.name.removeprefix('--')}"
@@ -255,7 +258,8 @@ def _usage_text(error: click.UsageError) -> str:
     option = error.param if isinstance(error, click.BadParameter) else None
     if not isinstance(option, click.Option):
         return error.format_message()
-    name, message = option.opts[0], error.message.removesuffix(".")
+    name = option.opts[0]
+    message = error.message.removesuffix(".")
     if isinstance(error, click.MissingParameter):
         prefix = error.ctx.auto_envvar_prefix if error.ctx else None
         variable = option.envvar or f"{prefix}_{str(option.name).upper()}"

@@ -34,7 +34,8 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
     domains = [line for domain in status.domains for line in domain_lines(domain, columns)]
     nodes, brief = (["", *_nodes(status, columns, details)] for details in (True, False))
     if not status.settings.for_ros1:
-        nodes, brief = [], []
+        nodes = []
+        brief = []
     full = [*head, *nodes, *domains, *hidden, *problems]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
@@ -72,7 +73,8 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
 
 
 def _master(master: document.MasterStatus) -> str:
-    uri, since = clean(master.uri), duration(master.since)
+    uri = clean(master.uri)
+    since = duration(master.since)
     if master.up:
         trip = f", round trip {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
         return f"{uri} up for {since}{trip} (pid {master.pid})"
@@ -82,8 +84,10 @@ def _master(master: document.MasterStatus) -> str:
 
 
 def _ports(status: document.ProxyStatus) -> str:
-    ports, host = status.ports, clean(status.settings.advertise_host)
-    listen, advertise = clean(ports.listen), clean(ports.advertise)
+    ports = status.ports
+    host = clean(status.settings.advertise_host)
+    listen = clean(ports.listen)
+    advertise = clean(ports.advertise)
     mapped = "" if advertise == listen else f", here {listen}"
     holders = "; ".join(map(clean, ports.held_by)) or "other programs"
     blocked = f", {ports.blocked} held by {holders}" if ports.blocked else ""

@@ -7,7 +7,8 @@ from collections.abc import Collection, Mapping
 import msgspec
 
 _PREFIX = "ROSPROXY_"
-_NEAR, _VERY_NEAR = 0.5, 0.85
+_NEAR = 0.5
+_VERY_NEAR = 0.85
 """How alike a name has to be: one that begins as ours do, and any other that begins with ROS."""
 _SERVICE_LINK = re.compile(r"_SERVICE_(HOST|PORT(_\w+)?)$|_PORT_\d+_(TCP|UDP|SCTP)(_\w+)?$")
 """What Kubernetes and Docker set for a service of the name rosproxy, or one that begins so."""
@@ -30,7 +31,8 @@ def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> lis
     """The variables of an environment that look as if they were meant for an option."""
     variables = []
     for name, value in sorted(environment.items()):
-        upper, prefixed = name.upper(), name.upper().startswith(_PREFIX)
+        upper = name.upper()
+        prefixed = name.upper().startswith(_PREFIX)
         # NAME_PORT=tcp://10.96.0.7:11311 is of a service, too (pkg/kubelet/envvars/envvars.go,
         # makeLinkVariables); without a URL it is judged as any other.
         linked = _SERVICE_LINK.search(upper) or (upper.endswith("_PORT") and "://" in value)

@@ -51,7 +51,8 @@ async def collect(
 
 async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     status = await asyncio.to_thread(admin.status)
-    host, master = status.settings.advertise_host, status.master
+    host = status.settings.advertise_host
+    master = status.master
     addresses = tuple(await resolve(host)) if host else ()
     facts = replace(
         facts,
@@ -68,7 +69,8 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     uri = master.uri if status.settings.for_ros1 else ""
     # The proxy tries its range meanwhile; each of the two may take some seconds.
     graph_task = asyncio.create_task(ask_graph(facts, uri, address))
-    probe, reason = None, ""
+    probe = None
+    reason = ""
     try:
         probe = await asyncio.to_thread(admin.probe)
     except AdminError as error:
@@ -93,7 +95,8 @@ async def collect_running(
     ``choose`` picks the names from what the master knows. Nobody is asked to try the range, and few
     are asked at once. Nodes say, too, how much they have counted (``getBusStats``).
     """
-    host, master = status.settings.advertise_host, status.master
+    host = status.settings.advertise_host
+    master = status.master
     facts = DoctorFacts(
         admin=admin,
         status=status,

@@ -60,7 +60,8 @@ def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
     """The participant that announces itself in a datagram; None without one or its domain."""
     try:
         message = read_discovery(datagram)
-        prefix, announced = message.prefix, message.of_participant
+        prefix = message.prefix
+        announced = message.of_participant
         vendor = source_vendor(datagram)
     except RtpsError:
         return None
@@ -78,7 +79,8 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
         # Not heard on this machine: the proxy, which hears the groups, would take the doctor for
         # a participant.
         send_through(sock, own_address, loop=False)
-        prefix, targets = os.urandom(PREFIX), list(_targets(own_address, domains))
+        prefix = os.urandom(PREFIX)
+        targets = list(_targets(own_address, domains))
         own_locator = HostPort(own_address, sock.getsockname()[1])
         _send(sock, announcement(prefix, [own_locator], LEASE, SPDP_ENDPOINTS), targets)
         deadline = time.monotonic() + WITHIN

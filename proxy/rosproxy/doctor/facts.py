@@ -185,7 +185,8 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     what they have in common, topics their publishers and subscribers. A name that is both a
     node's and a topic's means the topic.
     """
-    all_topics, all_nodes = graph.topics, graph.names()
+    all_topics = graph.topics
+    all_nodes = graph.names()
     topics = [name for name in names if name in all_topics]
     nodes = [name for name in names if name in all_nodes and name not in all_topics]
     services = [name for name in names if name in graph.services]

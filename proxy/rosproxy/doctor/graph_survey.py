@@ -92,7 +92,9 @@ class _Collector:
         nodes: MasterClient,
         choose: Callable[[SystemState], tuple[str, ...]] | None = None,
     ) -> None:
-        self._master, self._nodes, self._choose = master, nodes, choose
+        self._master = master
+        self._nodes = nodes
+        self._choose = choose
         self._limit = asyncio.Semaphore(FEW_PARALLEL if choose else PARALLEL)
 
     async def master(self) -> MasterFacts:
@@ -142,7 +144,8 @@ class _Collector:
 
     async def _examine_named(self, facts: DoctorFacts) -> DoctorFacts:
         """Ask the nodes and services that the user named."""
-        scope, nodes = facts.scope, facts.nodes
+        scope = facts.scope
+        nodes = facts.nodes
         asked_nodes = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
         facts = replace(facts, nodes={**nodes, **asked_nodes})
         unconnected = {
@@ -190,7 +193,8 @@ class _Collector:
 
     async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """What a node says of itself, asked through the proxy if it is behind it."""
-        slave, ask = _reached_at(facts, node.slave), self._nodes.call_node
+        slave = _reached_at(facts, node.slave)
+        ask = self._nodes.call_node
         if slave is None or node.attempt.failed:
             return node
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
@@ -248,7 +252,8 @@ def _reached_at(facts: DoctorFacts, target: HostPort | None) -> HostPort | None:
     """
     if not facts.is_ours(target):
         return target
-    lease, admin = facts.lease(target), parse_host_port(facts.admin.removeprefix("http://"))
+    lease = facts.lease(target)
+    admin = parse_host_port(facts.admin.removeprefix("http://"))
     if lease is None or admin is None:
         return None
     bound = facts.proxy.settings.bind

@@ -52,7 +52,8 @@ def _grouped(findings: Sequence[DoctorFinding], columns: int) -> Iterator[str]:
 
 def _summary(findings: Sequence[DoctorFinding]) -> str:
     severities = [finding.severity for finding in findings]
-    errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
+    errors = severities.count(Severity.ERROR)
+    warnings = severities.count(Severity.WARNING)
     if not errors and not warnings:
         return "Nothing wrong was found."
     counts = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."

@@ -55,8 +55,10 @@ class DatagramRelay:
     ) -> None:
         self.port: int = sock.getsockname()[1]
         self.sent = self.dropped = 0
-        self._sources, self._ended = frozenset(sources), ended
-        self._in, self._out = sock, _socket(target.host)
+        self._sources = frozenset(sources)
+        self._ended = ended
+        self._in = sock
+        self._out = _socket(target.host)
         try:
             # Linux passes ICMP errors to connected sockets only (net/ipv4/udp.c, __udp4_lib_err).
             self._out.connect((target.host, target.port))

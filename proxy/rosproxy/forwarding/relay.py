@@ -204,7 +204,9 @@ class _Pump:
         count: Callable[[int], None],
         may_splice: bool,
     ) -> None:
-        self._source, self._target, self._count = source, target, count
+        self._source = source
+        self._target = target
+        self._count = count
         self._may_splice = may_splice and hasattr(os, "splice")
         self._shares = False
 
@@ -214,7 +216,9 @@ class _Pump:
 
     def _copy(self) -> bool:
         """Copy until a read is full; False at the end."""
-        receive, send, count = self._source.recv, self._target.sendall, self._count
+        receive = self._source.recv
+        send = self._target.sendall
+        count = self._count
         while data := receive(COPY_SIZE):
             send(data)
             count(len(data))
@@ -243,8 +247,10 @@ class _Pump:
             self._target.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SHARED_SEND)
 
     def _splice(self, read_end: int, write_end: int) -> bool:
-        source, target = self._source.fileno(), self._target.fileno()
-        splice, count = os.splice, self._count
+        source = self._source.fileno()
+        target = self._target.fileno()
+        splice = os.splice
+        count = self._count
         while True:
             size = remaining = splice(source, write_end, PIPE_SIZE)
             while remaining:
@@ -254,7 +260,9 @@ class _Pump:
                 return size > 0
 
     def _copy_blocks(self) -> bool:
-        receive, send, count = self._source.recv, self._target.sendall, self._count
+        receive = self._source.recv
+        send = self._target.sendall
+        count = self._count
         while data := receive(BLOCK_SIZE):
             send(data)
             count(len(data))

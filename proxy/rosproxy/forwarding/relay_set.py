@@ -76,7 +76,8 @@ class _QuietSockets:
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop, self._selector = loop, selectors.DefaultSelector()
+        self._loop = loop
+        self._selector = selectors.DefaultSelector()
         loop.add_reader(self._selector.fileno(), self._look)
 
     def when_readable(self, sock: socket.socket, function: Callable[[], object]) -> None:

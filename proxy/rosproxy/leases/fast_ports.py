@@ -86,7 +86,8 @@ class BothSides:
     def __init__(
         self, inside: LeaseHolders[LeaseHolder], outside: Mapping[int, LeaseHolder]
     ) -> None:
-        self._inside, self._outside = inside, outside
+        self._inside = inside
+        self._outside = outside
 
     @property
     def by_port(self) -> Mapping[int, LeaseHolder]:

@@ -90,8 +90,12 @@ class Leases(Generic[_H]):
         gate: Gate,
     ) -> None:
         self._gate = gate
-        self._holders, self._address, self._kernel, self.watch = holders, address, kernel, watch
-        self._tasks, self._problems = tasks, problems
+        self._holders = holders
+        self._address = address
+        self._kernel = kernel
+        self.watch = watch
+        self._tasks = tasks
+        self._problems = problems
         self._reserved: dict[int, socket.socket] = {}
         self._acceptors: dict[int, Acceptor] = {}
         self._lent: set[int] = set()

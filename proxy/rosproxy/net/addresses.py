@@ -14,7 +14,8 @@ from urllib.parse import urlsplit
 
 Network = IPv4Network | IPv6Network
 
-_MOST_CACHED, _LONGEST_CACHED = 4096, 200
+_MOST_CACHED = 4096
+_LONGEST_CACHED = 200
 _T = TypeVar("_T")
 _HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
 

@@ -16,7 +16,9 @@ class Budget:
     """At most ``most`` at once, of which a source has at most ``share``; ``unit`` names them."""
 
     def __init__(self, most: int, share: int, unit: str) -> None:
-        self.most, self._share, self._unit = most, share, unit
+        self.most = most
+        self._share = share
+        self._unit = unit
         self._used_by_source: dict[str, int] = {}
         self.used = 0
 
@@ -46,7 +48,9 @@ class Charge:
     __slots__ = ("_budget", "_source", "taken")
 
     def __init__(self, budget: Budget, source: str) -> None:
-        self._budget, self._source, self.taken = budget, source, 0
+        self._budget = budget
+        self._source = source
+        self.taken = 0
 
     def add(self, size: int) -> None:
         """Hold more. Raises OverBudget."""

@@ -27,7 +27,9 @@ class Gate:
     """Counts connections and says which are too many."""
 
     def __init__(self, per_source: int, per_port: int, note_refusal: NoteRefusal) -> None:
-        self.per_source, self._per_port, self._note_refusal = per_source, per_port, note_refusal
+        self.per_source = per_source
+        self._per_port = per_port
+        self._note_refusal = note_refusal
         self._by_source: Counter[str] = Counter()
         self._by_port: Counter[int] = Counter()
         self._waiting: dict[str, dict[int, Callable[[], None]]] = {}
@@ -68,7 +70,8 @@ class Gate:
 
         Returns what is to be called when it has spoken, or is gone.
         """
-        number, connections = next(self._numbers), self._waiting.setdefault(source, {})
+        number = next(self._numbers)
+        connections = self._waiting.setdefault(source, {})
         if len(connections) >= MOST_WAITING:
             text = f"{MOST_WAITING} silent connections from one source"
             self._note_refusal("silent_connections", source, text)

@@ -59,7 +59,9 @@ class LongReply:
     """A reply's body that is passed on piece by piece; `close` it in any case."""
 
     def __init__(self, size: int, stream: aiohttp.StreamReader, finish: Callable[[], None]) -> None:
-        self.size, self._stream, self._finish = size, stream, finish
+        self.size = size
+        self._stream = stream
+        self._finish = finish
 
     async def pieces(self) -> AsyncIterator[bytes]:
         """The pieces, once. Raises aiohttp.ClientError, TimeoutError."""
@@ -95,7 +97,8 @@ class HttpClient:
         self.last_address: str | None = None
         lines = {"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers}
         self._headers = "".join(f"{name}: {text}\r\n" for name, text in lines.items())
-        self._keepalive, self._limit = keepalive, asyncio.Semaphore(most)
+        self._keepalive = keepalive
+        self._limit = asyncio.Semaphore(most)
         self._source = source
         self._longest = longest
         self._idle: dict[HostPort, list[tuple[float, ResponseHandler]]] = {}
@@ -284,7 +287,8 @@ class HttpClient:
     def _sweep(self) -> None:
         """Close what was not used for long."""
         loop = asyncio.get_running_loop()
-        expiry, self._sweeper = loop.time() - self._keepalive, None
+        expiry = loop.time() - self._keepalive
+        self._sweeper = None
         for peer, idle in self._idle.items():
             for _, handler in (pair for pair in idle if pair[0] <= expiry):
                 handler.close()
@@ -321,7 +325,8 @@ async def read_bounded(
 
     Raises TooLong, and what ``hold`` raises.
     """
-    chunks, size = list[bytes](), 0
+    chunks = list[bytes]()
+    size = 0
     while not stream.at_eof():
         chunk = stream.read_nowait() if stream.is_eof() else await stream.readany()
         size += len(chunk)

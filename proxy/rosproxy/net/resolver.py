@@ -22,10 +22,12 @@ RESOLVE_TIMEOUT = 1.0
 """Seconds after which a name counts as unresolvable."""
 MOST_LOOKUPS = 64
 """Look-ups that may be under way at once; beyond that names count as unresolvable."""
-MOST_FOR_OTHERS, MOST_FOR_ONE = 56, 8
+MOST_FOR_OTHERS = 56
+MOST_FOR_ONE = 8
 """Of these, how many for names that others gave, and that one other gave: the nodes of one machine
 give its name."""
-NODES, MOST_FOR_NODES = "nodes", 32
+NODES = "nodes"
+MOST_FOR_NODES = 32
 """The source of names that the master has of nodes, since it does not say who gave them; and how
 many: they are as many as there are machines, and come all at once."""
 

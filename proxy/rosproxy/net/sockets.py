@@ -101,7 +101,10 @@ class Acceptor:
     def __init__(
         self, tasks: Tasks, sock: socket.socket, handler: Handler, gate: Gate | None = None
     ) -> None:
-        self._tasks, self._sock, self._handler, self._gate = tasks, sock, handler, gate
+        self._tasks = tasks
+        self._sock = sock
+        self._handler = handler
+        self._gate = gate
         self._port = sock.getsockname()[1]
         self._loop = asyncio.get_running_loop()
         self._pause: asyncio.TimerHandle | None = None
@@ -208,7 +211,8 @@ async def peek(conn: socket.socket, size: int) -> bytes:
 
 async def read_exactly(conn: socket.socket, size: int) -> bytes:
     """So many bytes, taken off a connection. Raises EOFError if it ends before, OSError."""
-    loop, chunks = asyncio.get_running_loop(), []
+    loop = asyncio.get_running_loop()
+    chunks = []
     while size:
         chunk = await loop.sock_recv(conn, min(size, 65536))
         if not chunk:

@@ -14,7 +14,8 @@ def changes(before: Json, after: Json) -> Json:
     """
     news: Json = {}
     for table in _TABLES:
-        old, new = before[table], after[table]
+        old = before[table]
+        new = after[table]
         rows = {key: row for key, row in new.items() if old.get(key) != row}
         rows |= dict.fromkeys(old.keys() - new.keys())
         if rows:

@@ -137,10 +137,8 @@ def _mismatches(domain: DomainStatus) -> dict[Key, DomainProblem]:
         writer = participants.get(pair.writer, nobody)
         reader = participants.get(pair.reader, nobody)
         if pair.kind == "topic":
-            ends, has_link = (
-                (writer, reader),
-                pair.name in {*writer.publishes} & {*reader.subscribes},
-            )
+            ends = (writer, reader)
+            has_link = pair.name in {*writer.publishes} & {*reader.subscribes}
         else:  # of a service both write and read
             ends = (reader, writer) if pair.name in reader.services else (writer, reader)
             has_link = pair.name in ends[0].services and ends[1] is not nobody

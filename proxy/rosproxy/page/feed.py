@@ -59,7 +59,8 @@ class Feed:
     """
 
     def __init__(self, tasks: Tasks, make: Callable[[], AsyncGenerator[Json]]) -> None:
-        self._tasks, self._make = tasks, make
+        self._tasks = tasks
+        self._make = make
         self.watchers = FairSlots(
             "pages are open", MOST_WATCHERS, MOST_WATCHERS_EACH, "close one of them"
         )
@@ -153,7 +154,9 @@ class PageWatch:
         own_findings: Callable[[], Sequence[DoctorFinding]],
         admin: str,
     ) -> None:
-        self._status, self._own_findings, self._admin = status, own_findings, admin
+        self._status = status
+        self._own_findings = own_findings
+        self._admin = admin
         self._measures = Measures()
         self._judged: JudgedFacts | None = None
         # Taken once: were the clock set meanwhile, the times of all links would change.
@@ -174,7 +177,9 @@ class PageWatch:
             asking.cancel()
 
     async def _document(self, now: float) -> Json:
-        status, own_findings, judged = self._status(), tuple(self._own_findings()), self._judged
+        status = self._status()
+        own_findings = tuple(self._own_findings())
+        judged = self._judged
         async with self._counting:
             if judged:
                 self._measures.read_relays(relayed(status, judged.facts.system), now)
@@ -185,7 +190,8 @@ class PageWatch:
 
     async def _ask(self) -> float:
         """One round of questions; the seconds until the next."""
-        began, status = time.monotonic(), self._status()
+        began = time.monotonic()
+        status = self._status()
         facts = await collect_running(status, self._admin, partial(topics_to_ask_about, status))
         judged = await asyncio.to_thread(judge, facts, self._judged, self._status())
         async with self._counting:

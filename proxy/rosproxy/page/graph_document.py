@@ -39,7 +39,8 @@ from rosproxy.page.page_document import (
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import quoted
 
-MASTER, PROXY = "master", "rosproxy"
+MASTER = "master"
+PROXY = "rosproxy"
 """Keys of what is no node: names of those begin with a slash."""
 _STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
 
@@ -110,7 +111,9 @@ class _Ros1Graph:
     """The nodes of ROS 1."""
 
     def __init__(self, status: ProxyStatus, judged: JudgedFacts) -> None:
-        self._status, self._judged, self._facts = status, judged, judged.facts
+        self._status = status
+        self._judged = judged
+        self._facts = judged.facts
         self._inside = inside_nodes(status)
 
     def nodes(self) -> dict[str, PageNode]:
@@ -158,7 +161,8 @@ class _Ros1Graph:
         finding = self._judged.nodes.get(name)
         if finding is None:
             return node
-        text, fix = shown_text(finding.text), shown_text(finding.fix)
+        text = shown_text(finding.text)
+        fix = shown_text(finding.fix)
         return msgspec.structs.replace(node, state=_STATES[finding.severity], text=text, fix=fix)
 
 
@@ -168,8 +172,11 @@ class _Ros1Links:
     def __init__(
         self, status: ProxyStatus, judged: JudgedFacts, measures: Measures, now: float, epoch: float
     ) -> None:
-        self._status, self._judged, self._measures = status, judged, measures
-        self._now, self._epoch = now, epoch
+        self._status = status
+        self._judged = judged
+        self._measures = measures
+        self._now = now
+        self._epoch = epoch
         self.left_out = 0
         self._inside = inside_nodes(status)
         self._graph = judged.facts.system
@@ -275,7 +282,8 @@ class _Ros1Links:
         topic, publisher, subscriber = key
         if (topic, subscriber) in self._udpros:
             return "UDPROS", self._udpros[topic, subscriber]
-        endpoint, is_relayed = self._inside.get(publisher), key in self._relayed
+        endpoint = self._inside.get(publisher)
+        is_relayed = key in self._relayed
         if endpoint and subscriber in self._inside and not is_relayed:
             return "direct", None
         if endpoint:

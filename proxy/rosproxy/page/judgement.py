@@ -35,7 +35,8 @@ class JudgedFacts(msgspec.Struct, frozen=True):
 def topics_to_ask_about(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
     """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
     inside = inside_nodes(status)
-    topics, remaining = [], MOST_LINKS
+    topics = []
+    remaining = MOST_LINKS
     for topic in sorted(graph.topics - QUIET):
         if not inside.keys() & {*graph.sides(topic)}:
             continue
@@ -55,7 +56,8 @@ def judge(
     it is found so twice: nodes that start need a moment to meet.
     """
     nodes: dict[str, DoctorFinding] = {}
-    rest, inside = [], inside_nodes(facts.proxy)
+    rest = []
+    inside = inside_nodes(facts.proxy)
     for finding in _lasting(facts, later):
         if finding.subject not in facts.nodes and finding.subject not in inside:
             rest.append(finding)

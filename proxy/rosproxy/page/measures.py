@@ -50,7 +50,8 @@ class Counter:
         if value > self.value:
             self.grew = at
         self.every = at - self.at
-        self.value, self.at = value, at
+        self.value = value
+        self.at = at
 
 
 @dataclass(slots=True)
@@ -103,7 +104,8 @@ class Link:
 
     def note_progress(self) -> None:
         """Remember how far the publisher was whenever the subscriber got something."""
-        sent, arrived = self.counters.get("given"), self.counters.get("taken")
+        sent = self.counters.get("given")
+        arrived = self.counters.get("taken")
         if sent is None or arrived is None:
             self.mark = None
         # Anew also when the publisher counts from the beginning: that is another connection.
@@ -144,12 +146,14 @@ class Measures:
 
     def read_nodes(self, facts: DoctorFacts, pairs: Iterable[Key]) -> None:
         """Take in what nodes have counted of these links; what is known of others is dropped."""
-        former, uris = self._links, dict[str, Mapping[tuple[str, HostPort], str]]()
+        former = self._links
+        uris = dict[str, Mapping[tuple[str, HostPort], str]]()
         self._links = {}
         for key in pairs:
             topic, publisher, subscriber = key
             link = self._links[key] = former.get(key, Link())
-            source, target = facts.nodes.get(publisher), facts.nodes.get(subscriber)
+            source = facts.nodes.get(publisher)
+            target = facts.nodes.get(subscriber)
             if source and source.report and target:
                 _read(link, "given", source.report, ("o", topic, target.name))
             if target and target.report and source:

@@ -15,11 +15,18 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy.admin.status_bounds import encode
 from rosproxy.telemetry.text import brief
 
-ROBOT, HOST, CONTAINER = "robot", "host", "container"
+ROBOT = "robot"
+HOST = "host"
+CONTAINER = "container"
 """The lanes: outside, the machine of the proxy, and inside."""
-OK, UNKNOWN, WARNING, BROKEN = "ok", "unknown", "warning", "broken"
+OK = "ok"
+UNKNOWN = "unknown"
+WARNING = "warning"
+BROKEN = "broken"
 """States of nodes and links."""
-MOST_NODES, MOST_LINKS, MOST_FINDINGS = 1500, 3000, 50
+MOST_NODES = 1500
+MOST_LINKS = 3000
+MOST_FINDINGS = 50
 """How many are shown; the rest is counted."""
 MOST_NODE_BYTES = 1024 * 1024
 MOST_LINK_BYTES = 4 * MOST_NODE_BYTES

@@ -60,7 +60,8 @@ class Page:
     """The routes of the page, over a feed of documents."""
 
     def __init__(self, feed: Feed, visitors: Visitors) -> None:
-        self.feed, self.visitors = feed, visitors
+        self.feed = feed
+        self.visitors = visitors
         self._encoded: tuple[Json | None, Json, bytes] | None = None
         self._whole: tuple[Json, bytes] | None = None
 

@@ -33,7 +33,8 @@ class ExpiringTokens:
     """Random texts that are good for some seconds, of which only hashes are kept."""
 
     def __init__(self, seconds: float, now: Callable[[], float]) -> None:
-        self._seconds, self._now = seconds, now
+        self._seconds = seconds
+        self._now = now
         self._until: dict[str, float] = {}
 
     def issue(self) -> str:
@@ -77,9 +78,11 @@ class Visitors:
         local: bool = False,
         own_names: Collection[str] = (),
     ) -> None:
-        self._token_hash, self._local = token_hash, local
+        self._token_hash = token_hash
+        self._local = local
         self._own_names = own_names
-        self._sessions, self._keys = ExpiringTokens(SESSION, now), ExpiringTokens(KEY, now)
+        self._sessions = ExpiringTokens(SESSION, now)
+        self._keys = ExpiringTokens(KEY, now)
 
     def may_look(self, request: web.BaseRequest) -> bool:
         """Whether a request is of somebody who may."""

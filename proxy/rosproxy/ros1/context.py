@@ -48,9 +48,12 @@ class Context:
 
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
-        self.instance, self._runtime = runtime.instance, runtime
-        self.metrics, self.tasks = runtime.metrics, runtime.tasks
-        self.problems, self.refusals = runtime.problems, runtime.refusals
+        self.instance = runtime.instance
+        self._runtime = runtime
+        self.metrics = runtime.metrics
+        self.tasks = runtime.tasks
+        self.problems = runtime.problems
+        self.refusals = runtime.refusals
         self.outside_changed = runtime.outside_changed
         self.policy = runtime.policy
         self.gate = Gate(
@@ -162,7 +165,8 @@ class Context:
         self._client_networks = None
         self._networks_read = self.now()
         # With --direction both the network of the default route leads outside, so it is not inside.
-        configured, both = self.settings.inside_networks, self.stand_ins.is_bidirectional
+        configured = self.settings.inside_networks
+        both = self.stand_ins.is_bidirectional
         self.addressing.networks = configured or interface_networks(without_uplink=both)
 
     def caller_at(self, endpoint: Endpoint) -> Caller:
@@ -170,7 +174,8 @@ class Context:
 
         The proxy's address as the node sees it is looked up as often as the networks are.
         """
-        address, name = endpoint.location.address, min(endpoint.callers, default="")
+        address = endpoint.location.address
+        name = min(endpoint.callers, default="")
         if address not in self._proxy_addresses:
             self._proxy_addresses[address] = address_towards(address)
         return Caller(address, self._proxy_addresses[address], name, "", endpoint)

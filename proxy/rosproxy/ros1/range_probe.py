@@ -42,7 +42,8 @@ class _PortTrial:
 
     async def greet(self, conn: socket.socket, peer: str) -> None:
         """Answer a caller, in the way of a node, if it knows one of the secrets."""
-        loop, request = asyncio.get_running_loop(), b""
+        loop = asyncio.get_running_loop()
+        request = b""
         async with asyncio.timeout(TIMEOUT):
             while not self._recognize(request) and len(request) < MAX_REQUEST:
                 chunk = await loop.sock_recv(conn, 4096)
@@ -74,7 +75,8 @@ async def probe_range(
     The second port is left out where the master misses the first: rosmaster calls back from three
     threads, and each call into a void holds one for as long as TCP tries, two minutes.
     """
-    pool, ports = context.registry.pool, context.settings.ports.listen.ports()
+    pool = context.registry.pool
+    ports = context.settings.ports.listen.ports()
     probes: list[PortProbe] = []
     for order in (ports, reversed(ports)):
         trial = _PortTrial()
@@ -148,7 +150,8 @@ async def _subscribed(context: Context, trial: _PortTrial, target: HostPort) -> 
     """A parameter with the port under test as its subscriber, for as long as it takes."""
     # A subscriber's name that nobody else has: rosmaster calls shutdown at the former URI of a name
     # that registers with another (registrations.py, _register_node_api).
-    name, uri = f"{CALLER_ID}_probe_{trial.master_secret}", slave_uri(target)
+    name = f"{CALLER_ID}_probe_{trial.master_secret}"
+    uri = slave_uri(target)
     multicall = context.upstream.multicall
     try:
         replies = await multicall(

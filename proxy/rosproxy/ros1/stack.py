@@ -155,13 +155,15 @@ class Ros1:
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
-        settings, context = self.settings, self.context
+        settings = self.settings
+        context = self.context
         self.reserve_range()
         # Before any port listens, as the kernel has to see connections from their beginning.
         await self.plane.start()
         master = self._make_master_api()
         context.tasks.spawn(self._callers.await_operator(), "waiting for an operator")
-        guard, title = self._callers.refusal, "ROS master API, proxied"
+        guard = self._callers.refusal
+        title = "ROS master API, proxied"
         self._listen("--master-port", settings.master_port, master, title, guard)
         if settings.publish_master is not None:
             advertised = HostPort(settings.advertise_host, settings.publish_master)
@@ -271,7 +273,8 @@ class Ros1:
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""
-        address, upstream = read_body(body, MasterAddress).address, self.context.upstream
+        address = read_body(body, MasterAddress).address
+        upstream = self.context.upstream
         if address != upstream.master_address:
             log.info("master %s is looked for at %s", self.settings.master_uri, address)
             upstream.master_address = address
@@ -303,7 +306,8 @@ class Ros1:
     ) -> None:
         with setting_error_if_taken(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
-        context, greeting = self.context, f"rosproxy: {title}; nodes use it by ROS_MASTER_URI\n"
+        context = self.context
+        greeting = f"rosproxy: {title}; nodes use it by ROS_MASTER_URI\n"
         server = XmlRpcServer(context, service, greeting, context.master_call, service, guard)
         self._servers.append(server)
         self._acceptors.append(Acceptor(context.tasks, sock, server.dispatch, context.gate))

@@ -93,8 +93,10 @@ class Ros1State(Collector):
 
     def _numbers(self) -> Iterator[tuple[str, str, float]]:
         """Name, meaning and value of each gauge without labels."""
-        context, endpoints = self._context, self._context.registry
-        pool, buffered = endpoints.pool, context.buffered
+        context = self._context
+        endpoints = self._context.registry
+        pool = endpoints.pool
+        buffered = context.buffered
         yield "leases_used", "Ports held by inside nodes.", len(endpoints)
         yield "leases_free", "Ports left for inside nodes.", fast_ports.ports_left(pool, endpoints)
         text = "Of the ports left, those that serve topics meanwhile."
@@ -153,7 +155,8 @@ class Ros1State(Collector):
         return messages, sizes
 
     def _settings(self, common: document.StatusSettings) -> document.StatusSettings:
-        settings, selected = self._context.settings, self._context.selected
+        settings = self._context.settings
+        selected = self._context.selected
         return msgspec.structs.replace(
             common,
             master_port=settings.master_port,
@@ -166,7 +169,8 @@ class Ros1State(Collector):
         )
 
     def _master(self) -> document.MasterStatus:
-        context, monitor = self._context, self._monitor
+        context = self._context
+        monitor = self._monitor
         return document.MasterStatus(
             uri=context.settings.master_uri,
             address=context.upstream.reached_at,
@@ -179,7 +183,8 @@ class Ros1State(Collector):
         )
 
     def _ports(self) -> document.PortsStatus:
-        ports, registry = self._context.settings.ports, self._context.registry
+        ports = self._context.settings.ports
+        registry = self._context.registry
         return document.PortsStatus(
             listen=str(ports.listen),
             advertise=str(ports.advertise),

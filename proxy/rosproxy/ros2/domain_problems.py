@@ -30,7 +30,8 @@ class DomainProblem(msgspec.Struct, frozen=True):
     owner: str = ""
 
 
-_FAST_DDS_NAME, _CYCLONE_DDS_NAME = VENDORS[FAST_DDS], VENDORS[CYCLONE_DDS]
+_FAST_DDS_NAME = VENDORS[FAST_DDS]
+_CYCLONE_DDS_NAME = VENDORS[CYCLONE_DDS]
 _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.TCP: (
         "it is reached by TCP alone, and the proxy passes on UDP",

@@ -21,7 +21,8 @@ class DomainWatch:
     """Looks at the domains, and notes what it finds in ``problems``."""
 
     def __init__(self, state: Ros2State, problems: Problems) -> None:
-        self._state, self._problems = state, problems
+        self._state = state
+        self._problems = problems
         self._previous: set[DomainProblem] = set()
         self._noted: dict[str, set[DomainProblem]] = {}
 

@@ -66,7 +66,8 @@ class Ros2:
     """The part for ROS 2. `start` it in a running event loop, `stop` it in the same."""
 
     def __init__(self, runtime: Runtime) -> None:
-        self._runtime, self._settings = runtime, runtime.settings
+        self._runtime = runtime
+        self._settings = runtime.settings
         self.servers: list[DomainServer] = []
         self._hosts: tuple[str, ...] = ()
         ports = runtime.settings.ports.listen
@@ -77,7 +78,8 @@ class Ros2:
         )
         self._domain_plane = DomainPlane(plane, leases)
         self.state = Ros2State(self.servers, self._domain_plane)
-        self._applied, self._awaiting = runtime.policy.version, bool(self._settings.await_policy)
+        self._applied = runtime.policy.version
+        self._awaiting = bool(self._settings.await_policy)
         self.networks: tuple[Network, ...] = ()
         self._peers = self._settings.ros2_peer
         self._addresses_of_peers: dict[HostPort, tuple[HostPort, ...]] = {}
@@ -158,7 +160,8 @@ class Ros2:
         return tuple([await self._probe(server) for server in self.servers])
 
     async def _probe(self, server: DomainServer) -> PortProbe:
-        settings, secret = server.domain.settings, secrets.token_bytes(16)
+        settings = server.domain.settings
+        secret = secrets.token_bytes(16)
         port = settings.ports.advertised(settings.discovery_port)
         target = HostPort(self._hosts[0], port)
         outcome = await server.hears(secret, lambda heard: try_udp(target, secret, heard))
@@ -215,7 +218,8 @@ class Ros2:
     def greeting(self) -> str:
         """How nodes use it, for the log."""
         domains = ", ".join(map(str, self._settings.domains))
-        host, ports = self._settings.advertise_host, self._settings.ports.advertise
+        host = self._settings.advertise_host
+        ports = self._settings.ports.advertise
         return (
             f"ROS 2 nodes of domain {domains} are found by multicast; outside sees {host}:{ports}"
         )
@@ -228,7 +232,8 @@ class Ros2:
 
     def _domain_ports(self) -> list[PortMap]:
         """The range, shared out among the domains."""
-        ports, count = self._settings.ports, len(self._settings.domains)
+        ports = self._settings.ports
+        count = len(self._settings.domains)
         size = len(ports.listen) // count
 
         def share(whole: PortRange, index: int) -> PortRange:
@@ -359,7 +364,8 @@ class Ros2:
                 lease.sample(now)
 
     async def _resolve_peer(self, peer: HostPort) -> list[HostPort]:
-        subject, resolved = f"peer {peer.host}", await resolve(peer.host)
+        subject = f"peer {peer.host}"
+        resolved = await resolve(peer.host)
         self._runtime.problems.solved(subject)
         if not resolved:
             text = (

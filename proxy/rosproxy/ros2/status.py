@@ -104,7 +104,8 @@ class Ros2State(Collector):
             labels=["domain", "kind", "direction"],
         )
         for server in self._servers:
-            domain, number = server.domain, str(server.domain.settings.number)
+            domain = server.domain
+            number = str(server.domain.settings.number)
             used.add_metric([number], len(domain.inside.leases))
             free.add_metric([number], domain.ports.pool.free)
             lacking.add_metric([number], len(domain.inside.port_shortages))
@@ -137,7 +138,8 @@ class Ros2State(Collector):
         yield unproven
 
     def _domain(self, server: DomainServer) -> document.DomainStatus:
-        domain, settings = server.domain, server.domain.settings
+        domain = server.domain
+        settings = server.domain.settings
         discovery = settings.ports.advertised(settings.discovery_port)
         comparison = compare(domain.inside.by_prefix.values(), domain.outside.by_prefix.values())
         pairs = comparison.mismatched

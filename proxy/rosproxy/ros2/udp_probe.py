@@ -16,7 +16,8 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
 from rosproxy.runtime import Runtime
 
-ATTEMPTS, WITHIN = 3, 1.0
+ATTEMPTS = 3
+WITHIN = 1.0
 """UDP may lose some: how many are sent, and the seconds in which each may come back."""
 
 
@@ -41,8 +42,10 @@ async def try_ports(runtime: Runtime) -> tuple[PortProbe, ...]:
 
     Raises SettingError if none can be had.
     """
-    settings, addresses = runtime.settings, await resolve(runtime.settings.advertise_host)
-    ports, taken = settings.ports, list[int]()
+    settings = runtime.settings
+    addresses = await resolve(runtime.settings.advertise_host)
+    ports = settings.ports
+    taken = list[int]()
     with contextlib.ExitStack() as stack:
         bound: dict[int, socket.socket] = {}
         for port in ports.listen.ports():
@@ -54,7 +57,8 @@ async def try_ports(runtime: Runtime) -> tuple[PortProbe, ...]:
         first = ports.listen.first
         if first not in bound or not addresses:
             return ()
-        heard, secret = asyncio.Event(), secrets.token_bytes(16)
+        heard = asyncio.Event()
+        secret = secrets.token_bytes(16)
         loop = asyncio.get_running_loop()
         loop.add_reader(bound[first], _listen_for, bound[first], secret, heard)
         try:

@@ -29,11 +29,13 @@ from rosproxy.telemetry.text import brief, clean
 LONGEST = 2000
 """Characters of a message at most, and of each exception's text: the longest of the proxy's own
 has some 400."""
-SUBJECT_BURST, SUBJECT_INTERVAL = 20, 5.0
+SUBJECT_BURST = 20
+SUBJECT_INTERVAL = 5.0
 """Warnings and errors of one kind about one subject that are written at once, and the seconds
 after which one more is. What is told of a real node changes a few times in a minute at most; where
 the subject is an address, there may be some nodes that each say the same of five topics."""
-KIND_BURST, KIND_INTERVAL = 2000, 1.0
+KIND_BURST = 2000
+KIND_INTERVAL = 1.0
 """The same for all messages of one kind: a thousand nodes that start at once have a line each."""
 USUAL = 200
 """Characters of a message that counts as one; a longer one counts as several."""
@@ -113,7 +115,8 @@ def _subject(record: logging.LogRecord) -> str:
 def harmless(record: logging.LogRecord) -> logging.LogRecord:
     """A copy of a record whose message and traceback may be written as they are."""
     safe = copy.copy(record)
-    safe.msg, safe.args = brief(record.getMessage(), LONGEST), None
+    safe.msg = brief(record.getMessage(), LONGEST)
+    safe.args = None
     left_out = getattr(record, "left_out", 0)
     if left_out:
         safe.msg += f" ({left_out} more like it were left out)"

@@ -12,7 +12,8 @@ from rosproxy.telemetry.text import brief
 
 MOST = 50
 """Problems that are kept."""
-LONGEST_SUBJECT, LONGEST_TEXT = 200, 500
+LONGEST_SUBJECT = 200
+LONGEST_TEXT = 500
 """Characters of a problem at most. Names of real nodes have some tens, the proxy's own texts up to
 300; what is longer loses its middle."""
 
@@ -42,7 +43,8 @@ class Problems:
 
     def add(self, subject: str, text: str, port: int | None = None, holds: bool = False) -> None:
         """Note a problem; one that ``holds`` is to be `solved` by whoever notes it."""
-        subject, text = brief(subject, LONGEST_SUBJECT), brief(text, LONGEST_TEXT)
+        subject = brief(subject, LONGEST_SUBJECT)
+        text = brief(text, LONGEST_TEXT)
         remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]
         noted = [*remaining, NotedProblem(time.time(), subject, text, port, holds)]
         if len(noted) > MOST:

@@ -15,7 +15,8 @@ from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 
-DENIED, WOULD_BE_DENIED = "policy", "policy_audit"
+DENIED = "policy"
+WOULD_BE_DENIED = "policy_audit"
 """The reasons of what a policy denies, or only tells of."""
 QUIET = 60.0
 """Seconds in which a source is not logged again for the same reason."""
@@ -79,7 +80,9 @@ class Refusals:
     """Tells of refusals; ``now`` is the monotonic clock."""
 
     def __init__(self, metrics: Metrics, problems: Problems, now: Callable[[], float]) -> None:
-        self._metrics, self._problems, self._now = metrics, problems, now
+        self._metrics = metrics
+        self._problems = problems
+        self._now = now
         self._logged_at: dict[tuple[str, str], float] = {}
         self._lines: dict[str, tuple[float, int]] = {}
         self._spans: dict[str, _Span] = {}
@@ -97,7 +100,8 @@ class Refusals:
             return
         since, lines = self._lines.get(reason, (now, 0))
         if now - since >= QUIET:
-            since, lines = now, 0
+            since = now
+            lines = 0
         if lines >= LINES:
             return
         self._lines[reason] = since, lines + 1

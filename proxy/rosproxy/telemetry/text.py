@@ -100,7 +100,8 @@ def size(count: float) -> str:
     """A number of bytes: ``812 B``, ``1.5 kB``."""
     unit = 0
     while count >= 999.5 and unit < len(_UNITS) - 1:
-        count, unit = count / 1000, unit + 1
+        count = count / 1000
+        unit = unit + 1
     digits = 1 if unit and count < 99.95 else 0
     return f"{count:.{digits}f} {_UNITS[unit]}"
 

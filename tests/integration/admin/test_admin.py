@@ -118,7 +118,9 @@ async def test_status_tells_everything_of_a_node(proxy: Proxy, node: FakeNode) -
 async def test_metrics_of_a_proxy_at_work(
     make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
-    proxy, node, dead = await make_proxy(), await make_node(), await make_node("/dead")
+    proxy = await make_proxy()
+    node = await make_node()
+    dead = await make_node("/dead")
     for publisher in (node, dead):
         await publisher.publish(proxy.master)
     await node.serve(proxy.master)
@@ -152,7 +154,8 @@ async def test_metrics_of_a_proxy_at_work(
 async def test_who_does_not_answer_is_named(
     make_proxy: MakeProxy, make_node: MakeNode, node: FakeNode
 ) -> None:
-    proxy, dead = await make_proxy(cleanup_after=60.0), await make_node("/dead")
+    proxy = await make_proxy(cleanup_after=60.0)
+    dead = await make_node("/dead")
     for publisher in (node, dead):
         await publisher.publish(proxy.master)
     assert not [name for name in await metrics(proxy) if "nodes_down{" in name]

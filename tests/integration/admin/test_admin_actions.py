@@ -178,7 +178,8 @@ async def test_a_container_that_is_gone(
     make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
     proxy = await make_proxy(**PATIENT)
-    dead, alive = await make_node(), await make_node("/alive", OTHER_NODE)
+    dead = await make_node()
+    alive = await make_node("/alive", OTHER_NODE)
     await populate(proxy, dead)
     await alive.publish(proxy.master, "/news")
     lease = proxy.lease(dead)
@@ -258,11 +259,13 @@ async def test_a_port_that_a_living_node_got_meanwhile_keeps_its_connections(
     """While the dead node was asked, its port went to another: the last one of the range."""
     port = free_ports(1)
     proxy = await make_proxy(port_range=f"{port}-{port}", probe_interval=0.05, linger=60.0)
-    dead, alive = await make_node(), await make_node("/alive", OTHER_NODE)
+    dead = await make_node()
+    alive = await make_node("/alive", OTHER_NODE)
     await dead.publish(proxy.master)
     await dead.stop()
     await until(lambda: proxy.endpoint(dead).health.down, "the proxy knows that it is dead")
-    asked, answered = asyncio.Event(), asyncio.Event()
+    asked = asyncio.Event()
+    answered = asyncio.Event()
     probe = proxy.ros1.context.nodes.probe
 
     async def slow_probe(slave: HostPort, *timeout: float) -> ProbeAnswer:
@@ -329,12 +332,15 @@ class Container:
     """A node in a container that can get another address."""
 
     def __init__(self, node: FakeNode, proxy: Proxy) -> None:
-        self.node, self.proxy, self.uri = node, proxy, node.uri
+        self.node = node
+        self.proxy = proxy
+        self.uri = node.uri
 
     async def move(self, address: str) -> None:
         """The same process at another address; it calls itself what it did."""
         await self.node.stop()
-        self.node.host, self.node.address = self.node.host, address
+        self.node.host = self.node.host
+        self.node.address = address
         await self.node.start()
         assert self.node.uri == self.uri
 
@@ -357,10 +363,12 @@ async def container(make_proxy: MakeProxy, make_node: MakeNode) -> Container:
 async def test_a_container_that_has_moved(
     container: Container, master: FakeMaster, make_node: MakeNode
 ) -> None:
-    proxy, node = container.proxy, container.node
+    proxy = container.proxy
+    node = container.node
     robot = await make_node("/robot", OUTSIDE)
     await robot.subscribe(master.uri)
-    lease, uri = proxy.lease(node), proxy.uri(node)
+    lease = proxy.lease(node)
+    uri = proxy.uri(node)
     await container.move(OTHER_NODE)
     assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
     assert (proxy.lease(node), proxy.uri(node)) == (lease, uri)
@@ -378,7 +386,8 @@ async def test_a_container_that_has_moved(
 async def test_it_goes_on_calling_itself_what_it_did(
     container: Container, master: FakeMaster, make_node: MakeNode
 ) -> None:
-    proxy, node = container.proxy, container.node
+    proxy = container.proxy
+    node = container.node
     await container.move(OTHER_NODE)
     await news(proxy, moved={NODE: OTHER_NODE})
     await node.publish(proxy.master, "/more")
@@ -417,7 +426,8 @@ async def test_it_has_registered_from_its_new_address_already(
     container: Container, master: FakeMaster
 ) -> None:
     """So it holds another port, under the same name; its topics are all registered there."""
-    proxy, node = container.proxy, container.node
+    proxy = container.proxy
+    node = container.node
     await container.move(OTHER_NODE)
     await node.publish(proxy.master, "/more")
     assert master.holds("publishers", "/chatter") == []
@@ -431,7 +441,8 @@ async def test_it_has_registered_from_its_new_address_already(
 async def test_a_master_that_is_away_is_told_of_the_move_later(
     container: Container, master: FakeMaster
 ) -> None:
-    proxy, node = container.proxy, container.node
+    proxy = container.proxy
+    node = container.node
     await container.move(OTHER_NODE)
     await master.stop()
     reply = await post(proxy, "/containers", json.dumps({"moved": {NODE: OTHER_NODE}}))
@@ -443,7 +454,8 @@ async def test_a_master_that_is_away_is_told_of_the_move_later(
 
 async def test_a_container_that_is_back_elsewhere(container: Container, master: FakeMaster) -> None:
     """Gone at first, as one that is taken off its network, and then at another address."""
-    proxy, node = container.proxy, container.node
+    proxy = container.proxy
+    node = container.node
     await node.stop()
     assert await news(proxy, gone=[NODE]) == (1, 0, 0)
     assert not everything(master)

@@ -217,7 +217,8 @@ async def test_our_own_commands_may_name_the_proxy_as_they_like(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They send the address: ``rosproxy status --admin robot.example:11312`` goes on working."""
-    host, port = proxy.settings.admin.host, proxy.settings.admin.port
+    host = proxy.settings.admin.host
+    port = proxy.settings.admin.port
 
     def resolve(name: str, *rest: Any, **options: Any) -> Any:
         assert name == "robot.example"

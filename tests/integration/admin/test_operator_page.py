@@ -46,7 +46,8 @@ async def opened(proxies: dict[str, tuple[HostPort, str]], client: ProxyClient) 
 async def test_all_proxies_stand_on_one_page(
     make_proxy: MakeProxy, node: FakeNode, client: ProxyClient
 ) -> None:
-    first, second = await make_proxy(admin_token=TOKEN), await make_proxy()
+    first = await make_proxy(admin_token=TOKEN)
+    second = await make_proxy()
     await node.publish(first.master)
     gone = HostPort("127.0.0.1", free_ports(1))
     proxies = {

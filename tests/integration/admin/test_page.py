@@ -132,7 +132,8 @@ async def test_no_script_and_no_style_stands_in_the_page(proxy: Proxy) -> None:
 
 async def test_a_file_that_is_known_is_not_sent_again(proxy: Proxy) -> None:
     tag = (await get(proxy, "/page.js")).headers["etag"]
-    url, headers = f"{admin_url(proxy)}/page.js", {"If-None-Match": tag}
+    url = f"{admin_url(proxy)}/page.js"
+    headers = {"If-None-Match": tag}
     async with aiohttp.ClientSession() as session, session.get(url, headers=headers) as again:
         assert (again.status, await again.read()) == (304, b"")
 
@@ -248,7 +249,8 @@ async def test_a_page_that_reads_nothing_misses_documents_and_holds_few(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Documents of 8 MB, and nobody who reads: no more are encoded than buffers can take."""
-    made, encoded = 0, 0
+    made = 0
+    encoded = 0
     page = proxy.app.page
     encode = page._event
 

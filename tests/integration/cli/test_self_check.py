@@ -176,7 +176,8 @@ async def test_the_range_is_tried_until_outside_gets_in(
     make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A try that no port was free for says nothing: what was found before holds."""
-    dead, sound = PortProbe(1, "h:1", "refused", "missed"), PortProbe(1, "h:1", "ok", "ok")
+    dead = PortProbe(1, "h:1", "refused", "missed")
+    sound = PortProbe(1, "h:1", "ok", "ok")
     scripted = iter([(dead,), (), (sound,), (dead,)])
     tries: list[tuple[PortProbe, ...]] = []
 
@@ -202,8 +203,11 @@ async def test_what_was_proven_is_tried_again_when_it_may_have_changed(
     change: str, make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Outside got in, and then does not any more."""
-    dead, sound = PortProbe(1, "h:1", "refused", "missed"), PortProbe(1, "h:1", "ok", "ok")
-    outcome, tries, addresses = [sound], [0], ["127.0.0.1"]
+    dead = PortProbe(1, "h:1", "refused", "missed")
+    sound = PortProbe(1, "h:1", "ok", "ok")
+    outcome = [sound]
+    tries = [0]
+    addresses = ["127.0.0.1"]
 
     async def probe(*_: Any) -> tuple[PortProbe, ...]:
         tries[0] += 1
@@ -331,7 +335,8 @@ async def test_a_node_gets_the_port_that_is_being_tried(
     monkeypatch.setattr(master, "_notify", lambda *_: None)  # it does not get through
     monkeypatch.setattr("rosproxy.ros1.range_probe.MASTER_WAIT", 1.0)
     proxy = await make_proxy(ports=1)
-    leases, context = proxy.ros1.leases, proxy.ros1.context
+    leases = proxy.ros1.leases
+    context = proxy.ros1.context
     (port,) = context.settings.ports.listen.ports()
     trial = asyncio.create_task(probe_range(context, leases))
     await until(lambda: leases.is_lent(port), "the port is being tried")

@@ -248,12 +248,14 @@ async def test_a_signal_ends_it_with_connections_open(start_process, master, mak
         "from rosproxy.cli.main import main; sys.argv = ['rosproxy', *sys.argv[4:]]; main()"
     )
     process: Process = start_process(prefix=[sys.executable, "-c", forever])
-    node, hung = await make_node(), await make_node("/hung", "127.0.2.12")
+    node = await make_node()
+    hung = await make_node("/hung", "127.0.2.12")
     await node.publish(process.master)
     await hung.publish(process.master)
     lease = host_and_port(master.holds("publishers", "/chatter")[0])
     stuck = host_and_port(master.nodes["/hung"])
-    hung.hang, master.answers["getParam"] = True, End.HANG
+    hung.hang = True
+    master.answers["getParam"] = End.HANG
     get = b"GET /healthz HTTP/1.1\r\nHost: h\r\n\r\n"
     async with AsyncExitStack() as stack:
         wires = [
@@ -344,7 +346,8 @@ async def test_the_advertised_host_may_be_a_name(make_proxy, master, node):
 
 async def test_inside_networks_decide_who_reaches_whom_directly(make_proxy, make_node):
     proxy = await make_proxy(inside_network=("127.0.2.11/32",))
-    node, other = await make_node(), await make_node("/other", "127.0.2.12")
+    node = await make_node()
+    other = await make_node("/other", "127.0.2.12")
     await node.publish(proxy.master)
     assert (await node.subscribe(proxy.master))[2] == [node.uri]
     seen = (await other.subscribe(proxy.master))[2]

@@ -148,8 +148,10 @@ def test_wrong_options_are_refused():
     ],
 )
 def test_what_counts_as_lost_cut_off_duplicated_or_unheard(sent, before, received, kept, told):
-    talker, listener = Talker("/t", "", topic="/t"), Listener("/l", "", topic="/t")
-    talker.number, talker.sent = 5, dict.fromkeys(sent, 0.0)
+    talker = Talker("/t", "", topic="/t")
+    listener = Listener("/l", "", topic="/t")
+    talker.number = 5
+    talker.sent = dict.fromkeys(sent, 0.0)
     listener.received = [(number, 0.0) for number in received]
     fits, text = count(talker, listener, frozenset(before))
     assert fits is kept
@@ -160,7 +162,8 @@ def test_what_counts_as_lost_cut_off_duplicated_or_unheard(sent, before, receive
 def scenario():
     made = Scenario(4)
     made.act = "first act"
-    made.talker.number, made.talker.sent = 12, dict.fromkeys(range(3, 13), 0.0)
+    made.talker.number = 12
+    made.talker.sent = dict.fromkeys(range(3, 13), 0.0)
     made.listener.problem = "Connection refused"
     made.tell("it began")
     return made

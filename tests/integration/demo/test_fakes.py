@@ -8,7 +8,8 @@ from examples.demo.players import Listener, Refused, Talker
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, rpc, until
 
 TYPE = "std_msgs/String"
-A, B = "http://127.0.0.1:1/", "http://127.0.0.1:2/"
+A = "http://127.0.0.1:1/"
+B = "http://127.0.0.1:2/"
 NEW_NODE = "[/twin] Reason: new node registered with same name"
 
 
@@ -79,7 +80,8 @@ async def test_subscribers_of_a_parameter_hear_of_it_unless_they_set_it(master, 
 @pytest.fixture
 async def pair(master):
     """A talker that talks and a listener, without a proxy."""
-    talker, listener = Talker("/t", OUTSIDE, topic="/t"), Listener("/l", OTHER_NODE, topic="/t")
+    talker = Talker("/t", OUTSIDE, topic="/t")
+    listener = Listener("/l", OTHER_NODE, topic="/t")
     for node in (listener, talker):
         await node.start()
         await node.register(master.uri)

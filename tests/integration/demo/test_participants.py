@@ -25,7 +25,8 @@ from examples.demo.rtps_messages import (
 from rosproxy.ros2.protocol.rtps import SubmessageId
 from tests.integration.net import until
 
-A, B = b"A" * 12, b"B" * 12
+A = b"A" * 12
+B = b"B" * 12
 LISTENER = A + bytes([0, 0, 1, 4])
 
 

@@ -61,7 +61,8 @@ async def ask(proxy: Any, node: Any) -> Address:
 
 
 async def test_a_subscriber_is_sent_to_the_fast_port(make_proxy, make_node, kernel):
-    proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
+    proxy = await make_proxy(data_plane="auto")
+    node = await make_node("/a")
     await node.publish(proxy.master)
     host, lease = proxy.lease(node)
     assert await ask(proxy, node) == (host, lease + 4)
@@ -77,7 +78,8 @@ async def test_a_subscriber_is_sent_to_the_fast_port(make_proxy, make_node, kern
 
 
 async def test_a_service_keeps_to_the_lease(make_proxy, make_node, kernel, master):
-    proxy, node = await make_proxy(data_plane="kernel"), await make_node("/a")
+    proxy = await make_proxy(data_plane="kernel")
+    node = await make_node("/a")
     await node.publish(proxy.master)
     await node.serve(proxy.master)
     host, lease = proxy.lease(node)
@@ -87,7 +89,8 @@ async def test_a_service_keeps_to_the_lease(make_proxy, make_node, kernel, maste
 
 
 async def test_the_fast_port_of_a_node_that_ended_refuses(make_proxy, make_node, kernel):
-    proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
+    proxy = await make_proxy(data_plane="auto")
+    node = await make_node("/a")
     await node.publish(proxy.master)
     fast = await ask(proxy, node)
     await node.stop()
@@ -139,7 +142,8 @@ async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
 
 async def test_a_range_without_partners_has_no_fast_ports(make_proxy, make_node, kernel, caplog):
     caplog.set_level("INFO")
-    proxy, node = await make_proxy(data_plane="auto", ports=1), await make_node("/a")
+    proxy = await make_proxy(data_plane="auto", ports=1)
+    node = await make_node("/a")
     await node.publish(proxy.master)
     for _ in range(2):
         assert await ask(proxy, node) == proxy.lease(node)
@@ -147,7 +151,8 @@ async def test_a_range_without_partners_has_no_fast_ports(make_proxy, make_node,
 
 
 async def test_without_the_kernel_nobody_is_sent_to_a_fast_port(make_proxy, make_node, no_kernel):
-    proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
+    proxy = await make_proxy(data_plane="auto")
+    node = await make_node("/a")
     await node.publish(proxy.master)
     assert await ask(proxy, node) == proxy.lease(node)
     assert proxy.app.status()["data_plane"]["reason"] == "not in this test"
@@ -156,7 +161,8 @@ async def test_without_the_kernel_nobody_is_sent_to_a_fast_port(make_proxy, make
 async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     make_proxy, make_node, no_kernel
 ):
-    proxy, node = await make_proxy(data_plane="auto", ports=4), await make_node("/a")
+    proxy = await make_proxy(data_plane="auto", ports=4)
+    node = await make_node("/a")
     await node.publish(proxy.master)
     host, lease = proxy.lease(node)
     assert await refuses((host, lease + 2))

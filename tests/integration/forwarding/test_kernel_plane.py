@@ -82,7 +82,8 @@ class Bench:
 
     def stand_in(self) -> StandIn:
         address = HostPort("robot", 40000)
-        local, uri = HostPort("172.30.0.2", 20016), f"http://{address}/"
+        local = HostPort("172.30.0.2", 20016)
+        uri = f"http://{address}/"
         stand_in = StandIn(local, uri, address, is_uri_kept=False, topic_ports={"/chatter": 50000})
         stand_in.address = NODE
         self.context.stand_ins.add(stand_in)
@@ -137,7 +138,8 @@ async def test_another_tcpros_port_is_followed(bench: Bench) -> None:
 
 
 async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> None:
-    endpoint, other = await bench.forwarded(), await bench.forwarded(1)
+    endpoint = await bench.forwarded()
+    other = await bench.forwarded(1)
     endpoint.health.end(1.0)
     bench.plane.syncer.note_change(endpoint)
     await bench.plane.syncer.cleared(45002)
@@ -151,7 +153,8 @@ async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> Non
 
 
 async def test_only_those_that_changed_are_gone_through(bench: Bench) -> None:
-    first, second = await bench.forwarded(), await bench.forwarded(1)
+    first = await bench.forwarded()
+    second = await bench.forwarded(1)
     first.topic_ports = second.topic_ports = {"/a": 50001}
     assert await bench.plane.syncer.forwards(second, 50001)
     assert bench.tools.forwards == {45002: (NODE, 50000), 45003: (NODE, 50001)}
@@ -237,7 +240,8 @@ async def test_a_plane_that_is_lost_is_told_and_comes_back(
     monkeypatch.setattr(syncer, "RETRY_LOST", 0.0)
     endpoint = await bench.forwarded()
     endpoint.fast_peers = {"198.51.100.2": 1}
-    bench.tools.failing, endpoint.topic_ports = 2, {"/a": 50001}
+    bench.tools.failing = 2
+    endpoint.topic_ports = {"/a": 50001}
     assert not await bench.plane.syncer.forwards(endpoint, 50001)
     assert not bench.plane.syncer.usable
     assert endpoint.fast_peers == {}
@@ -251,7 +255,8 @@ async def test_a_plane_that_is_lost_is_told_and_comes_back(
 
 async def test_a_plane_that_stays_lost_is_tried_again_later(bench: Bench) -> None:
     endpoint = await bench.forwarded()
-    bench.tools.failing, endpoint.topic_ports = 10, {"/a": 50001}
+    bench.tools.failing = 10
+    endpoint.topic_ports = {"/a": 50001}
     assert not await bench.plane.syncer.forwards(endpoint, 50001)
     left = bench.tools.failing
     await bench.plane.look()
@@ -306,7 +311,8 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     later.plane.recovered([endpoint])
     await asyncio.sleep(0.05)
     assert later.tools.forwards == {45002: (NODE, 50000)}
-    endpoint.topic_ports, endpoint.trusted = {"/a": 50001}, True
+    endpoint.topic_ports = {"/a": 50001}
+    endpoint.trusted = True
     assert await later.plane.syncer.forwards(endpoint, 50001)
     assert later.tools.forwards == {45002: (NODE, 50001)}
     assert later.plane.status_of(endpoint)["plane"] == "kernel"

@@ -34,7 +34,8 @@ class Ends:
     """Both ends of a relayed connection, as raw connections of the test."""
 
     def __init__(self, outside: Wire, inside: Wire) -> None:
-        self.outside, self.inside = outside, inside
+        self.outside = outside
+        self.inside = inside
 
 
 @pytest.fixture
@@ -55,7 +56,8 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
         arrived.set_result(Wire(reader, writer))
         await over.wait()
 
-    before, node.stream = node.stream, hold
+    before = node.stream
+    node.stream = hold
     async with connect(lease) as outside:
         await outside.send(topic_header())
         try:
@@ -82,7 +84,8 @@ async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lea
 @pytest.mark.parametrize("after", ["nothing", "data", "a half close"])
 async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
     async with relayed(node, lease) as ends:
-        resetting, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
+        resetting = getattr(ends, who)
+        other = ends.inside if who == "outside" else ends.outside
         if after == "data":
             await resetting.send(b"x" * 100_000)
             assert await other.exactly(100_000) == b"x" * 100_000
@@ -97,7 +100,8 @@ async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
 @pytest.mark.parametrize("who", ["outside", "inside"])
 async def test_a_reset_passes_once_the_other_side_reads_on(proxy, node, lease, who):
     async with relayed(node, lease) as ends:
-        resetting, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
+        resetting = getattr(ends, who)
+        other = ends.inside if who == "outside" else ends.outside
         resetting.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
         flood = asyncio.create_task(resetting.send(b"x" * 50_000_000))
         await resetting.stalls()
@@ -123,7 +127,9 @@ async def test_a_reader_that_stalls_and_leaves_ends_the_writer(proxy, node, leas
 
 def slices(data: bytes, seed: int) -> list[bytes]:
     """The same bytes in pieces of random sizes, most near where the relay changes its ways."""
-    chooser, parts, start = random.Random(seed), [], 0
+    chooser = random.Random(seed)
+    parts = []
+    start = 0
     while start < len(data):
         near = chooser.choice([1, 100, 3000, *THRESHOLDS])
         size = max(1, near + chooser.choice([-1, 0, 1, chooser.randrange(50)]))
@@ -153,7 +159,8 @@ async def test_bytes_arrive_intact_both_ways_at_once(
     proxy, node, lease, seed, least_pipe, monkeypatch
 ):
     monkeypatch.setattr(relay, "LEAST_PIPE", least_pipe)
-    outward, inward = random.Random(seed).randbytes(3_000_001), os.urandom(2_000_003)
+    outward = random.Random(seed).randbytes(3_000_001)
+    inward = os.urandom(2_000_003)
     async with relayed(node, lease) as ends, asyncio.timeout(PATIENCE):
         *_, got_outside, got_inside = await asyncio.gather(
             write(ends.inside, slices(outward, seed)),
@@ -247,7 +254,8 @@ async def test_without_a_thread_left_a_connection_is_reset(
     async with relayed(node, lease):
         pass
     await proxy.quiet()
-    real, budget = threading.Thread.start, [started]
+    real = threading.Thread.start
+    budget = [started]
 
     def start(thread: threading.Thread) -> None:
         if thread.name.startswith("relay"):

@@ -92,7 +92,9 @@ def subscribe(address: Address) -> socket.socket:
 
 def drain(conn: socket.socket, stall: float = 0.0) -> int:
     """Stall, then read to the end; how many bytes came."""
-    stop, total, buffer = threading.Event(), 0, bytearray(MIB)
+    stop = threading.Event()
+    total = 0
+    buffer = bytearray(MIB)
     stop.wait(stall)
     while size := conn.recv_into(buffer):
         total += size
@@ -129,7 +131,8 @@ async def test_a_stalled_subscriber_does_not_move_the_proxys_memory(start_proces
 
 
 async def test_a_stalled_node_does_not_move_the_proxys_memory(start_process, master, node):
-    process, got = start_process(), []
+    process = start_process()
+    got = []
     lease = await lease_of(process, master, node)
 
     def give() -> None:
@@ -154,7 +157,8 @@ class Streams:
         for conn in conns:
             conn.setblocking(False)
             self._selector.register(conn, event)
-        self._turn, self._stop = turn, threading.Event()
+        self._turn = turn
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -173,7 +177,8 @@ class Streams:
 
 
 async def test_a_hundred_streams_all_make_progress(start_process, master, node):
-    process, over = start_process(), threading.Event()
+    process = start_process()
+    over = threading.Event()
     lease = await lease_of(process, master, node)
     inside: list[socket.socket] = []
     buffer = bytearray(65536)

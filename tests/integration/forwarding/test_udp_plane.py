@@ -25,7 +25,8 @@ from tests.integration.net import until
 from tests.run_options import parse_settings
 
 RANGE = PortRange(45000, 45015)
-LOCATOR, OTHER = HostPort("192.0.2.5", 7411), HostPort("192.0.2.6", 7411)
+LOCATOR = HostPort("192.0.2.5", 7411)
+OTHER = HostPort("192.0.2.6", 7411)
 
 
 class Bench:
@@ -36,7 +37,8 @@ class Bench:
         self.runtime = runtime = Runtime(parse_settings(told))
         self.tools = tools or FakeTools()
         self.later = 0.0
-        ports, pool = PortMap(RANGE, RANGE), PortPool(RANGE)
+        ports = PortMap(RANGE, RANGE)
+        pool = PortPool(RANGE)
         domain = DomainSettings(
             number=0,
             hosts=("192.0.2.1",),

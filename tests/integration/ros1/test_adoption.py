@@ -62,7 +62,8 @@ def all_of(master: FakeMaster, name: str = "/talker") -> dict[str, list[str]]:
 
 def leased(proxy: Proxy, node: FakeNode) -> dict[str, list[str]]:
     """The same as it must be once the node is behind the proxy."""
-    uri, (host, port) = proxy.uri(node), proxy.lease(node)
+    uri = proxy.uri(node)
+    (host, port) = proxy.lease(node)
     names = ("/chatter", "/rosout", "/back", "/rosout_disable_topics_generation")
     return {name: [uri] for name in names} | {"/add": [f"rosrpc://{host}:{port}"]}
 
@@ -293,7 +294,8 @@ async def test_it_registers_around_the_proxy_again(
 async def test_it_does_so_through_a_proxy_that_has_forgotten(
     make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
-    proxy, node = await make_proxy(**PATIENT), await make_node("/talker", NODE, "c1.invalid")
+    proxy = await make_proxy(**PATIENT)
+    node = await make_node("/talker", NODE, "c1.invalid")
     await register_directly(master, node)
     await adopt(proxy, container(NODE, "c1.invalid"))
     await proxy.restart()

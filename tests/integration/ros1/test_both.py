@@ -111,7 +111,8 @@ async def test_what_comes_back_is_what_the_master_has(
     proxy: Proxy, robot: FakeNode, master: FakeMaster
 ) -> None:
     """As `rosnode cleanup` unregisters somebody else's node."""
-    given, api = await look_up(proxy, robot), await look_up_service(proxy)
+    given = await look_up(proxy, robot)
+    api = await look_up_service(proxy)
     await proxy.restart()  # nothing is remembered; the port is as before
     assert await look_up(proxy, robot) == given
     ended = await rpc(proxy.master, "unregisterPublisher", "/robot", "/chatter", given, source=NODE)
@@ -149,10 +150,8 @@ async def test_a_node_outside_has_no_port_opened_for_what_the_master_does_not_ha
 
 
 async def test_only_inside_is_let_in(proxy: Proxy, robot: FakeNode) -> None:
-    at, service = (
-        host_and_port(await look_up(proxy, robot)),
-        host_and_port(await look_up_service(proxy)),
-    )
+    at = host_and_port(await look_up(proxy, robot))
+    service = host_and_port(await look_up_service(proxy))
     for source in (OUTSIDE, MASTER, "127.0.0.1"):
         assert await knock(at, post(xml("getPid", "/tool")), source) in ("closed", "reset")
         assert await knock(service, service_header(), source) in ("closed", "reset")
@@ -189,10 +188,8 @@ async def test_denied_topics_and_services_are_not_reached_by_an_address_that_is_
     proxy = await make_proxy(
         direction="both", policy=("deny subscribe /chatter by /spy; deny call /add by /spy",)
     )
-    at, service = (
-        host_and_port(await look_up(proxy, robot)),
-        host_and_port(await look_up_service(proxy)),
-    )
+    at = host_and_port(await look_up(proxy, robot))
+    service = host_and_port(await look_up_service(proxy))
     for caller, may in (("/spy", False), ("/friend", True)):
         asked = await rpc(at, "requestTopic", caller, "/chatter", [["TCPROS"]], source=NODE)
         assert (asked[0] == 1) is may

@@ -101,7 +101,8 @@ async def test_where_an_operator_selects_only_its_containers_are_let_in(
 ) -> None:
     monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
     proxy = await make_proxy(linger=60)
-    node, other = await make_node(), await make_node("/other", OTHER_NODE)
+    node = await make_node()
+    other = await make_node("/other", OTHER_NODE)
     assert (await node.publish(proxy.master))[0] == 1
     assert proxy.app.status()["settings"]["selected"] is None
     assert await news(proxy, selected=[OTHER_NODE]) == (0, 0, 0)
@@ -162,7 +163,8 @@ async def test_nobody_slips_in_before_an_operator_has_told_whom_it_selects(
     """For some tenths of a second after each start all of the inside networks were let in."""
     monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
     proxy = await make_proxy(**BY_AN_OPERATOR)
-    node, stranger = await make_node(), await make_node("/stranger", OTHER_NODE)
+    node = await make_node()
+    stranger = await make_node("/stranger", OTHER_NODE)
     body = request(xml("registerPublisher", stranger.name, "/t", "x/Y", stranger.uri))
     good = asyncio.create_task(node.publish(proxy.master))
     bad = asyncio.create_task(exchange(proxy.master, body, OTHER_NODE))
@@ -199,7 +201,8 @@ async def test_no_more_than_so_many_calls_wait(
     monkeypatch.setattr(callers, "MOST_WAITING_EACH", 2)
     monkeypatch.setattr(callers, "MOST_WAITING", 3)
     await news(proxy, selected=[])
-    waiting, body = proxy.ros1._callers._waiting, request(xml("getPid", "/n"))
+    waiting = proxy.ros1._callers._waiting
+    body = request(xml("getPid", "/n"))
     sources = [NODE, NODE, OTHER_NODE]
     calls = [asyncio.create_task(exchange(proxy.master, body, source)) for source in sources]
     await until(lambda: waiting.total() == 3, "the calls wait")
@@ -228,7 +231,8 @@ async def test_a_forged_caller_api_publishes_nobody_else(
     proxy: Proxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
     """A node that never joined was published by somebody who registered its address."""
-    evil, victim = await make_node("/evil"), await make_node("/victim", OTHER_NODE)
+    evil = await make_node("/evil")
+    victim = await make_node("/victim", OTHER_NODE)
     await evil.call(proxy.master, "registerPublisher", "/rosout", "rosgraph_msgs/Log", victim.uri)
     assert address_of(proxy, "/evil") == NODE
     told = [row["text"] for row in proxy.app.status()["problems"] if row["subject"] == "/evil"]
@@ -458,7 +462,8 @@ async def test_what_former_proxies_left_is_cleaned_from_the_master(
     former = await make_proxy()
     node = await make_node()
     await node.publish(former.master)
-    port, uri = former.endpoint(node).port, former.uri(node)
+    port = former.endpoint(node).port
+    uri = former.uri(node)
     await former.stop()
     await claim(master, "/same_port", port, f"{OTHER_NODE}:1")
     await claim(master, "/other_network", port + 1, "10.99.0.5:40001")
@@ -523,7 +528,8 @@ async def test_news_of_a_node_that_is_gone_do_not_close_its_port_to_the_next(
 ) -> None:
     """A probe of a dead node ended after its port had been given to one that lives."""
     proxy = await make_proxy(ports=1)
-    gone, late = await make_node("/gone"), await make_node("/late")
+    gone = await make_node("/gone")
+    late = await make_node("/late")
     await gone.publish(proxy.master)
     endpoint = proxy.endpoint(gone)
     proxy.ros1.leases.end(endpoint)

@@ -161,7 +161,8 @@ async def test_the_proxy_keeps_a_connection_to_a_node_that_is_well(make_proxy, n
     proxy = await make_proxy(probe_interval=0.1)
     await node.publish(proxy.master)
     await until(lambda: asked(node) > 3, "it is asked")
-    before, connections = asked(node), node.slave.connections
+    before = asked(node)
+    connections = node.slave.connections
     await until(lambda: asked(node) > before + 3, "it is asked on")
     assert node.slave.connections == connections
     node.pid += 1  # as if another process had the address

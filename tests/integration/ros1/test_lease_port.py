@@ -148,7 +148,8 @@ async def test_a_header_whose_sender_has_left_is_not_handed_on(proxy, node):
 
 
 async def test_a_service_on_a_port_of_its_own_is_found(proxy, make_node):
-    node, other_port = await make_node(), FakeNode("/talker", NODE)
+    node = await make_node()
+    other_port = FakeNode("/talker", NODE)
     await node.publish(proxy.master)
     await other_port.tcpros.start(other_port.address)
     try:
@@ -200,7 +201,8 @@ async def test_a_node_that_drops_the_connection_at_once_is_a_reset(proxy, node):
 
 
 async def test_publisher_updates_are_imported_in_order_without_doubles(proxy, make_node):
-    talker, listener = await make_node(), await make_node("/listener", OTHER_NODE)
+    talker = await make_node()
+    listener = await make_node("/listener", OTHER_NODE)
     await talker.publish(proxy.master)
     await listener.subscribe(proxy.master)
     far = f"http://{OUTSIDE}:4000/"
@@ -210,7 +212,8 @@ async def test_publisher_updates_are_imported_in_order_without_doubles(proxy, ma
 
 
 async def test_bus_info_and_master_uri_are_exported(proxy, make_node):
-    talker, listener = await make_node(), await make_node("/listener", OTHER_NODE)
+    talker = await make_node()
+    listener = await make_node("/listener", OTHER_NODE)
     await talker.publish(proxy.master)
     await listener.subscribe(proxy.master)
     row = [1, talker.uri, "i", "TCPROS", "/chatter", True]
@@ -226,7 +229,8 @@ async def test_only_the_master_may_control_nodes_where_policy_says_so(make_proxy
     proxy = await make_proxy(slave_control="master")
     await node.publish(proxy.master)
     await node.call(proxy.master, "subscribeParam", node.uri, "/chatter")
-    lease, controls = proxy.uri(node), ("shutdown", "publisherUpdate", "paramUpdate")
+    lease = proxy.uri(node)
+    controls = ("shutdown", "publisherUpdate", "paramUpdate")
     for method in controls:
         assert (await rpc(lease, method, "/evil", "/chatter", []))[0] == -1
         inner = [{"methodName": method, "params": ["/evil", "/chatter", []]}]
@@ -295,9 +299,11 @@ async def test_a_registration_never_gets_a_port_outside_the_range(make_proxy, ma
 
 async def test_the_same_uri_gets_the_same_port_again(make_proxy, make_node):
     proxy = await make_proxy(linger=0.0)
-    node, other = await make_node(), await make_node("/other", OTHER_NODE)
+    node = await make_node()
+    other = await make_node("/other", OTHER_NODE)
     await node.publish(proxy.master)
-    lease, uri = proxy.lease(node), proxy.uri(node)
+    lease = proxy.lease(node)
+    uri = proxy.uri(node)
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
     await until(lambda: not len(proxy.ros1.context.registry), "the lease ends")
     assert await refuses(lease)
@@ -308,7 +314,8 @@ async def test_the_same_uri_gets_the_same_port_again(make_proxy, make_node):
 
 async def test_an_idle_lease_gives_way_where_the_range_is_short(make_proxy, make_node):
     proxy = await make_proxy(ports=1, linger=60.0)
-    node, other = await make_node(), await make_node("/other", OTHER_NODE)
+    node = await make_node()
+    other = await make_node("/other", OTHER_NODE)
     await node.publish(proxy.master)
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
     await until(lambda: proxy.endpoint(node).idle_since is not None, "the node counts as idle")
@@ -348,7 +355,8 @@ async def test_a_port_that_another_program_holds_is_passed_over(make_proxy, make
 async def test_no_other_program_takes_a_port_of_the_range(proxy, node):
     """Whether nobody has the port, a node has it, or a node had it and has gone."""
     (await node.publish(proxy.master))
-    leased, free = proxy.endpoint(node).port, proxy.settings.ports.listen.last
+    leased = proxy.endpoint(node).port
+    free = proxy.settings.ports.listen.last
 
     def bound(port: int) -> bool:
         with socket.socket() as other:

@@ -89,10 +89,12 @@ async def test_clean_up_waits_for_a_master_that_is_down(make_proxy, master, node
 
 async def test_a_hanging_node_blocks_nobody(make_proxy, make_node):
     proxy = await make_proxy(**{**IMPATIENT, "cleanup_after": 0})
-    hung, fine = await make_node("/hung"), await make_node("/fine", OTHER_NODE)
+    hung = await make_node("/hung")
+    fine = await make_node("/fine", OTHER_NODE)
     await hung.publish(proxy.master)
     await fine.publish(proxy.master)
-    lease, other = proxy.lease(hung), proxy.lease(fine)
+    lease = proxy.lease(hung)
+    other = proxy.lease(fine)
     hung.hang = True
     async with connect(lease) as stuck:
         await stuck.send(post(xml("getPid", "/outside")))
@@ -105,11 +107,14 @@ async def test_a_hanging_node_blocks_nobody(make_proxy, make_node):
 
 
 async def test_probes_of_a_hanging_node_leak_nothing(start_process, make_node):
-    process, hung = start_process(**{**IMPATIENT, "cleanup_after": 0}), await make_node("/hung")
+    process = start_process(**{**IMPATIENT, "cleanup_after": 0})
+    hung = await make_node("/hung")
     await hung.publish(process.master)
     hung.hang = True
     await until(lambda: "does not answer" in process.text, "the node counts as silent")
-    before, threads, probes = process.descriptors(), process.threads(), hung.slave.connections
+    before = process.descriptors()
+    threads = process.threads()
+    probes = hung.slave.connections
     await until(lambda: hung.slave.connections >= probes + 6, "six more probes")
     # A call that is under way has one, or whose answer is late: what leaks would stay.
     await hung.stop()
@@ -145,7 +150,8 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
     await node.subscribe(proxy.master, "/news")
     await node.serve(proxy.master)
     await node.call(proxy.master, "subscribeParam", node.uri, "/p")
-    uri, lease = proxy.uri(node), proxy.lease(node)
+    uri = proxy.uri(node)
+    lease = proxy.lease(node)
     node.hang = True
     await until(lambda: not master.nodes, "it is cleaned up")
     far = f"http://{OUTSIDE}:4000/"
@@ -221,7 +227,9 @@ async def test_what_a_former_process_at_the_same_uri_registered_is_taken_back(
     proxy = await make_proxy(probe_interval=0.1)
     node = await make_node("/first")
     await node.publish(proxy.master, "/old")
-    node.name, node.pid, node.published = "/second", node.pid + 1, {}
+    node.name = "/second"
+    node.pid = node.pid + 1
+    node.published = {}
     await node.publish(proxy.master, "/new")
     await until(lambda: not master.holds("publishers", "/old"), "the old topic is taken back")
     assert master.holds("publishers", "/new") == [proxy.uri(node)]
@@ -231,7 +239,8 @@ async def test_what_a_former_process_at_the_same_uri_registered_is_taken_back(
 async def test_a_restart_under_the_same_name_elsewhere_ends_the_old_process(
     proxy, master, make_node
 ):
-    old, new = await make_node(), await make_node("/talker", OTHER_NODE)
+    old = await make_node()
+    new = await make_node("/talker", OTHER_NODE)
     await old.publish(proxy.master)
     await new.publish(proxy.master)
     assert proxy.uri(old) != proxy.uri(new)

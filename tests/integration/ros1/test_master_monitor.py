@@ -79,7 +79,8 @@ async def test_a_master_that_hangs_is_noticed_long_before_its_calls_time_out(
 async def test_what_the_master_loses_later_is_registered_again(master, make_proxy, node):
     proxy = await make_proxy(master_interval=0.05)
     await node.publish(proxy.master)
-    uri, often = proxy.uri(node), len(master.named("getSystemState"))
+    uri = proxy.uri(node)
+    often = len(master.named("getSystemState"))
     await until(lambda: len(master.named("getSystemState")) > often + 2, "nothing is missing")
     for _ in range(2):
         await rpc(master.uri, "unregisterPublisher", node.name, "/chatter", uri)

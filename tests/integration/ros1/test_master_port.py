@@ -46,7 +46,8 @@ async def test_a_node_sees_its_own_uri_literally(proxy, node):
 
 
 async def test_neighbours_get_each_others_own_uris(proxy, make_node):
-    talker, listener = await make_node("/talker"), await make_node("/listener", "127.0.2.12")
+    talker = await make_node("/talker")
+    listener = await make_node("/listener", "127.0.2.12")
     await talker.publish(proxy.master)
     assert (await listener.subscribe(proxy.master))[2] == [talker.uri]
     await talker.serve(proxy.master)

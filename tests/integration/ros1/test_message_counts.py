@@ -13,7 +13,9 @@ from tests.integration.conftest import MakeNode
 from tests.integration.proxy import Proxy
 
 PUBLISHED = {"name": "/chatter", "side": "published"}
-READ_LATELY, PATIENCE, AFTER_SILENCE = 15.0, 40.0, 12.0
+READ_LATELY = 15.0
+PATIENCE = 40.0
+AFTER_SILENCE = 12.0
 """Shorter than the proxy's own."""
 ROUND = EVERY + 2
 """Seconds in which each of few nodes is asked once more."""
@@ -23,7 +25,8 @@ class Counts:
     """What a node has counted of its one topic, for its answers."""
 
     def __init__(self, node: FakeNode) -> None:
-        self.messages, self._node = 1000, node
+        self.messages = 1000
+        self._node = node
         node.answers["getBusStats"] = lambda *_: value(
             [1, "", [[["/chatter", 0, [[1, 10 * self.messages, self.messages, True]]]], [], []]]
         )
@@ -112,7 +115,8 @@ async def test_who_does_not_answer_once_loses_nothing(
     read(proxy)
     await pass_time(ROUND)
     counts.messages += 50
-    answer, node.answers["getBusStats"] = node.answers["getBusStats"], End.HANG
+    answer = node.answers["getBusStats"]
+    node.answers["getBusStats"] = End.HANG
     asked = counts.asked()
     read(proxy)
     await pass_time(ROUND)

@@ -76,10 +76,8 @@ async def test_a_service_of_a_neighbour_without_a_usable_name_is_relayed(proxy, 
 
 async def test_a_tool_inside_can_unregister_whatever_it_was_told_of(proxy, master, make_node):
     tool = await make_node("/tool", THIRD_NODE)
-    direct, relayed = (
-        await make_node("/direct"),
-        await make_node("/relayed", OTHER_NODE, "x.invalid"),
-    )
+    direct = await make_node("/direct")
+    relayed = await make_node("/relayed", OTHER_NODE, "x.invalid")
     for node in (direct, relayed):
         await node.publish(proxy.master)
         await node.serve(proxy.master, f"{node.name}/add")
@@ -161,7 +159,8 @@ async def test_an_update_of_a_parameter_does_not_overtake_the_subscription(proxy
 
 async def test_an_update_does_not_overtake_the_registration_before_it(proxy, master, node):
     await node.subscribe(proxy.master, "/other")
-    uri, master.delay = proxy.uri(node), 0.2
+    uri = proxy.uri(node)
+    master.delay = 0.2
     registering = asyncio.create_task(node.subscribe(proxy.master))
     await until(lambda: proxy.endpoint(node).pending, "the registration is on its way")
     far = f"http://{OUTSIDE}:4000/"
@@ -173,9 +172,11 @@ async def test_an_update_does_not_overtake_the_registration_before_it(proxy, mas
 
 async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_proxy, make_node):
     proxy = await make_proxy(ports=1, linger=0.0)
-    former, next_ = await make_node("/former"), await make_node("/next", OTHER_NODE)
+    former = await make_node("/former")
+    next_ = await make_node("/next", OTHER_NODE)
     await former.publish(proxy.master)
-    lease, former_path = proxy.lease(former), f"/{NODE}:{former.slave.address[1]}/"
+    lease = proxy.lease(former)
+    former_path = f"/{NODE}:{former.slave.address[1]}/"
     async with connect(lease) as kept:
         await kept.send(post(xml("getPid", "/outside")))
         await kept.reply()
@@ -216,7 +217,8 @@ async def test_a_network_that_the_proxy_joins_while_it_runs_counts_at_once(
     networks = [ip_network("127.0.5.0/24")]
     monkeypatch.setattr("rosproxy.ros1.context.interface_networks", lambda **_: tuple(networks))
     proxy = await make_proxy(inside_network=())
-    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    talker = await make_node("/talker")
+    listener = await make_node("/listener", OTHER_NODE)
     networks.append(ip_network("127.0.2.0/24"))
     await talker.publish(proxy.master)
     assert (await listener.subscribe(proxy.master))[2] == [talker.uri]

@@ -48,7 +48,8 @@ async def denied(proxy, kind, mode="enforce"):
 
 async def test_a_denied_topic_is_hidden_outside_and_found_inside(make_proxy, master, make_node):
     proxy = await make_proxy(policy="deny publish /camera/*")
-    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    talker = await make_node("/talker")
+    listener = await make_node("/listener", OTHER_NODE)
     await talker.publish(proxy.master, "/odom")
     reply = await talker.publish(proxy.master, "/camera/front")
     assert reply == [1, "Registered [/talker] as publisher of [/camera/front]", []]
@@ -92,7 +93,8 @@ async def test_subscribers_inside_hear_of_hidden_publishers_that_come_and_go(
 
 async def test_a_hidden_service_is_found_inside_alone(make_proxy, master, make_node):
     proxy = await make_proxy(policy="deny serve /add")
-    server, client = await make_node("/server"), await make_node("/client", OTHER_NODE)
+    server = await make_node("/server")
+    client = await make_node("/client", OTHER_NODE)
     assert await server.serve(proxy.master) == [
         1,
         "Registered [/server] as provider of [/add]",
@@ -109,7 +111,8 @@ async def test_a_hidden_service_is_found_inside_alone(make_proxy, master, make_n
 
 async def test_tools_inside_see_the_whole_graph(make_proxy, master, make_node):
     proxy = await make_proxy(policy="deny publish /chatter; deny serve *")
-    talker, shown = await make_node("/talker"), await make_node("/shown", OTHER_NODE)
+    talker = await make_node("/talker")
+    shown = await make_node("/shown", OTHER_NODE)
     before = await shown.call(proxy.master, "getSystemState")
     for node in (talker, shown):
         await node.publish(proxy.master, "/odom")
@@ -130,7 +133,8 @@ async def test_tools_inside_see_the_whole_graph(make_proxy, master, make_node):
 
 async def test_a_dead_hidden_publisher_is_told_of(make_proxy, make_node):
     proxy = await make_proxy(policy="deny publish /chatter")
-    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    talker = await make_node("/talker")
+    listener = await make_node("/listener", OTHER_NODE)
     await talker.publish(proxy.master)
     await listener.subscribe(proxy.master)
     await talker.stop()
@@ -145,7 +149,8 @@ async def test_a_denied_subscription_gets_the_publishers_inside_alone(
 ):
     proxy = await make_proxy(policy="deny subscribe /chatter")
     master.register("publishers", "/chatter", "/outside", OUTSIDE_PUBLISHER)
-    listener, talker = await make_node("/listener"), await make_node("/talker", OTHER_NODE)
+    listener = await make_node("/listener")
+    talker = await make_node("/talker", OTHER_NODE)
     assert (await listener.subscribe(proxy.master))[2] == []
     assert master.holds("subscribers", "/chatter") == []
     await talker.publish(proxy.master)
@@ -157,7 +162,8 @@ async def test_a_denied_subscription_gets_the_publishers_inside_alone(
 
 async def test_a_denied_service_of_outside_is_not_found(make_proxy, master, make_node):
     proxy = await make_proxy(policy="deny call *")
-    client, server = await make_node("/client"), await make_node("/server", OTHER_NODE)
+    client = await make_node("/client")
+    server = await make_node("/server", OTHER_NODE)
     await server.serve(proxy.master)
     await rpc(master.uri, "registerService", "/far", "/far/add", "rosrpc://h:1", "http://h:2/")
     code, text, uri = await client.call(proxy.master, "lookupService", "/far/add")
@@ -249,7 +255,8 @@ async def test_a_multicall_of_many_parameters_asks_the_master_once(params, node,
 
 async def test_a_denied_topic_is_refused_outside_and_served_to_neighbours(make_proxy, make_node):
     proxy = await make_proxy(policy="deny publish /chatter")
-    talker, other = await make_node("/talker"), await make_node("/other", OTHER_NODE)
+    talker = await make_node("/talker")
+    other = await make_node("/other", OTHER_NODE)
     await talker.publish(proxy.master)
     await talker.publish(proxy.master, "/odom")
     await other.publish(proxy.master, "/else")
@@ -291,7 +298,8 @@ async def test_no_spelling_of_a_header_gets_around_a_rule(make_proxy, make_node,
 async def test_udpros_is_refused_where_topics_may_be_denied(make_proxy, make_node):
     """Its offer names a topic of its own, which roscpp believes."""
     proxy = await make_proxy(policy="deny publish /chatter by /talker")
-    talker, other = await make_node("/talker"), await make_node("/other", OTHER_NODE)
+    talker = await make_node("/talker")
+    other = await make_node("/other", OTHER_NODE)
     for node in (talker, other):
         await node.publish(proxy.master, "/odom")
     offer = [["UDPROS", Binary(b"topic=/chatter"), "h", 1, 1500]]
@@ -339,7 +347,8 @@ async def test_the_masters_own_calls_pass(make_proxy, master, make_node):
 
 async def test_a_change_hides_cuts_and_shows(make_proxy, master, make_node):
     proxy = await make_proxy(**PATIENT)
-    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    talker = await make_node("/talker")
+    listener = await make_node("/listener", OTHER_NODE)
     await talker.publish(proxy.master)
     await talker.publish(proxy.master, "/odom")
     await listener.subscribe(proxy.master)
@@ -425,7 +434,8 @@ async def test_a_bad_policy_names_what_is_wrong(proxy, body, says):
 
 async def test_a_restarted_proxy_knows_what_is_hidden(make_proxy, master, make_node):
     proxy = await make_proxy(policy="deny publish /chatter; deny subscribe /far", **PATIENT)
-    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    talker = await make_node("/talker")
+    listener = await make_node("/listener", OTHER_NODE)
     for node in (talker, listener):
         await node.publish(proxy.master, "/rosout")
     await talker.publish(proxy.master)
@@ -449,7 +459,8 @@ async def test_nothing_is_registered_before_an_operator_has_told_its_policy(
     """Neither by nodes that call nor by the recovery."""
     proxy = await make_proxy(await_policy=60, **PATIENT)
     assert await told(proxy) == (0, 0, 0)
-    talker, late = await make_node("/talker"), await make_node("/late", OTHER_NODE)
+    talker = await make_node("/talker")
+    late = await make_node("/late", OTHER_NODE)
     await talker.publish(proxy.master, "/rosout")
     assert await told(proxy, "deny publish /chatter") == (0, 0, 0)
     await talker.publish(proxy.master)
@@ -473,7 +484,8 @@ async def test_an_operator_is_waited_for_once_and_not_for_ever(make_proxy, make_
 
 async def test_a_restarted_proxy_asks_nodes_for_hidden_services(make_proxy, make_node):
     proxy = await make_proxy(policy="deny serve *", **PATIENT)
-    server, client = await make_node("/server"), await make_node("/client", OTHER_NODE)
+    server = await make_node("/server")
+    client = await make_node("/client", OTHER_NODE)
 
     async def answer(node, reader, writer, header):
         if header.get("service") == "/add":

@@ -52,7 +52,8 @@ async def test_nodes_that_answer_late_are_announced_together(make_proxy, master,
         uri = master.nodes[node.name]
         assert await refuses(host_and_port(uri))
     await asyncio.sleep(0.5)
-    master.delay, before = 0.1, len(master.named("getSystemState"))
+    master.delay = 0.1
+    before = len(master.named("getSystemState"))
     for node in nodes:
         node.hang = False
     await until(lambda: all_served(proxy), "all are served")

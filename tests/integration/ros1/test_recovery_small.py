@@ -280,7 +280,8 @@ async def test_a_node_that_is_down_is_not_registered_at_a_new_master(make_proxy,
 async def test_messages_flow_again(start_process, master):
     process = start_process()
     inner = f"http://{PROXY}:{process.master[1]}/"
-    talker, far_talker = Talker("/t", NODE, topic="/out"), Talker("/ft", OUTSIDE, topic="/in")
+    talker = Talker("/t", NODE, topic="/out")
+    far_talker = Talker("/ft", OUTSIDE, topic="/in")
     listener = Listener("/l", OTHER_NODE, topic="/in")
     far_listener = Listener("/fl", OUTSIDE, topic="/out")
     adder = Adder("/a", THIRD_NODE, service="/add")

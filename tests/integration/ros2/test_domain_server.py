@@ -23,7 +23,9 @@ from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, farewell, reached_at, spdp
 
-PROXY, INSIDE, OUTSIDE = "127.0.7.1", "127.0.7.2", "127.0.7.9"
+PROXY = "127.0.7.1"
+INSIDE = "127.0.7.2"
+OUTSIDE = "127.0.7.9"
 DOMAIN = own_domain()
 
 

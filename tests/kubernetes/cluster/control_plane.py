@@ -14,7 +14,8 @@ from tests.kubernetes.cluster.layout import (
 )
 from tests.kubernetes.cluster.programs import Program
 
-_ETCD, _ETCD_PEERS = "http://127.0.0.1:22379", "http://127.0.0.1:22380"
+_ETCD = "http://127.0.0.1:22379"
+_ETCD_PEERS = "http://127.0.0.1:22380"
 
 ETCD = Program("etcd", (
     BIN / "etcd", f"--data-dir={STATE}/etcd", "--unsafe-no-fsync", "--log-level=warn",

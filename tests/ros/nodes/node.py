@@ -68,8 +68,10 @@ def publish(options: Options) -> None:
     latch = options.number("latch", 0) > 0
     topic = options.text("topic")
     publisher = rospy.Publisher(topic, String, queue_size=10, latch=latch)
-    prefix, size = options.text("word", "hello"), int(options.number("size", 0))
-    rate, count = rospy.Rate(options.number("rate", 20)), options.number("count", 1e9)
+    prefix = options.text("word", "hello")
+    size = int(options.number("size", 0))
+    rate = rospy.Rate(options.number("rate", 20))
+    count = options.number("count", 1e9)
     say("ready")
     number = 0
     while number < count and not rospy.is_shutdown():
@@ -119,11 +121,13 @@ def serve(options: Options) -> None:
 
 def call(options: Options) -> None:
     """Waits for the service, then calls it `--count` times; a failed call is only told."""
-    service, persistent = options.text("service"), options.number("persistent", 0) > 0
+    service = options.text("service")
+    persistent = options.number("persistent", 0) > 0
     say("waiting")
     rospy.wait_for_service(service, timeout=options.number("patience", 30))
     proxy = rospy.ServiceProxy(service, MuxSelect, persistent=persistent)
-    rate, size = rospy.Rate(options.number("rate", 20)), int(options.number("size", 0))
+    rate = rospy.Rate(options.number("rate", 20))
+    size = int(options.number("size", 0))
     for number in range(int(options.number("count", 1))):
         if rospy.is_shutdown():
             break

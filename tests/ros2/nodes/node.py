@@ -103,7 +103,8 @@ def subscribe(node: Node, options: argparse.Namespace) -> None:
 
 def serve(node: Node, options: argparse.Namespace) -> None:
     def answer(_: Trigger.Request, reply: Trigger.Response) -> Trigger.Response:
-        reply.success, reply.message = True, options.word
+        reply.success = True
+        reply.message = options.word
         return reply
 
     node.create_service(Trigger, options.topic, answer)
@@ -118,7 +119,8 @@ def call(node: Node, options: argparse.Namespace) -> None:
         nonlocal number
         if not client.service_is_ready() or (options.in_turn and answered < number):
             return
-        asked, started = number, time.monotonic()
+        asked = number
+        started = time.monotonic()
         number += 1
         if number == options.count:
             timer.cancel()

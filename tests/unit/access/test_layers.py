@@ -50,7 +50,8 @@ def test_a_layer_may_be_for_some_addresses() -> None:
 
 
 def test_audit_tells_and_enforcement_goes_first() -> None:
-    audit, enforce = layer("deny publish /a", "trial", "audit"), layer("deny publish /a")
+    audit = layer("deny publish /a", "trial", "audit")
+    enforce = layer("deny publish /a")
     told = decide([audit], PUBLISH, "/a", "/n", "")
     assert told.allowed
     assert (told.layer, told.mode) == ("trial", PolicyMode.AUDIT)

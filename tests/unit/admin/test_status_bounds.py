@@ -35,7 +35,8 @@ from rosproxy.admin.status_document import (
     parse_status,
 )
 
-GOOD, EVIL = "172.18.0.5", "172.18.0.66"
+GOOD = "172.18.0.5"
+EVIL = "172.18.0.66"
 LONG = "x" * 1000
 MANY = tuple(f"/{number}{LONG}" for number in range(2000))
 GOOD_NODE = EndpointStatus(
@@ -158,7 +159,8 @@ def test_every_list_is_bounded_and_hides_nothing_of_others(flood: str) -> None:
 
 def _rows(status: ProxyStatus) -> int:
     """How many rows the tables have."""
-    policy, (domain,) = status.policy, status.domains
+    policy = status.policy
+    (domain,) = status.domains
     assert policy
     return sum(
         map(
@@ -172,7 +174,8 @@ def _rows(status: ProxyStatus) -> int:
 
 
 def _rows_left_out(status: ProxyStatus) -> int:
-    policy, (domain,) = status.policy, status.domains
+    policy = status.policy
+    (domain,) = status.domains
     assert policy
     counters = domain.left_out, domain.mismatches_left_out, policy.layers_left_out
     return status.left_out + policy.left_out + sum(counters)

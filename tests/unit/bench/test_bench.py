@@ -64,7 +64,8 @@ def test_loss() -> None:
 
 def test_cpu_is_by_the_time_between_two_readings() -> None:
     """However late the second one comes."""
-    before, after = Spent(10.0, 3.0, 7.0), Spent(12.0, 4.0, 10.0)
+    before = Spent(10.0, 3.0, 7.0)
+    after = Spent(12.0, 4.0, 10.0)
     assert per_second(before, after) == (0.5, 1.5)
 
 
@@ -130,7 +131,8 @@ def test_markdown_has_a_column_for_each_size() -> None:
 
 
 def test_results_are_pasted_between_the_marks_alone(tmp_path: Path) -> None:
-    page, folder = tmp_path / "performance.md", tmp_path / "results"
+    page = tmp_path / "performance.md"
+    folder = tmp_path / "results"
     folder.mkdir()
     page.write_text(f"before\n{report.BEGIN}\nold\n{report.END}\nafter\n")
     (folder / "performance.md").write_text("![Growth](streams.svg)\n")

@@ -22,7 +22,8 @@ from tests.unit.doctor.cases import (
 )
 from tests.unit.status_json import HOST, make_node, make_status
 
-REFUSED, UNRESOLVABLE = Attempt(ReachOutcome.REFUSED), Attempt(ReachOutcome.UNRESOLVABLE)
+REFUSED = Attempt(ReachOutcome.REFUSED)
+UNRESOLVABLE = Attempt(ReachOutcome.UNRESOLVABLE)
 
 
 def check(facts: DoctorFacts) -> list[DoctorFinding]:

@@ -25,7 +25,8 @@ def holder(registry: Registry, number: int) -> Endpoint:
 
 
 def a_book(holders: int) -> tuple[Registry, KernelAccounts, list[Endpoint]]:
-    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
+    registry = Registry(PortRange(1000, 1003))
+    book = KernelAccounts()
     endpoints = [holder(registry, number) for number in range(1, holders + 1)]
     book.note_owners(registry)
     return registry, book, endpoints
@@ -46,7 +47,9 @@ def added(counts: Counts, other: Iterable[int]) -> Counts:
 
 @given(st.lists(STEPS))
 def test_nothing_is_lost_or_counted_twice(steps: list[tuple[int, int, int]]) -> None:
-    ledger, counter, counted = CounterDeltas(), Counts(), Counts()
+    ledger = CounterDeltas()
+    counter = Counts()
+    counted = Counts()
     for step in steps:
         counter = added(counter, step)
         counted = added(counted, ledger.take({45050: counter}).get(45050, Counts()))

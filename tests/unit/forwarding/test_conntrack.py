@@ -107,7 +107,9 @@ def flow(peer_port: int) -> Flow:
 
 
 def test_who_is_not_answered_is_told_after_a_while() -> None:
-    watch, waiting, other = Watch(3.0), flow(1), flow(2)
+    watch = Watch(3.0)
+    waiting = flow(1)
+    other = flow(2)
     assert watch.look([waiting], 10.0) == []
     assert watch.look([waiting, other], 12.9) == []
     assert watch.look([waiting, other], 13.0) == [waiting]
@@ -115,7 +117,8 @@ def test_who_is_not_answered_is_told_after_a_while() -> None:
 
 
 def test_who_was_answered_meanwhile_begins_anew() -> None:
-    watch, waiting = Watch(3.0), flow(1)
+    watch = Watch(3.0)
+    waiting = flow(1)
     assert watch.look([waiting], 10.0) == []
     assert watch.look([], 12.0) == []
     assert watch.look([waiting], 14.0) == []

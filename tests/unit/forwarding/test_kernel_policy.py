@@ -21,7 +21,8 @@ from rosproxy.ros1.registry.node_health import ProbeResult
 
 NODE = "10.0.0.5"
 ROUTE = Route("10.0.0.2", 1500)
-THERE, THERE_SIX = HostPort(NODE, 50000), HostPort("fd00::5", 50000)
+THERE = HostPort(NODE, 50000)
+THERE_SIX = HostPort("fd00::5", 50000)
 
 
 def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
@@ -141,7 +142,9 @@ def test_what_did_not_change_stays() -> None:
 
 
 def test_a_forward_without_answer_is_not_made_for_longer_each_time() -> None:
-    pauses, now, lasted = Pauses(), 0.0, []
+    pauses = Pauses()
+    now = 0.0
+    lasted = []
     assert pauses.why(45050, THERE, now) is None
     for _ in range(12):
         pauses.note(45050, THERE, "no answer", now)

@@ -30,7 +30,8 @@ from rosproxy.net.addresses import HostPort
 
 TABLE = ConnectionTable(11311, PortRange(45000, 45999))
 NOTHING = Surroundings()
-FOUR, SIX = HostPort("10.0.0.5", 50000), HostPort("fd00::5", 50001)
+FOUR = HostPort("10.0.0.5", 50000)
+SIX = HostPort("fd00::5", 50001)
 
 
 def elements(document: str, verb: str) -> dict[str, list[str]]:

@@ -56,7 +56,8 @@ def test_an_endpoint_gets_the_partner_of_its_lease_and_keeps_it() -> None:
 
 def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
     registry = Registry(PortRange(1000, 1001))
-    first, second = admitted(registry, 1), admitted(registry, 2)
+    first = admitted(registry, 1)
+    second = admitted(registry, 2)
     assert not fast_ports.claim(registry.pool, first)
     assert not fast_ports.claim(registry.pool, second)
     assert fast_ports.why_no_fast_port(registry.pool, first) == (

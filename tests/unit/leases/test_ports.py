@@ -90,7 +90,9 @@ STEPS = st.sampled_from(["take", "give", "block", "unblock"])
 
 @given(st.lists(st.tuples(STEPS, st.integers(0, 3))))
 def test_every_port_is_free_held_or_blocked(steps: list[tuple[str, int]]) -> None:
-    pool, taken_ports, blocked = PortPool(RANGE), set[int](), set[int]()
+    pool = PortPool(RANGE)
+    taken_ports = set[int]()
+    blocked = set[int]()
     for step, index in steps:
         port = RANGE.first + index
         if step == "take" and (taken := pool.take(port)) is not None:

@@ -4,7 +4,8 @@ import pytest
 
 from rosproxy.net.fair_slots import FairSlots, NoSlot
 
-NEAR, FAR = "192.0.2.1", "192.0.2.2"
+NEAR = "192.0.2.1"
+FAR = "192.0.2.2"
 
 
 def test_a_source_has_its_share_and_leaves_the_rest_to_others() -> None:

@@ -7,7 +7,8 @@ from rosproxy.net.proxy_signs import MOST, Sign, overlapping_proxies, publish_si
 
 
 def test_a_sign_is_read_while_it_stands_and_where_the_ports_overlap() -> None:
-    own_admin, other_admin = HostPort("127.0.0.1", 61312), HostPort("::1", 61313)
+    own_admin = HostPort("127.0.0.1", 61312)
+    other_admin = HostPort("::1", 61313)
     sign = publish_sign(("2", "1"), 61000, 61009, own_admin)
     assert sign
     with closing(sign):

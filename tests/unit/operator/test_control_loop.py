@@ -59,7 +59,9 @@ class Looks:
         then: Callable[[], float | None] = lambda: None,
         takes: float = 0.0,
     ) -> None:
-        self.errors, self.then, self.takes = list(errors), then, takes
+        self.errors = list(errors)
+        self.then = then
+        self.takes = takes
         self.metrics = DockerMetrics()
         self.loop = ControlLoop(PACE, self.metrics)
         self.start = asyncio.get_running_loop().time()

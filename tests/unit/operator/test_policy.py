@@ -67,7 +67,8 @@ class Answers:
     """A proxy's admin endpoint that answers as it is told, and notes what it hears."""
 
     def __init__(self) -> None:
-        self.status, self.text = 200, "{}"
+        self.status = 200
+        self.text = "{}"
         self.told: list[Any] = []
 
     async def policy(self, request: web.Request) -> web.Response:
@@ -110,7 +111,8 @@ async def test_it_is_in_force_before_the_master_has_heard() -> None:
 @pytest.mark.parametrize(("status", "kind"), [(400, PolicyRefused), (403, ProxyError)])
 async def test_one_that_does_not_take_it(status: int, kind: type[ProxyError]) -> None:
     answers = Answers()
-    answers.status, answers.text = status, "layer 'x': too long"
+    answers.status = status
+    answers.text = "layer 'x': too long"
     async with proxy(web.post("/policy", answers.policy)) as (client, admin):
         with pytest.raises(ProxyError, match="layer 'x': too long") as error:
             await client.policy(admin, "token", [OWN])

@@ -27,7 +27,8 @@ class Evil:
 
 @pytest.fixture
 async def evil() -> AsyncIterator[Evil]:
-    evil, application = Evil(), web.Application()
+    evil = Evil()
+    application = web.Application()
     application.router.add_route("*", "/{path:.*}", evil.serve)
     runner = web.AppRunner(application)
     await runner.setup()

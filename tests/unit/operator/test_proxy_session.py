@@ -19,7 +19,8 @@ class SlowClient(ProxyClient):
 
     def __init__(self) -> None:
         super().__init__()
-        self.answers, self.asked = asyncio.Event(), asyncio.Event()
+        self.answers = asyncio.Event()
+        self.asked = asyncio.Event()
         self.error: ProxyError | None = None
         self.calls = 0
 

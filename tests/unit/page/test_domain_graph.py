@@ -93,7 +93,8 @@ def test_a_mismatch_that_is_at_its_link_is_no_finding_as_well() -> None:
 
 def test_a_service_that_does_not_match_is_broken_between_its_ends() -> None:
     server = replace(INSIDE, services=("/add",))
-    asks, replies = ("01.10.bb", "01.0f.aa"), ("01.0f.aa", "01.10.bb")
+    asks = ("01.10.bb", "01.0f.aa")
+    replies = ("01.0f.aa", "01.10.bb")
     for writer, reader in (asks, replies):
         pair = MismatchStatus("service", "/add", "type", "A", "B", writer, reader)
         document = made(inside=(server,), mismatches=(pair,))

@@ -109,7 +109,8 @@ def test_nodes_that_have_just_started_are_not_said_to_be_apart() -> None:
 @pytest.mark.parametrize("is_late", [True, False])
 def test_a_node_that_comes_or_goes_while_all_are_asked_is_well(is_late: bool) -> None:
     """The proxy was asked first, the master afterwards, and the node answers."""
-    before, after = make_status(), make_status(make_node())
+    before = make_status()
+    after = make_status(make_node())
     if not is_late:
         before, after = after, before
     facts = make_facts(status=before, nodes=by_name(talker(attempt=ANSWERED), listener()))
@@ -147,7 +148,8 @@ def test_a_node_that_is_wrong_is_the_first_cause_on_its_links() -> None:
 
 def counted(*rounds: tuple[float, int, int]) -> tuple[Measures, DoctorFacts]:
     """Rounds in which talker and listener have counted so many messages of 10 bytes."""
-    measures, facts = Measures(), make_facts()
+    measures = Measures()
+    facts = make_facts()
     for at, sent, got in rounds:
         gave = SlaveReport(
             STRING,
@@ -316,7 +318,8 @@ def test_a_large_graph_is_cut_and_what_is_broken_stays() -> None:
 def test_of_too_many_nodes_the_broken_ones_stay() -> None:
     """The last of them had the one broken link, which was not shown."""
     nodes = {f"/n{number}": PageNode("robot") for number in range(MOST_NODES + 9)}
-    last, ill = f"/n{MOST_NODES + 8}", f"/n{MOST_NODES + 7}"
+    last = f"/n{MOST_NODES + 8}"
+    ill = f"/n{MOST_NODES + 7}"
     nodes[ill] = PageNode("container", state="broken")
     link = PageLink("topic", "/chatter", "/n0", last, state="broken")
     made = document({}, nodes, [link], ())

@@ -20,8 +20,11 @@ from tests.unit.builders import (
     py_reply,
 )
 
-ROBOT, ADDRESS = "robot", "192.0.2.7"
-URI, SERVICE, LAPTOP = "http://robot:40001/", "rosrpc://robot:40003", "http://laptop:33445/"
+ROBOT = "robot"
+ADDRESS = "192.0.2.7"
+URI = "http://robot:40001/"
+SERVICE = "rosrpc://robot:40003"
+LAPTOP = "http://laptop:33445/"
 
 
 def settings(**options: Any) -> Settings:
@@ -137,7 +140,8 @@ def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
 
 
 def test_advice_says_what_to_do() -> None:
-    address, reason = HostPort(ROBOT, 45000), "lies in --port-range 45000-45009"
+    address = HostPort(ROBOT, 45000)
+    reason = "lies in --port-range 45000-45009"
     text = make_stand_ins().advice(address, reason, ADDRESS)
     assert "port 45000 lies in --port-range 45000-45009" in text
     assert "ROS_IP=192.0.2.7" in text

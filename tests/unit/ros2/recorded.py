@@ -7,7 +7,8 @@ import msgspec
 FOLDER = Path(__file__).parent / "recordings"
 VENDORS = "cyclone", "jazzy", "kilted"
 """Whose they are: Cyclone DDS, Fast DDS 2.14 and 3.2."""
-PUBLISHER, SUBSCRIBER = "172.30.1.11", "172.30.1.12"
+PUBLISHER = "172.30.1.11"
+SUBSCRIBER = "172.30.1.12"
 
 
 class Datagram(msgspec.Struct, frozen=True):

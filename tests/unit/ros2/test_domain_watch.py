@@ -34,7 +34,8 @@ def look(watch: DomainWatch, told: Told, *inside: ParticipantStatus) -> None:
 
 
 def test_what_lasts_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    told, problems = Told(), Problems()
+    told = Told()
+    problems = Problems()
     watch = DomainWatch(told, problems)
     with caplog.at_level(logging.WARNING):
         look(watch, told, TCP)
@@ -48,7 +49,8 @@ def test_what_lasts_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_what_is_mended_is_told_no_more() -> None:
-    told, problems = Told(), Problems()
+    told = Told()
+    problems = Problems()
     watch = DomainWatch(told, problems)
     for participant in (TCP, TCP, GOOD):
         look(watch, told, participant)
@@ -56,7 +58,8 @@ def test_what_is_mended_is_told_no_more() -> None:
 
 
 def test_another_cause_takes_the_place_of_the_first() -> None:
-    told, problems = Told(), Problems()
+    told = Told()
+    problems = Problems()
     watch = DomainWatch(told, problems)
     secured = replace(GOOD, security="protected")
     for participant in (TCP, TCP, secured, secured):
@@ -66,7 +69,8 @@ def test_another_cause_takes_the_place_of_the_first() -> None:
 
 
 def test_so_many_are_told_and_no_more() -> None:
-    told, problems = Told(), Problems()
+    told = Told()
+    problems = Problems()
     watch = DomainWatch(told, problems)
     crowd = [replace(TCP, guid_prefix=f"01.0f.{number:02x}") for number in range(MOST_NOTED + 5)]
     for _ in range(2):
@@ -76,7 +80,8 @@ def test_so_many_are_told_and_no_more() -> None:
 
 def test_an_address_with_many_problems_hides_no_other() -> None:
     """The problems of one address, whose prefixes sorted first, were all that was noted."""
-    told, problems = Told(), Problems()
+    told = Told()
+    problems = Problems()
     watch = DomainWatch(told, problems)
     many = [replace(TCP, guid_prefix=f"01.0f.{number:02d}") for number in range(2 * MOST_NOTED)]
     other = replace(TCP, guid_prefix="ff.0f", address="172.30.0.6")

@@ -46,7 +46,8 @@ def exported(message: DiscoveryMessage) -> bytes:
 def passed(domain: Domain, datagram: Datagram) -> list[Outgoing]:
     """What the proxy sends because of a datagram, if it is between the two."""
     host, _, port = datagram.target.partition(":")
-    target, content = HostPort(host, int(port)), datagram.content
+    target = HostPort(host, int(port))
+    content = datagram.content
     if datagram.host == PUBLISHER:
         if host != SUBSCRIBER:
             return domain.heard_inside(content, PUBLISHER, NOW)
@@ -85,7 +86,8 @@ def test_users_data_is_known_from_discovery(vendor: str) -> None:
 def test_no_address_of_inside_is_left_and_nothing_else_changes(vendor: str) -> None:
     changed = 0
     for message in messages(vendor, PUBLISHER):
-        before, after = message.datagram, exported(message)
+        before = message.datagram
+        after = exported(message)
         assert inet_aton(PUBLISHER) not in after
         assert len(after) == len(before)
         parameters = {
@@ -124,11 +126,14 @@ def _network_configurations(told: list[DiscoveryMessage]) -> list[int | None]:
 
 @OF_EACH
 def test_two_that_meet_through_the_proxy(vendor: str) -> None:
-    domain, sent = make_domain(peers=(SUBSCRIBER,), ear=None), list[Outgoing]()
-    inside, outside = set[tuple[EndpointKind, str]](), set[tuple[EndpointKind, str]]()
+    domain = make_domain(peers=(SUBSCRIBER,), ear=None)
+    sent = list[Outgoing]()
+    inside = set[tuple[EndpointKind, str]]()
+    outside = set[tuple[EndpointKind, str]]()
     for datagram in recorded(vendor):
         sent += passed(domain, datagram)
-        insiders, outsiders = domain.inside.by_prefix.values(), domain.outside.by_prefix.values()
+        insiders = domain.inside.by_prefix.values()
+        outsiders = domain.outside.by_prefix.values()
         inside |= _endpoints(insiders)
         outside |= _endpoints(outsiders)
         assert compare(insiders, outsiders) == Comparison()

@@ -32,7 +32,8 @@ class FailingOnce:
 async def test_a_policy_that_could_not_be_applied_is_tried_again() -> None:
     told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": "45000-45015"}
     runtime = Runtime(parse_settings(told))
-    ros2, server = Ros2(runtime), FailingOnce()
+    ros2 = Ros2(runtime)
+    server = FailingOnce()
     ros2.servers.append(cast(DomainServer, server))
     runtime.policy.version += 1
     with pytest.raises(RtpsError):

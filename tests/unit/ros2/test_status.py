@@ -33,7 +33,8 @@ from tests.unit.ros2.discovery.domains import (
 )
 from tests.unit.ros2.protocol.messages import data, message, payload
 
-PUBLICATIONS, SUBSCRIPTIONS = 0x000003C2, 0x000004C2
+PUBLICATIONS = 0x000003C2
+SUBSCRIPTIONS = 0x000004C2
 
 
 @dataclass
@@ -81,7 +82,8 @@ def announce(domain: Domain, reliability: int) -> None:
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     (stand_in,) = domain.outside.stand_ins
-    string, trigger = "std_msgs::msg::dds_::String_", "std_srvs::srv::dds_::Trigger_Request_"
+    string = "std_msgs::msg::dds_::String_"
+    trigger = "std_srvs::srv::dds_::Trigger_Request_"
     for writer, topic, kind in (
         (PUBLICATIONS, "rt/scan", string),
         (SUBSCRIPTIONS, "rq/addRequest", trigger),
@@ -96,7 +98,8 @@ def announce(domain: Domain, reliability: int) -> None:
 def test_topics_and_their_types() -> None:
     domain = make_domain()
     announce(domain, 1)
-    (inside,), (outside,) = told(domain).inside, told(domain).outside
+    (inside,) = told(domain).inside
+    (outside,) = told(domain).outside
     assert (inside.publishes, inside.services, outside.subscribes) == (
         ("/scan",),
         ("/add",),
@@ -135,7 +138,8 @@ def test_who_does_not_match() -> None:
     announce(domain, 2)
     (mismatch,) = told(domain).mismatches
     assert (mismatch.kind, mismatch.name, mismatch.policy) == ("topic", "/scan", "reliability")
-    (inside,), (outside,) = told(domain).inside, told(domain).outside
+    (inside,) = told(domain).inside
+    (outside,) = told(domain).outside
     assert (mismatch.writer, mismatch.reader) == (inside.guid_prefix, outside.guid_prefix)
 
 

@@ -149,14 +149,16 @@ def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) 
 
 def test_a_node_is_told_of_after_another_one_at_the_same_address(clock: Clock) -> None:
     """A node registers some five times when it starts, and is refused each time."""
-    floods, why = LogRateLimit(clock), "all ports of the range are in use; " * 7
+    floods = LogRateLimit(clock)
+    why = "all ports of the range are in use; " * 7
     told = [record("%s: %s: %s", "10.0.0.5", node, why) for node in ("/a", "/b") for _ in range(5)]
     assert written(floods, told) == told
 
 
 @pytest.mark.parametrize("level", [logging.INFO, logging.ERROR])
 def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int) -> None:
-    floods, more = LogRateLimit(clock), 3 * MOST_BUCKETS
+    floods = LogRateLimit(clock)
+    more = 3 * MOST_BUCKETS
     names = [record("%s is new", f"/{n}", level=level) for n in range(KIND_BURST + more)]
     assert len(written(floods, names)) == KIND_BURST
     assert len(written(floods, [record("%s is old", "/a", level=level)])) == 1

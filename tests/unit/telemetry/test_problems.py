@@ -38,7 +38,8 @@ def test_texts_of_any_size_are_short_and_harmless() -> None:
 
 
 def test_what_was_noted_of_a_long_name_is_forgotten_when_it_is_solved() -> None:
-    problems, name = Problems(), "/" + "x" * 8000
+    problems = Problems()
+    name = "/" + "x" * 8000
     problems.add(name, "gone")
     problems.add("/b", "gone", port=7)
     problems.solved(name)

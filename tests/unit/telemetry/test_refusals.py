@@ -20,7 +20,9 @@ from rosproxy.telemetry.refusals import (
 def test_each_refusal_counts_and_the_first_of_a_source_is_told(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    metrics, problems, clock = Metrics(), Problems(), [0.0]
+    metrics = Metrics()
+    problems = Problems()
+    clock = [0.0]
     refusals = Refusals(metrics, problems, lambda: clock[0])
     for _ in range(5):
         refusals.note("long_body", "10.0.0.5", "a body of more than 5 bytes")

@@ -48,7 +48,8 @@ def after_refusals(
 def _after_refusal(
     memory: DockerMemory, sandbox: Sandbox, refusal: PortRefusal, now: float
 ) -> DockerMemory:
-    served, moved = memory.served.get(sandbox.key), dict(memory.moved)
+    served = memory.served.get(sandbox.key)
+    moved = dict(memory.moved)
     port = refusal.port
     suspects = {port} if port and port in sandbox.range else set(sandbox.range.ports())
     # Of a range that was made longer only the added ports can be another's: on the others its proxy
@@ -153,7 +154,9 @@ class _Allocation:
 
     def fill(self, desired: Desired, frozen: bool) -> None:
         """Give a key more ports if it has too few, or a range if it has none."""
-        key, count, window = desired.key, desired.ports, self.settings.port_window
+        key = desired.key
+        count = desired.ports
+        window = self.settings.port_window
         blocked = self.blocked(key) | reserved_ports(key)
         kept = self.allocated.get(key)
         if kept is None:
@@ -214,7 +217,8 @@ def allocate(
         allocation.keep(key)
     for key in order:
         allocation.fill(live[key], frozen)
-    ranges, served = allocation.allocated, dict(memory.served)
+    ranges = allocation.allocated
+    served = dict(memory.served)
     leaving = [key for key in ranges if key in served and not within(served[key], ranges[key])]
     moved = {key: Move(served.pop(key), now) for key in leaving} | dict(memory.moved)
     for key, ports in sorted(ranges.items(), key=lambda item: item[0]):

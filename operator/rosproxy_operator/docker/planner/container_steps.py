@@ -302,7 +302,8 @@ def _process_steps(
 
     ``gone`` are the names of containers that are removed before.
     """
-    key, wanted_name = context.desired.key, proxy_name(context.desired.key)
+    key = context.desired.key
+    wanted_name = proxy_name(context.desired.key)
     proxies = context.observed.proxies_of(key)
     taken = context.taken(proxies)
     name = free_name(wanted_name, taken)

@@ -49,11 +49,14 @@ def select(
         return Selection(kept=best, waiting=True)
     idle = [c for c in present if c.state in IDLE]
     ready = next((c for c in idle if c.id in fit_ids), None)
-    kept, old = None, best or next(iter(idle), None)
+    kept = None
+    old = best or next(iter(idle), None)
     if best and (best.id in fit_ids or not creatable):
-        kept, old = best, None
+        kept = best
+        old = None
     elif ready:
-        kept, old = ready, best
+        kept = ready
+        old = best
     elif not creatable:
         return Selection(stuck=True)
     return Selection(kept, old, tuple(c for c in present if c not in (kept, old)))

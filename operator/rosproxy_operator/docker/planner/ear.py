@@ -72,8 +72,11 @@ def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
 
 def _wanted(context: PlanContext) -> CreateEar | None:
     """The ear that there ought to be; None if there ought to be none, or its proxy is not found."""
-    key, observed, settings = context.desired.key, context.observed, context.settings
-    lan, bind = _lan(key, observed, settings), context.ear
+    key = context.desired.key
+    observed = context.observed
+    settings = context.settings
+    lan = _lan(key, observed, settings)
+    bind = context.ear
     address = next(
         (
             attachment.address

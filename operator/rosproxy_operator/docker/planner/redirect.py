@@ -122,7 +122,8 @@ def redirect_steps(
         else:
             steps = _removal_steps(site[1], existing, observed, settings)
         if steps and not _is_busy(existing, observed):
-            name, cure = names.get(site[1], site[1][:12]), _by_name(site[0])
+            name = names.get(site[1], site[1][:12])
+            cure = _by_name(site[0])
             yield RedirectSteps(site[0], name, tuple(steps), cure if site in wanted else "")
 
 
@@ -179,7 +180,8 @@ def _redirect_to(
     member: Member, owner: Container, observed: HostState, settings: PlanSettings
 ) -> CreateRedirect | None:
     """The redirect of a container; None while its proxy does not run, or is not met."""
-    key, meeting = member.key, _meeting(member, owner, observed)
+    key = member.key
+    meeting = _meeting(member, owner, observed)
     if meeting is None:
         return None
     proxy, ports = meeting

@@ -126,7 +126,9 @@ def _participant(row: Status) -> str:
 
 
 def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, ...]:
-    name, state, proxy = container["name"], container["state"], container["proxy"]
+    name = container["name"]
+    state = container["state"]
+    proxy = container["proxy"]
     cells = map(clean, (name, state, proxy or "-", ranges.get(proxy, "-")))
     participants = plural(len(container["participants"]), "participant")
     return (*cells, participants if container["ros"] == "2" else str(len(container["nodes"])))

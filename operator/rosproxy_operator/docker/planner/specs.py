@@ -75,7 +75,8 @@ _ROLES = {
     CreateRedirect: ROLE_REDIRECT,
     CreateFlush: ROLE_FLUSH,
 }
-EAR_MEMORY, EAR_PIDS = 128 * 1024**2, 64
+EAR_MEMORY = 128 * 1024**2
+EAR_PIDS = 64
 """Bytes and threads of an ear, which has 30 MiB and one."""
 USER = "10001:10001"
 SANDBOX_COMMAND = ("sleep", "infinity")
@@ -230,7 +231,8 @@ def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
 
 
 def _read_key(labels: Mapping[str, str]) -> Key | None:
-    uri, host = labels.get(MASTER_URI, ""), labels.get(ADVERTISE_HOST, "")
+    uri = labels.get(MASTER_URI, "")
+    host = labels.get(ADVERTISE_HOST, "")
     domain = labels.get(DOMAIN, "")
     if not host or bool(uri) == bool(domain):
         return None

@@ -62,7 +62,9 @@ TRIES = 4
 LONGEST_PAUSE = 10.0
 """Seconds that it may put it off at a time."""
 WEBHOOKS = "mutatingwebhookconfigurations"
-POLICIES, LEASES, ENDPOINTS = "networkpolicies", "leases", "endpointslices"
+POLICIES = "networkpolicies"
+LEASES = "leases"
+ENDPOINTS = "endpointslices"
 _ROOTS = {
     PLURAL: f"/apis/{GROUP}/{VERSION}",
     WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
@@ -187,7 +189,8 @@ class Api:
     """
 
     def __init__(self, namespaces: Sequence[str] = ()) -> None:
-        self._places, self.gate = tuple(namespaces) or ("",), Gate()
+        self._places = tuple(namespaces) or ("",)
+        self.gate = Gate()
         try:
             settings = configuration()
         except NoCluster as error:
@@ -224,7 +227,8 @@ class Api:
         ``fields`` is a selector. The items are decoded one at a time: decoded, they take ten times
         as much memory.
         """
-        limit, path = PAGE, _path(kind, place)
+        limit = PAGE
+        path = _path(kind, place)
         data = None
         while data is None:
             query = {"limit": str(limit), **_watched(kind), "continue": token}
@@ -237,7 +241,8 @@ class Api:
         except (msgspec.DecodeError, UnicodeDecodeError):
             raise self._no_server(path) from None
         meta = listing.metadata
-        version, next_token = text_at(meta, "resourceVersion"), text_at(meta, "continue")
+        version = text_at(meta, "resourceVersion")
+        next_token = text_at(meta, "continue")
         return Page(self._decoded(listing.items, path), version, next_token)
 
     def each(self, kind: str, place: str, fields: str) -> Iterator[JsonObject]:

@@ -15,7 +15,8 @@ class Gate:
 
     def __init__(self, open: Callable[[], bool] = lambda: True) -> None:
         self.open = open
-        self._closed, self._passing = False, 0
+        self._closed = False
+        self._passing = 0
         self._changed = threading.Condition()
 
     @contextmanager

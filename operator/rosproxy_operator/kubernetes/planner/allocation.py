@@ -79,7 +79,9 @@ class _Allocation:
         refused: set[int],
         ranges: ClusterRanges,
     ) -> None:
-        self.view, self.state, self.ranges = view, state, ranges
+        self.view = view
+        self.state = state
+        self.ranges = ranges
         self.node = node = wanted[0].node
         self.rosproxies = {place: view.rosproxies[place.of] for place in wanted}
         self.proxies = view.proxies_by_node.get(node, ())
@@ -114,8 +116,10 @@ class _Allocation:
 
     def _keep(self, place: ProxyPlace) -> None:
         """Give a proxy the range that it has or had, if it can have it."""
-        proxy, spec = self.view.current.get(place), self.rosproxies[place].spec
-        reserved, kernel = self._reserved(place), [*self.kernel.values()]
+        proxy = self.view.current.get(place)
+        spec = self.rosproxies[place].spec
+        reserved = self._reserved(place)
+        kernel = [*self.kernel.values()]
         for ports in self._candidates(place):
             trimmed = PortRange(ports.first, min(ports.last, ports.first + spec.ports - 1))
             is_allowed = within(trimmed, spec.window) and is_free(trimmed, reserved, kernel)
@@ -154,7 +158,8 @@ class _Allocation:
 
     def _publish(self, place: ProxyPlace) -> None:
         """Give a proxy its port for a master in the cluster, if it is to have one and can."""
-        proxy, port = self.view.current.get(place), self.rosproxies[place].spec.master.publish
+        proxy = self.view.current.get(place)
+        port = self.rosproxies[place].spec.master.publish
         if not port:
             return
         if proxy is None or not has_ports(proxy) or port not in proxy.pod.host_ports:
@@ -175,7 +180,8 @@ class _Allocation:
 
     def _fill(self, place: ProxyPlace) -> None:
         """Give a proxy more ports if it has too few, or a range if it has none."""
-        spec, ranges = self.rosproxies[place].spec, self.ranges.given
+        spec = self.rosproxies[place].spec
+        ranges = self.ranges.given
         pod_ports = host_ports_of(self._other_pods(place), spec)
         blocked = pod_ports | self.refused | self._reserved(place)
         excluded = [*self.kernel.values(), *self._promised_to_others(place)]

@@ -133,7 +133,8 @@ def _wanted(
     wanted: dict[ProxyPlace, tuple[Pod, ...]] = {}
     findings: list[ClusterFinding] = []
     for place, pods in sorted(places.items()):
-        rosproxy, node = rosproxies[place.of], observed.nodes.get(place.node)
+        rosproxy = rosproxies[place.of]
+        node = observed.nodes.get(place.node)
         if node is None or node.deleting:
             continue
         if on_node(rosproxy, node):

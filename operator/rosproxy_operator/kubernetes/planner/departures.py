@@ -54,7 +54,8 @@ def find_departures(observed: ClusterSnapshot, state: ClusterState, now: float) 
     departed: dict[str, tuple[str, ...]] = {}
     strange: dict[tuple[str, str], float] = {}
     for proxy in observed.proxies:
-        report, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.node)
+        report = observed.reports.get(proxy.pod.uid)
+        node = observed.nodes.get(proxy.node)
         if report is None or not report.answered or node is None or not node.ready:
             continue
         living = [pod for pod in pods.get(node.name, ()) if not pod.ended]
@@ -80,7 +81,8 @@ def _is_pod_ip(address: str, proxy: ProxyPod, node: ClusterNode) -> bool:
     Of a pod with addresses of both families only one is known here.
     """
     try:
-        ip, proxy_ip = ip_address(address), ip_address(proxy.pod.ip)
+        ip = ip_address(address)
+        proxy_ip = ip_address(proxy.pod.ip)
         networks = [ip_network(network, strict=False) for network in node.pod_networks]
     except ValueError:
         return False

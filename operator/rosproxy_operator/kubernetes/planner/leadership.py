@@ -73,7 +73,8 @@ def observe(candidate: Candidate, record: LeaseRecord | None, now: float) -> Can
 
 def next_record(candidate: Candidate, now: float) -> LeaseRecord | None:
     """What is to be written over what was read; None: nothing, somebody else holds it."""
-    record, since = candidate.record, now if candidate.seen_since is None else candidate.seen_since
+    record = candidate.record
+    since = now if candidate.seen_since is None else candidate.seen_since
     if record is None:  # it may have been deleted while an operator acts
         return LeaseRecord("", NOBODY)
     if record.holder == candidate.name:

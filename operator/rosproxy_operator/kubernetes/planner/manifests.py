@@ -138,7 +138,8 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     The fingerprint says what the pod is made of, except its image, which can be exchanged, its
     policy and its peers; then under what its nodes know the proxy, see `keeps_registrations`.
     """
-    rosproxy, container = site.rosproxy, _container(site, settings)
+    rosproxy = site.rosproxy
+    container = _container(site, settings)
     annotations = {
         NODE: site.node.name,
         PORT_RANGE: str(site.ports),
@@ -349,7 +350,8 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
 
 
 def _environment(site: ProxySite, settings: ClusterSettings) -> Mapping[str, str]:
-    spec, policy = site.rosproxy.spec, policy_of(site.rosproxy, settings)
+    spec = site.rosproxy.spec
+    policy = policy_of(site.rosproxy, settings)
     variables = {
         "ROS_MASTER_URI": site.master.uri,
         "ROSPROXY_MASTER_ADDRESS": site.master.address,

@@ -36,7 +36,8 @@ def partition_of(
     for namespace, node in _uses(observed):
         nodes_of[namespace].add(node)
         users[node].add(namespace)
-    reached, reached_nodes = set(namespaces), set[str]()
+    reached = set(namespaces)
+    reached_nodes = set[str]()
     for node in nodes:
         reached |= users.get(node, set())
     pending = [*reached]
@@ -113,7 +114,8 @@ _BY_NODE = ("lost", "addresses")
 
 def _filtered(state: ClusterState, partition: Partition, inside: bool) -> ClusterState:
     """The state of what is inside a part, or of all outside it."""
-    namespaces, nodes = partition.namespaces, partition.nodes
+    namespaces = partition.namespaces
+    nodes = partition.nodes
     fields: dict[str, Mapping[Any, Any]] = {
         "attempts": {
             t: a for t, a in state.attempts.items() if (t.of.namespace in namespaces) == inside

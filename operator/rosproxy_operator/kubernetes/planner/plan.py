@@ -101,7 +101,8 @@ def plan(
     ``state`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
     clock that goes on as long as the state does; ``stamp`` is the time of day in RFC 3339.
     """
-    full_snapshot, observed = observed, within_bounds(observed, settings)
+    full_snapshot = observed
+    observed = within_bounds(observed, settings)
     cluster_view = view(observed)
     learned = learn(cluster_view, state, now)
     ranges = allocate(cluster_view, settings, learned)
@@ -115,9 +116,7 @@ def plan(
         own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))
         own_problems = _problems(context, rosproxy, states, moved)
-        master, _ = master_of(rosproxy, observed)
-        uri, address = master.uri if master else "", context.cluster_ip(rosproxy)
-        status = status_of(rosproxy, states, own_problems, address, uri, stamp)
+        status = _status(context, rosproxy, states, own_problems, stamp)
         problems += own_problems
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for invalid in observed.unusable.values():
@@ -139,6 +138,19 @@ def plan(
         former_ports=former_ports(cluster_view, decided.former),
         next_look_in=min(waits, default=None),
     )
+
+
+def _status(
+    context: ClusterContext,
+    rosproxy: RosProxy,
+    states: tuple[RosProxyOnNode, ...],
+    problems: tuple[ClusterFinding, ...],
+    stamp: str,
+) -> Json:
+    """The status of a RosProxy, with the address of its Service and the URI of its master."""
+    master, _ = master_of(rosproxy, context.observed)
+    uri = master.uri if master else ""
+    return status_of(rosproxy, states, problems, context.cluster_ip(rosproxy), uri, stamp)
 
 
 def stand_by(
@@ -163,7 +175,8 @@ def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnN
     }
     for node in sorted(node_names & context.observed.nodes.keys()):
         place = ProxyPlace(rosproxy.id, node)
-        current, wanted = context.view.current.get(place), place in context.view.wanted
+        current = context.view.current.get(place)
+        wanted = place in context.view.wanted
         site = site_of(context, place) if wanted else None
         former = context.state.given.get(place) or rosproxy.former_ranges.get(node)
         kept = current.range if current else former

@@ -137,7 +137,8 @@ def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
 
 def _possible(view: View, ranges: Mapping[ProxyPlace, PortRange]) -> dict[ProxyPlace, PortRange]:
     """The ranges whose RosProxy and whose node exist."""
-    rosproxies, nodes = view.rosproxies, view.observed.nodes
+    rosproxies = view.rosproxies
+    nodes = view.observed.nodes
     return {p: ports for p, ports in ranges.items() if p.of in rosproxies and p.node in nodes}
 
 
@@ -158,12 +159,14 @@ def _refused(
     waiting = {place: at for place, at in since.items() if _is_waiting(view, place)}
     taken: set[tuple[str, int]] = set()
     for proxy in view.observed.proxies:
-        place, neighbours = place_of(proxy), view.proxies_by_node.get(proxy.node, ())
+        place = place_of(proxy)
+        neighbours = view.proxies_by_node.get(proxy.node, ())
         ends_soon = any(p.pod.deleting and overlap(p.range, proxy.range) for p in neighbours)
         is_stuck = proxy.stuck is PodFailure.PORTS and not proxy.pod.deleting
         if not is_stuck or place not in view.wanted or ends_soon:
             continue
-        former, began = served.get(place), waiting.pop(place, now)
+        former = served.get(place)
+        began = waiting.pop(place, now)
         if former is not None and overlap(former, proxy.range) and now - began < RETRY_FOR:
             waiting[place] = began
             continue

@@ -26,7 +26,8 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
 
     Nodes that it has given up already are not among its nodes.
     """
-    master, nodes = status.master, nodes_by_address(status)
+    master = status.master
+    nodes = nodes_by_address(status)
     all_nodes = [node for group in nodes.values() for node in group]
     topics = {topic for node in all_nodes for topic in node.publishes + node.subscribes}
     participants = participants_by_address(status)

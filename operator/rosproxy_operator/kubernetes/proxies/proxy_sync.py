@@ -81,7 +81,8 @@ class ProxyPoller:
         self.session = ProxySession(proxies, *_admin_endpoint(proxy, key))
         self.name = str(proxy.pod.id)
         self.report: ProxyReport | None = None
-        self._limits, self._changed = limits, changed
+        self._limits = limits
+        self._changed = changed
         self._gone: set[str] = set()
         self._restarts = proxy.restarts
         self._policy: tuple[PolicyLayer, ...] | None = None
@@ -89,8 +90,11 @@ class ProxyPoller:
         self._callers: AllowedCallers | None = None
         self._callers_told_at = 0.0
         self._pending = asyncio.Event()
-        self._recheck, self._failures = False, 0
-        self._tells_changes, self._version, self._instance = True, "", ""
+        self._recheck = False
+        self._failures = 0
+        self._tells_changes = True
+        self._version = ""
+        self._instance = ""
         self._since = time.monotonic()
 
     def report_gone(self, gone: Iterable[str]) -> None:
@@ -151,7 +155,8 @@ class ProxyPoller:
     @property
     def _is_busy(self) -> bool:
         """Whether the proxy is yet to answer, or to confirm what it was sent."""
-        policy, callers = self._policy, self._callers
+        policy = self._policy
+        callers = self._callers
         confirmed = (policy is None or self.session.has_policy(policy)) and (
             callers is None or self.session.has_callers(callers)
         )
@@ -205,7 +210,8 @@ class ProxyPoller:
         if starting and new_report.answered and not new_report.master_up:
             return  # it may not have asked its master yet
         # A process may outlive its pod for a moment: then the next look tells it again.
-        recheck, self._recheck = self._recheck, False
+        recheck = self._recheck
+        self._recheck = False
         if new_report != self.report or recheck:
             self.report = new_report
             self._changed()
@@ -311,7 +317,10 @@ class ClusterProxySync:
         changed: Callable[[Iterable[str]], None],
         leads: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._tasks, self._proxies, self._changed, self._leads = tasks, proxies, changed, leads
+        self._tasks = tasks
+        self._proxies = proxies
+        self._changed = changed
+        self._leads = leads
         self._limits = CallLimits()
         self._pollers: dict[str, tuple[ProxyPoller, asyncio.Task[None]]] = {}
 

@@ -41,7 +41,8 @@ class SandboxFailures:
 
     async def read(self, observed: ClusterSnapshot) -> set[str]:
         """Request the Events that are due. Returns the namespaces with new messages."""
-        now, waiting = time.monotonic(), [proxy for proxy in observed.proxies if _waits(proxy)]
+        now = time.monotonic()
+        waiting = [proxy for proxy in observed.proxies if _waits(proxy)]
         uids = {p.pod.uid for p in waiting}
         self._waiting_since = {uid: self._waiting_since.get(uid, now) for uid in uids}
         self._messages = {uid: text for uid, text in self._messages.items() if uid in uids}

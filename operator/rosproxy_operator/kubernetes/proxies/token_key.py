@@ -38,7 +38,8 @@ class TokenKey:
     """Reads the key, and makes one where there is none. Without a Secret it is this process's."""
 
     def __init__(self, api: Api, secret: Name | None) -> None:
-        self._api, self._secret = api, secret
+        self._api = api
+        self._secret = secret
         self._cached_key = b""
         self.problems: Sequence[Problem] = ()
 

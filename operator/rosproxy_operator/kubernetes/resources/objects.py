@@ -61,7 +61,9 @@ _LONGEST_LIST = 16 * 1024
 
 def node(obj: Json) -> ClusterNode:
     """A node."""
-    meta, spec, status = submap(obj, "metadata"), submap(obj, "spec"), submap(obj, "status")
+    meta = submap(obj, "metadata")
+    spec = submap(obj, "spec")
+    status = submap(obj, "status")
     networks = spec.get("podCIDRs") or (text_at(spec, "podCIDR"),)
     # Reversed, so that of several addresses of a type the first one stays.
     addresses = reversed(submaps(status, "addresses"))
@@ -79,7 +81,9 @@ def node(obj: Json) -> ClusterNode:
 
 def pod(obj: Json) -> Pod:
     """A pod. At admission it may have no name, uid, node and address."""
-    meta, spec, status = submap(obj, "metadata"), submap(obj, "spec"), submap(obj, "status")
+    meta = submap(obj, "metadata")
+    spec = submap(obj, "spec")
+    status = submap(obj, "status")
     wired = _short(text_at(submap(meta, "annotations"), names.MASTER_URI))
     masters = islice(map(_short, _masters(spec)), MOST_CONTAINERS)
     return Pod(
@@ -105,12 +109,15 @@ def pod(obj: Json) -> Pod:
 
 def proxy_pod(obj: Json) -> ProxyPod | None:
     """A proxy's pod; None if the object is not one that this operator made, or not whole."""
-    meta, status = submap(obj, "metadata"), submap(obj, "status")
-    labels, notes = texts_at(meta, "labels"), texts_at(meta, "annotations")
+    meta = submap(obj, "metadata")
+    status = submap(obj, "status")
+    labels = texts_at(meta, "labels")
+    notes = texts_at(meta, "annotations")
     containers = submaps(submap(obj, "spec"), "containers")
     container = next((c for c in containers if c.get("name") == names.CONTAINER), None)
     ports = port_range(notes, names.PORT_RANGE)
-    on, owner = notes.get(names.NODE, ""), _owner(meta)
+    on = notes.get(names.NODE, "")
+    owner = _owner(meta)
     if not names.is_own(labels) or names.is_ear(labels):
         return None
     if ports is None or not (on and owner and container):
@@ -135,10 +142,13 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
 
 def ear_pod(obj: Json) -> EarPod | None:
     """An ear's pod; None if the object is not one that this operator made, or not whole."""
-    meta, status = submap(obj, "metadata"), submap(obj, "status")
-    labels, notes = texts_at(meta, "labels"), texts_at(meta, "annotations")
+    meta = submap(obj, "metadata")
+    status = submap(obj, "status")
+    labels = texts_at(meta, "labels")
+    notes = texts_at(meta, "annotations")
     container = next(iter(submaps(submap(obj, "spec"), "containers")), {})
-    on, owner = notes.get(names.NODE, ""), _owner(meta)
+    on = notes.get(names.NODE, "")
+    owner = _owner(meta)
     if not names.is_ear(labels) or not (on and owner):
         return None
     reason, message = pod_failure(status)
@@ -157,8 +167,10 @@ def ear_pod(obj: Json) -> EarPod | None:
 
 def service(obj: Json) -> ProxyService | None:
     """A Service; None if the object is not one that this operator made."""
-    meta, address = submap(obj, "metadata"), text_at(submap(obj, "spec"), "clusterIP")
-    labels, owner = texts_at(meta, "labels"), _owner(meta)
+    meta = submap(obj, "metadata")
+    address = text_at(submap(obj, "spec"), "clusterIP")
+    labels = texts_at(meta, "labels")
+    owner = _owner(meta)
     rosproxy = Name(text_at(meta, "namespace"), labels.get(names.PROXY_OF, ""))
     if not names.is_own(labels) or not owner or names.service_id(rosproxy) != name_of(meta):
         return None
@@ -174,7 +186,8 @@ def service(obj: Json) -> ProxyService | None:
 
 def master_service(obj: Json) -> MasterService:
     """A Service, as far as a master's matters."""
-    spec, ports = submap(obj, "spec"), submaps(submap(obj, "spec"), "ports")
+    spec = submap(obj, "spec")
+    ports = submaps(submap(obj, "spec"), "ports")
     return MasterService(
         id=name_of(submap(obj, "metadata")),
         address=text_at(spec, "clusterIP"),
@@ -188,7 +201,8 @@ def master_service(obj: Json) -> MasterService:
 def policy(obj: Json) -> ProxyPolicy | None:
     """A NetworkPolicy; None if the object is not one that this operator made."""
     meta = submap(obj, "metadata")
-    labels, owner = texts_at(meta, "labels"), _owner(meta)
+    labels = texts_at(meta, "labels")
+    owner = _owner(meta)
     rosproxy = Name(text_at(meta, "namespace"), labels.get(names.PROXY_OF, ""))
     id = name_of(meta)
     if not names.is_own(labels) or not owner:

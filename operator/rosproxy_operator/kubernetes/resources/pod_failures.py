@@ -102,8 +102,10 @@ def _waiting(container: Json) -> tuple[PodFailure | None, str]:
 
     The kubelet calls that CrashLoopBackOff only when it looks at the pod again.
     """
-    ended, waiting = submap(container, "state", "terminated"), submap(container, "state", "waiting")
-    reason, message = text_at(waiting, "reason"), text_at(waiting, "message")
+    ended = submap(container, "state", "terminated")
+    waiting = submap(container, "state", "waiting")
+    reason = text_at(waiting, "reason")
+    message = text_at(waiting, "message")
     if int_at(ended, "exitCode") and int_at(container, "restartCount"):
         return _crashing(ended)
     if reason == "CrashLoopBackOff":
@@ -121,7 +123,8 @@ def _crashing(ended: Json) -> tuple[PodFailure, str]:
 
     Between two tries to start a container that never ran, the kubelet calls that a crash too.
     """
-    reason, message = text_at(ended, "reason"), text_at(ended, "message")
+    reason = text_at(ended, "reason")
+    message = text_at(ended, "message")
     if reason in _NOT_STARTED:
         return PodFailure.SANDBOX, _text("RunContainerError", message)
     ending = f"exit code {int_at(ended, 'exitCode')}"

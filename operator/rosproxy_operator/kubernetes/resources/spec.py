@@ -100,8 +100,10 @@ def rosproxies(
 
 def rosproxy(obj: Json) -> RosProxy:
     """A RosProxy. Raises InvalidField."""
-    meta, status = submap(obj, "metadata"), submap(obj, "status")
-    id, service = name_of(meta), parse_slave_uri(text_at(status, "masterURI"))
+    meta = submap(obj, "metadata")
+    status = submap(obj, "status")
+    id = name_of(meta)
+    service = parse_slave_uri(text_at(status, "masterURI"))
     address = service.host if service else text_at(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME:
         fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
@@ -122,13 +124,16 @@ def rosproxy(obj: Json) -> RosProxy:
 
 def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
     """What is left of a RosProxy that can't be read. Never raises."""
-    meta, status = submap(obj, "metadata"), submap(obj, "status")
-    uid, generation = text_at(meta, "uid"), int_at(meta, "generation")
+    meta = submap(obj, "metadata")
+    status = submap(obj, "status")
+    uid = text_at(meta, "uid")
+    generation = int_at(meta, "generation")
     return InvalidRosProxy(name_of(meta), uid, generation, str(error), status)
 
 
 def _spec(field: Field, of: Name) -> RosProxySpec:
-    ports, for_ros = field["ports"].number(32, 1, MOST_PORTS), versions(field["ros"])
+    ports = field["ports"].number(32, 1, MOST_PORTS)
+    for_ros = versions(field["ros"])
     for name in ("master", "udp"):
         if "1" not in for_ros and field[name].value not in (None, False):
             raise field[name].error("is for ROS 1, which spec.ros leaves out", "leave it out")
@@ -161,7 +166,8 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
 
 
 def _pod_egress(field: Field) -> PodEgress:
-    egress, direction = field["podEgress"].one_of(_POD_EGRESS, "Any"), field["direction"]
+    egress = field["podEgress"].one_of(_POD_EGRESS, "Any")
+    direction = field["direction"]
     if egress == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
         fix = "the pods would hear nobody outside: choose spec.direction: Both, too"
         raise field["podEgress"].error("does not go with spec.direction: Out", fix)
@@ -224,7 +230,8 @@ def _host_alias(field: Field) -> Json:
 
     That is ``ValidateHostAliases`` in k8s.io/kubernetes, pkg/apis/core/validation/validation.go.
     """
-    ip, names = field["ip"].text(), []
+    ip = field["ip"].text()
+    names = []
     if not is_address(ip) or "%" in ip:
         fix = "write the host's address, e.g. 192.0.2.7"
         raise field["ip"].error("is not an IP address", fix)
@@ -251,7 +258,8 @@ def _selector(field: Field) -> Selector | None:
 
 
 def _expression(field: Field) -> tuple[str, str, frozenset[str]]:
-    key, operator = field["key"].text(), field["operator"].one_of(_OPERATORS, "")
+    key = field["key"].text()
+    operator = field["operator"].one_of(_OPERATORS, "")
     _check_key(field["key"], key)
     values = [_check_value(value) for value in field["values"].items()]
     if bool(values) != (operator in ("In", "NotIn")):
@@ -276,7 +284,9 @@ _AS_LABEL = "write it as in the pod's labels"
 
 
 def _master(field: Field, of: Name) -> MasterSpec:
-    uri, address, service = field["uri"], field["address"], field["service"]
+    uri = field["uri"]
+    address = field["address"]
+    service = field["service"]
     publish = field["publish"].number(0, *_HIGH)
     if (uri.value is None) == (service.value is None):
         raise InvalidField(
@@ -330,7 +340,8 @@ def _is_service(host: str, service: Name) -> bool:
 
 
 def _service(field: Field, of: Name) -> Name:
-    name, namespace = field["name"], field["namespace"]
+    name = field["name"]
+    namespace = field["namespace"]
     service = Name(namespace.text() or of.namespace, name.text())
     if not is_label(service.name):
         raise name.error("is not a Service's name", "write it as kubectl get service shows it")

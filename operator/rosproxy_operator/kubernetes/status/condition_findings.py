@@ -28,7 +28,8 @@ def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
 
 
 def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
-    metadata, status = rosproxy["metadata"], rosproxy.get("status", {})
+    metadata = rosproxy["metadata"]
+    status = rosproxy.get("status", {})
     id = Name(metadata["namespace"], metadata["name"])
     subject = f"rosproxy {id}"
     conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}

@@ -91,7 +91,8 @@ def _is_told(event: RecentEvent, messages: Iterable[str]) -> bool:
 
 
 def _read(event: Json, now: float) -> RecentEvent:
-    about, series = submap(event, "involvedObject"), submap(event, "series")
+    about = submap(event, "involvedObject")
+    series = submap(event, "series")
     source = text_at(submap(event, "source"), "component")
     return RecentEvent(
         kind=text_at(about, "kind"),

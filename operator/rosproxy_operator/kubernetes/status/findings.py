@@ -72,7 +72,8 @@ def finding(
     of: RosProxy | InvalidRosProxy, reason: str, text: str, fatal: bool = False, subject: str = ""
 ) -> ClusterFinding:
     """Something about a RosProxy, or about a ``subject`` that it has, with an Event."""
-    subject, about = subject or f"rosproxy {of.id}", Reference(KIND, of.id, of.uid)
+    subject = subject or f"rosproxy {of.id}"
+    about = Reference(KIND, of.id, of.uid)
     return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
 
 
@@ -80,7 +81,8 @@ def pod_finding(
     pod: Pod, rosproxy: RosProxy, reason: str, text: str, fatal: bool = True
 ) -> ClusterFinding:
     """Something about a pod that a RosProxy selects, with an Event on the pod."""
-    subject, about = f"pod {pod.id}", Reference("Pod", pod.id, pod.uid)
+    subject = f"pod {pod.id}"
+    about = Reference("Pod", pod.id, pod.uid)
     return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=rosproxy.id, about=about)
 
 
@@ -94,7 +96,8 @@ def proxy_subject(proxy: ProxyPod) -> str:
 
 
 def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFinding:
-    id, error = proxy.pod.id, proxy.message
+    id = proxy.pod.id
+    error = proxy.message
     command = f"kubectl -n {id.namespace} describe pod {id.name}"
     texts = {
         PodFailure.PORTS: f"ports {proxy.range} are not all free there ({error}); others are "
@@ -125,7 +128,8 @@ def _answered(
     rosproxy: RosProxy, state: RosProxyOnNode, proxy: ProxyPod
 ) -> Iterator[ClusterFinding]:
     """What follows from a proxy's answer. One that is not asked yet is not to blame."""
-    answer, subject = state.answer, proxy_subject(proxy)
+    answer = state.answer
+    subject = proxy_subject(proxy)
     if answer is None:
         return
     if not answer.answered:

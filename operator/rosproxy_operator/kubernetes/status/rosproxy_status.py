@@ -32,7 +32,10 @@ from rosproxy_operator.kubernetes.status.findings import (
 )
 from rosproxy_operator.kubernetes.status.range_texts import not_proven
 
-READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
+READY = "Ready"
+PORTS = "PortsAllocated"
+MASTER = "MasterReachable"
+DEGRADED = "Degraded"
 WAY_IN = "PortsReachable"
 LONGEST = 1024
 """Characters of a message."""
@@ -83,7 +86,8 @@ def status_of(
     lines = [_line(rosproxy, state, names) for state in shown]
     nodes = sum(int_at(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
-    spec, members = rosproxy.spec, sum(int_at(line, "participants") for line in lines)
+    spec = rosproxy.spec
+    members = sum(int_at(line, "participants") for line in lines)
     served = [plural(nodes, "ROS node")] if spec.ros1 else []
     if spec.ros2:
         served.append(f"{plural(members, 'participant')} of domain {spec.ros2.number}")
@@ -138,7 +142,8 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
 
     What it has goes on as it is, so that the other conditions stay.
     """
-    former, text = rosproxy.status, rosproxy.text
+    former = rosproxy.status
+    text = rosproxy.text
     conditions = [_read(condition) for condition in submaps(former, "conditions")]
     judged = [
         Condition(READY, "False", rosproxy.reason, text),
@@ -159,7 +164,8 @@ def _shown_nodes(states: Sequence[RosProxyOnNode]) -> list[RosProxyOnNode]:
 
 
 def _line(rosproxy: RosProxy, state: RosProxyOnNode, names: int) -> dict[str, object]:
-    proxy, problem = state.proxy, next(node_findings(rosproxy, state), None)
+    proxy = state.proxy
+    problem = next(node_findings(rosproxy, state), None)
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,
@@ -274,7 +280,8 @@ def _ready(
     blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
     if blocking:
         return Condition(READY, "False", blocking[0].reason, _one_line(blocking[0]))
-    name, proxy = waiting[0].name, waiting[0].proxy
+    name = waiting[0].name
+    proxy = waiting[0].proxy
     progress = "its proxy is being created"
     if proxy is not None and not proxy.pod.deleting:
         progress = f"its proxy {proxy.pod.id.name} is starting"

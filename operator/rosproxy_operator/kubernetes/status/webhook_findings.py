@@ -76,7 +76,8 @@ def _serves(operator: Json) -> bool:
 
 
 def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFinding]:
-    metadata, service = submap(configuration, "metadata"), service_of(configuration)
+    metadata = submap(configuration, "metadata")
+    service = service_of(configuration)
     subject = f"webhook {text_at(metadata, 'name')}"
     lacks_ca = not text_at(submap(our_webhook(configuration), "clientConfig"), "caBundle")
     if lacks_ca:

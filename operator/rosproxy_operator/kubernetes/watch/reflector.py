@@ -72,7 +72,10 @@ class Reflector:
         call_soon: Callable[..., object],
         lost: Callable[[], None],
     ) -> None:
-        self._api, self._listener, self._call_soon, self._lost = api, listener, call_soon, lost
+        self._api = api
+        self._listener = listener
+        self._call_soon = call_soon
+        self._lost = lost
         self._kind, self._place = collection
         self._ending = threading.Event()
         self._watch: Watch | None = None
@@ -120,7 +123,8 @@ class Reflector:
                     self._pause(failures)
             except Exception as error:  # a mistake of ours must not blind the operator
                 log.exception("watching %s failed; trying again", self._kind)
-                self._version, failures = "", failures + 1
+                self._version = ""
+                failures = failures + 1
                 self._complain(ApiUnavailable(f"watching {self._kind} failed: {error!r}"))
                 self._pause(failures)
 
@@ -157,7 +161,8 @@ class Reflector:
         Also for a watch that is lost: else all its events would come again from the beginning, and
         set objects back to what they were then.
         """
-        began, heard = time.monotonic(), False
+        began = time.monotonic()
+        heard = False
         self._watch = watch = self._api.watch(self._kind, self._place, self._version)
         self._tell(self._listener.changed, {})  # it works again, if it did not
         if self._ending.is_set():
@@ -167,7 +172,8 @@ class Reflector:
                 break
             if changes := self._changes(events):
                 self._tell(self._listener.changed, changes)
-            self._version, heard = _version(events) or self._version, True
+            self._version = _version(events) or self._version
+            heard = True
         if not heard and time.monotonic() - began < SHORT:
             raise ApiLost("a watch has ended at once")
 

@@ -66,12 +66,15 @@ class ClusterStore:
         back: Callable[[], None],
         corrected: Callable[[int], None] = lambda _: None,
     ) -> None:
-        self._wake, self._back, self._corrected = wake, back, corrected
+        self._wake = wake
+        self._back = back
+        self._corrected = corrected
         self._places = places
         self._tables: dict[Collection, dict[str, Record]] = {collection: {} for collection in kinds}
         self._errors: dict[Collection, ApiError] = {}
         self._listed: set[Collection] = set()
-        self._pending, self._all_heard = set(self._tables), asyncio.Event()
+        self._pending = set(self._tables)
+        self._all_heard = asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
         self._ears: dict[str, dict[str, EarPod]] = defaultdict(dict)
@@ -92,7 +95,8 @@ class ClusterStore:
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
         """These are all objects of a kind; the watch is yet to begin."""
-        collection, former = (kind, place), dict(self._tables[kind, place])
+        collection = (kind, place)
+        former = dict(self._tables[kind, place])
         gone = dict.fromkeys(former.keys() - records.keys())
         differ = [key for key, record in records.items() if former.get(key) != record]
         for key, record in {**gone, **records}.items():
@@ -136,13 +140,15 @@ class ClusterStore:
 
     def take_changes(self) -> StoreChanges:
         """What has changed since the last call."""
-        touched, self._touched = self._touched, StoreChanges()
+        touched = self._touched
+        self._touched = StoreChanges()
         return touched
 
     def snapshot(self, key: bytes = b"") -> ClusterSnapshot:
         """The cluster as far as it is known."""
         rosproxies = tuple(self._records_of(PLURAL, RosProxy))
-        masters, services = self._masters(rosproxies), self._records_of("services", ProxyService)
+        masters = self._masters(rosproxies)
+        services = self._records_of("services", ProxyService)
         snapshot = ClusterSnapshot(
             rosproxies=rosproxies,
             unusable={r.id: r for r in self._records_of(PLURAL, InvalidRosProxy)},
@@ -163,7 +169,8 @@ class ClusterStore:
         namespaces = {*self._rosproxies, *self._proxies, *self._ears}
         namespaces |= {id.namespace for id in snapshot.unusable}
         candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
-        selected, own = [p for p in candidates if self._is_selected(p)], own_pods(proxies, ears)
+        selected = [p for p in candidates if self._is_selected(p)]
+        own = own_pods(proxies, ears)
         nodes = {p.node for p in selected} | {node for p in own for node in (p.node, p.pod.node)}
         pods = {p.uid: p for p in candidates if p.node in nodes}
         pods |= {pod.uid: pod for pod in selected}

@@ -21,7 +21,9 @@ RENEW_AFTER = 2 / 3
 """The part of its life after which a certificate is made anew."""
 _BACKDATED = timedelta(hours=1)
 """So that an API server whose clock is slow takes it as well."""
-CERTIFICATE, KEY, CA = "tls.crt", "tls.key", "ca.crt"
+CERTIFICATE = "tls.crt"
+KEY = "tls.key"
+CA = "ca.crt"
 """Keys of the Secret; ``ca.crt`` also has the CAs before, as long as they are valid."""
 
 

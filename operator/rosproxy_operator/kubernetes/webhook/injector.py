@@ -67,8 +67,10 @@ class Injector:
         metrics: ClusterMetrics,
         wake: Callable[[], None],
     ) -> None:
-        self._api, self._settings = api, settings
-        self._metrics, self._wake = metrics, wake
+        self._api = api
+        self._settings = settings
+        self._metrics = metrics
+        self._wake = wake
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
         """What a pod needs. Never raises. A ``dry_run`` does not wait for a Service."""

@@ -82,8 +82,12 @@ class SelfSigned:
         now: Callable[[], datetime] = certificates.now,
         leads: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._api, self._names, self._now, self._leads = api, names, now, leads
-        self._secret, self._configuration = secret, configuration
+        self._api = api
+        self._names = names
+        self._now = now
+        self._leads = leads
+        self._secret = secret
+        self._configuration = configuration
         self._pair: KeyPair | None = None
         self._unsaved: KeyPair | None = None
         self._serving: KeyPair | None = None
@@ -96,7 +100,8 @@ class SelfSigned:
         Raises ApiError, and NotMadeYet.
         """
         self.problems = []
-        now, self._pair = self._now(), self._kept_pair()
+        now = self._now()
+        self._pair = self._kept_pair()
         trusted = self._trust(self._pair.ca)
         # There is nothing to wait for without a valid certificate to go on with, or without a
         # configuration from which API servers have to learn of the CA first.
@@ -106,7 +111,8 @@ class SelfSigned:
             # API servers are to have the time to learn of the new CA.
             self._trusted_at = self._trusted_at or now
             if (now - self._trusted_at).total_seconds() >= OVERLAP:
-                self._serving, self._trusted_at = self._pair, None
+                self._serving = self._pair
+                self._trusted_at = None
         return self._serving
 
     def _kept_pair(self) -> KeyPair:
@@ -231,7 +237,8 @@ class CertificateRotation:
     def __init__(self, source: CertificateDirectory | SelfSigned, metrics: ClusterMetrics) -> None:
         self.pair: KeyPair | None = None
         self.not_made_yet = False
-        self._source, self._metrics = source, metrics
+        self._source = source
+        self._metrics = metrics
         self._log = ProblemLog()
 
     async def run(self) -> None:
@@ -242,7 +249,8 @@ class CertificateRotation:
 
     async def refresh(self) -> None:
         """Check it once, and renew it if it is due."""
-        not_made_yet, problems = False, list[Problem]()
+        not_made_yet = False
+        problems = list[Problem]()
         try:
             pair = await in_thread(self._source.refresh)
         except NotMadeYet:

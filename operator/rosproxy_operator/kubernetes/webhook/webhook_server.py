@@ -52,8 +52,10 @@ class WebhookServer:
     """
 
     def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
-        self._bind, self._rotation = bind, rotation
-        self._serving, self._draining = False, False
+        self._bind = bind
+        self._rotation = rotation
+        self._serving = False
+        self._draining = False
 
     def unready(self) -> str | None:
         """Why pods are not wired here; None if they are. May be asked from any thread.

@@ -14,7 +14,9 @@ from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 from rosproxy.telemetry.text import plural, quoted
 
-INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
+INSIDE = "inside node"
+OUTSIDE = "node"
+STALE = "stale registration"
 TWO_PROXIES = "two proxies"
 _ENDED = ("refused", "silent", "failing", "cleaned")
 FIRST_NODE = 10.0
@@ -90,7 +92,8 @@ def _inside(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[DoctorFinding]:
-    state, address = node.state, node.address
+    state = node.state
+    address = node.address
     if state in ("refused", "silent", "failing", "ok") and _only_on_loopback(node):
         text = f"calls itself {node.uri} and so listens on loopback only: nobody can reach it"
         host = address.rpartition(":")[0]
@@ -121,7 +124,8 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
 
 def _only_on_loopback(node: EndpointStatus) -> bool:
     """Whether a node gives a loopback address, and is somewhere else than the proxy."""
-    claimed, actual = parse_slave_uri(node.uri), parse_host_port(node.address)
+    claimed = parse_slave_uri(node.uri)
+    actual = parse_host_port(node.address)
     return bool(claimed and actual and is_loopback(claimed.host) and not is_loopback(actual.host))
 
 
@@ -170,7 +174,8 @@ def _is_of_another_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
 
 
 def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
-    slave, reach = node.slave, node.attempt.reach
+    slave = node.slave
+    reach = node.attempt.reach
     if slave is None:
         text = f"the master gives no usable address for it: {node.uri!r}"
         yield error(OUTSIDE, node.name, text, "restart it")

@@ -9,7 +9,8 @@ from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, quoted, size
 
-PAIR, ANY = "pair", "*"
+PAIR = "pair"
+ANY = "*"
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -59,7 +60,8 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
 
 def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
     """Whether a publisher and a subscriber are connected, else why not."""
-    publisher_node, subscriber_node = facts.nodes[publisher], facts.nodes[subscriber]
+    publisher_node = facts.nodes[publisher]
+    subscriber_node = facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
     if is_connected(topic, publisher_node, subscriber_node):
         return ok(
@@ -84,7 +86,8 @@ def _traffic(facts: DoctorFacts, topic: str, publisher: NodeFacts, subscriber: N
     lease = facts.lease(publisher.slave)
     for connection in lease.connections if lease else ():
         if (connection.name, connection.caller_id) == (topic, subscriber.name):
-            sent, rate = size(connection.sent), size(connection.sent_rate)
+            sent = size(connection.sent)
+            rate = size(connection.sent_rate)
             return f", {sent} so far, {rate}/s just now"
     return ""
 
@@ -182,7 +185,8 @@ def _why_not_from_inside(
 
 
 def _service(facts: DoctorFacts, service: str) -> DoctorFinding:
-    uri, attempt = facts.service_uris.get(service, ""), facts.services.get(service, Attempt())
+    uri = facts.service_uris.get(service, "")
+    attempt = facts.services.get(service, Attempt())
     providers = listed(facts.system.services.get(service, ()))
     text = f"{providers} provides it at {uri}: {attempt.reach.value}"
     if not attempt.failed:

@@ -73,8 +73,10 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 def _unanswered(master: MasterFacts) -> tuple[str, str]:
     """What is wrong with a master that does not answer as one, and what mends it."""
-    uri, split_uri = master.uri, urlsplit(master.uri)
-    host, port = split_uri.hostname or "", split_uri.port
+    uri = master.uri
+    split_uri = urlsplit(master.uri)
+    host = split_uri.hostname or ""
+    port = split_uri.port
     by_address = f"--master-uri http://ADDRESS:{port}"
     match master.attempt.reach:
         case ReachOutcome.UNRESOLVABLE:
@@ -147,7 +149,8 @@ def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     port = facts.proxy.settings.publish_master
     if port is None:
         return
-    check, attempt = "published master", facts.published_master
+    check = "published master"
+    attempt = facts.published_master
     text = f"http://{facts.advertise_host}:{port} for nodes outside: {attempt.reach.value}"
     if not attempt.failed:
         yield ok(check, check, text)

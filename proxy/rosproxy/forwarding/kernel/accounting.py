@@ -64,8 +64,10 @@ class UnansweredPorts:
         if now - self._window_start < SILENCE_WINDOW:
             return []
         silent = {port for port, (sent, received) in self._bytes.items() if received and not sent}
-        unanswered, self._silent_before = silent & self._silent_before, silent
-        self._window_start, self._bytes = now, {}
+        unanswered = silent & self._silent_before
+        self._silent_before = silent
+        self._window_start = now
+        self._bytes = {}
         return sorted(unanswered)
 
 
@@ -80,7 +82,8 @@ class KernelAccounts:
     def __init__(self) -> None:
         self.owners: Mapping[int, LeaseHolder] = {}
         self._accounts: dict[LeaseHolder, Account] = {}
-        self._deltas, self._silence = CounterDeltas(), UnansweredPorts()
+        self._deltas = CounterDeltas()
+        self._silence = UnansweredPorts()
         self.unanswered: list[int] = []
         self._counted_at = 0.0
 
@@ -97,10 +100,12 @@ class KernelAccounts:
 
     def count(self, counters: Counters, now: float) -> list[tuple[str, Counts]]:
         """Take in counters; what was sent and received since the last time, by node name."""
-        elapsed, self._counted_at = now - self._counted_at, now
+        elapsed = now - self._counted_at
+        self._counted_at = now
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
-        by_name, by_port = [], self._deltas.take(counters)
+        by_name = []
+        by_port = self._deltas.take(counters)
         self.unanswered = self._silence.look(by_port, now)
         for port, (from_node, to_node, packets) in by_port.items():
             endpoint = self.owners.get(port)

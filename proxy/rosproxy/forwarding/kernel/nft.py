@@ -214,7 +214,9 @@ def _counted(elements: Json) -> dict[int, tuple[int, int]]:
     for item in elements if isinstance(elements, list) else []:
         body = _dict(_dict(item).get("elem"))
         counter = _dict(body.get("counter"))
-        mark, size, count = body.get("val"), counter.get("bytes", 0), counter.get("packets", 0)
+        mark = body.get("val")
+        size = counter.get("bytes", 0)
+        count = counter.get("packets", 0)
         if isinstance(mark, int) and isinstance(size, int) and isinstance(count, int):
             counted[mark] = size, count
     return counted

@@ -54,13 +54,17 @@ class KernelPlane:
         table: KernelTable,
         near: Callable[[], Near] = tuple,
     ) -> None:
-        self._settings, self.holders = settings, endpoints
-        self._tasks, self._problems, self._clock = tasks, problems, clock
+        self._settings = settings
+        self.holders = endpoints
+        self._tasks = tasks
+        self._problems = problems
+        self._clock = clock
         self._table = table
         self._accounts = KernelAccounts()
         self.syncer = ForwardSyncer(endpoints, table, self._accounts, problems, clock, near)
         self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
-        self.traffic, self.total = Traffic(), Counts()
+        self.traffic = Traffic()
+        self.total = Counts()
         self._is_wanted = settings.data_plane in ("auto", "kernel")
         splices = table.has_connections and hasattr(os, "splice")
         copies = settings.data_plane == "copy" or not splices
@@ -115,7 +119,8 @@ class KernelPlane:
 
     def cut(self, endpoint: LeaseHolder) -> None:
         """Have the kernel forget an endpoint's connections; who sends next gets a reset."""
-        ports, ipv6 = self._accounts.ports_of(endpoint), ":" in endpoint.address
+        ports = self._accounts.ports_of(endpoint)
+        ipv6 = ":" in endpoint.address
         if self.syncer.usable and ports:
             work = self.syncer.cut([(port, ipv6) for port in ports])
             self._tasks.spawn(work, f"cutting {endpoint.label}")
@@ -139,7 +144,8 @@ class KernelPlane:
     def status_of(self, endpoint: LeaseHolder) -> dict[str, Any]:
         """The plane of one endpoint's topics, as JSON; bytes of IP packets."""
         account = self._accounts.account(endpoint)
-        reason, port = self.syncer.reason(endpoint), endpoint.fast_port
+        reason = self.syncer.reason(endpoint)
+        port = endpoint.fast_port
         # Ports of nodes outside are for inside alone: they are not published, and have no offset.
         return {
             "plane": self.user_plane if reason else "kernel",
@@ -170,7 +176,9 @@ class KernelPlane:
         )
 
     def _report(self) -> None:
-        plane, reason, traffic = self.user_plane, self.syncer.why_not, self.syncer.traffic
+        plane = self.user_plane
+        reason = self.syncer.why_not
+        traffic = self.syncer.traffic
         if reason is None:
             log.info("the kernel forwards %s: nftables table %s", traffic, self._table.table.name)
             self._problems.solved(self.syncer.subject)

@@ -63,12 +63,19 @@ class ForwardSyncer:
         clock: Clock,
         near: Callable[[], Near],
     ) -> None:
-        self._endpoints, self._table, self._accounts = endpoints, table, accounts
-        self._problems, self._clock, self._near = problems, clock, near
-        self._lock, self._wake, self._synced = asyncio.Lock(), asyncio.Event(), asyncio.Event()
+        self._endpoints = endpoints
+        self._table = table
+        self._accounts = accounts
+        self._problems = problems
+        self._clock = clock
+        self._near = near
+        self._lock = asyncio.Lock()
+        self._wake = asyncio.Event()
+        self._synced = asyncio.Event()
         self._changed: set[LeaseHolder] = set()
         self._all_changed = True
-        self._host, self._pauses = HostForwarding(), decisions.Pauses()
+        self._host = HostForwarding()
+        self._pauses = decisions.Pauses()
         self._routes: dict[str, Route] = {}
         # inf: what was not possible at the start is not tried again, only a table that was lost.
         self._retry_at = float("inf")
@@ -151,7 +158,8 @@ class ForwardSyncer:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
 
         def leads() -> bool:
-            target, port = HostPort(endpoint.address, node_port), endpoint.fast_port
+            target = HostPort(endpoint.address, node_port)
+            port = endpoint.fast_port
             return self.usable and port is not None and self._table.forwards.get(port) == target
 
         if not leads():
@@ -233,7 +241,8 @@ class ForwardSyncer:
             if self.usable:
                 await self._change()
             # Each round has an event of its own, which wakes all who wait for it once.
-            synced, self._synced = self._synced, asyncio.Event()
+            synced = self._synced
+            self._synced = asyncio.Event()
             synced.set()
 
     async def _change(self) -> None:
@@ -248,7 +257,8 @@ class ForwardSyncer:
         try:
             await self._table.make(wanted, self._surroundings(wanted))
         except ToolError as error:
-            self._all_changed, self.why_not = True, str(error)
+            self._all_changed = True
+            self.why_not = str(error)
             self._retry_at = self._clock() + RETRY_LOST
             self._accounts.note_peers({})
             text = f"{self.traffic} are no longer forwarded by the kernel: {error}"
@@ -257,9 +267,11 @@ class ForwardSyncer:
 
     def _wanted(self) -> dict[int, HostPort]:
         current = self._table.forwards
-        changed, self._changed = self._changed, set()
+        changed = self._changed
+        self._changed = set()
         if self._all_changed or not self.recovered:
-            self._all_changed, changed = False, set(self._endpoints)
+            self._all_changed = False
+            changed = set(self._endpoints)
             wanted = decisions.forwards_to_keep(current, changed, self.recovered)
         else:
             wanted = decisions.unchanged_forwards(current, self._accounts.owners, changed)
@@ -273,7 +285,8 @@ class ForwardSyncer:
 
     def _log(self, change: Changes) -> None:
         for port in {**change.removed, **change.added}:
-            endpoint, target = self._accounts.owners.get(port), change.added.get(port)
+            endpoint = self._accounts.owners.get(port)
+            target = change.added.get(port)
             name = endpoint.label if endpoint else "a node that is gone"
             if target:
                 log.info("%s: the kernel forwards port %d to %s", name, port, target)

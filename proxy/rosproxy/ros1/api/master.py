@@ -69,7 +69,8 @@ class MasterApi:
         self._refuse_loop(call)
         # getUri is answered with the address by which the node itself calls the proxy.
         caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
-        metrics, upstream = self._context.metrics, self._context.upstream
+        metrics = self._context.metrics
+        upstream = self._context.upstream
         judges_params = self._access.judges_parameters(call.source)
         # roslaunch sets all its parameters by one multicall (launch.py, _load_parameters).
         if not judges_params and await _is_long_and_passes(call.body):
@@ -125,7 +126,8 @@ class MasterApi:
         self, request: Request, replies: Sequence[LocalReply | None], call: IncomingCall
     ) -> bytes:
         """Admit nodes, export URIs, call the master, note what it accepted, import its URIs."""
-        addressing, version = self._context.addressing, self._context.policy.version
+        addressing = self._context.addressing
+        version = self._context.policy.version
         async with self._outcomes(request, replies, call) as outcomes:
             exported = master_api.export_request(request, outcomes, addressing)
             self._note(exported.registry_changes(), request.caller.address)
@@ -155,7 +157,8 @@ class MasterApi:
         nothing.
         """
         self._context.refresh_networks(request.caller.address)
-        outcomes, pending = list[CallOutcome](), list[Endpoint]()
+        outcomes = list[CallOutcome]()
+        pending = list[Endpoint]()
         try:
             # One after the other: they may register the same new node.
             for call, reply in zip(request.calls, replies, strict=True):
@@ -187,7 +190,8 @@ class MasterApi:
 
     async def _admit(self, call: Call, request: Request) -> CallOutcome:
         """What becomes of one call; what is too long, or one too many, is refused."""
-        caller, may_be_long = request.caller, len(request.body) > LONGEST_NAME
+        caller = request.caller
+        may_be_long = len(request.body) > LONGEST_NAME
         if may_be_long and (text := too_long_to_register(call)):
             return self._refuse("long_name", call, caller, text)
         admission = await self._admission.admit(call, caller)

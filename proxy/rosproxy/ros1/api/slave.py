@@ -50,8 +50,12 @@ class SlaveApi:
         tcpros: TcprosServer,
         access: AccessChecks,
     ) -> None:
-        self._context, self._leases, self._stand_ins = context, leases, stand_ins
-        self._adopter, self._tcpros, self._access = adopter, tcpros, access
+        self._context = context
+        self._leases = leases
+        self._stand_ins = stand_ins
+        self._adopter = adopter
+        self._tcpros = tcpros
+        self._access = access
         self._nodes = InsideNodes(context, access)
         greeting = "rosproxy: slave API of a ROS node behind it\n"
         self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
@@ -93,8 +97,9 @@ class SlaveApi:
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
-        endpoint, method = self._endpoint(call), long_call.method
-        caller_id, parameter, *_ = *passing.first_strings(call.body, 2), None, None
+        endpoint = self._endpoint(call)
+        method = long_call.method
+        caller_id, parameter = passing.first_strings(call.body, 2)
         reason = await self._why_not(endpoint, method, caller_id or "", call.source)
         if reason is None and caller_id is None and not self._access.idle:
             reason = NO_CALLER_ID
@@ -175,14 +180,16 @@ class SlaveApi:
             return await self._pass(endpoint, body)
         if parsed.method == "publisherUpdate":
             await self._context.wait_for_registration(endpoint)
-            topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
+            topic = parsed.string(1) or ""
+            announced = slave_api.announced_publishers(parsed)
             node = self._context.caller_at(endpoint)
             await self._stand_ins.listen_for_announced(topic, announced, node)
             if len(announced) > MANY_VALUES:
                 await self._context.yield_to_others()
             body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
-        addressing, is_local = self._context.addressing, call.reached_locally
+        addressing = self._context.addressing
+        is_local = call.reached_locally
         node = self._context.caller_at(endpoint)
         view = slave_api.from_outside(node, self._context.settings.master_uri, addressing)
         if self._context.stand_ins.is_bidirectional:
@@ -192,7 +199,8 @@ class SlaveApi:
         reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
         # The node's own answer is all that tells where its topics are. Whoever connects next, and
         # the kernel plane, are led to the port that is noted here.
-        port, topic_port = endpoint.port, slave_api.topic_port(parsed, reply)
+        port = endpoint.port
+        topic_port = slave_api.topic_port(parsed, reply)
         if topic_port is not None:
             endpoint.note_topic_port(parsed.string(1) or "", topic_port)
             if self._access.may_bypass(endpoint):
@@ -204,7 +212,8 @@ class SlaveApi:
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes
     ) -> tuple[bytes, xmlrpc.Call]:
         """A publisherUpdate with what the node is to hear of; as it came if that is the same."""
-        topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
+        topic = parsed.string(1) or ""
+        announced = slave_api.announced_publishers(parsed)
         publishers = policing.publishers_for(endpoint, topic, announced, self._context.addressing)
         if publishers == [*dict.fromkeys(announced)]:
             return body, parsed
@@ -214,7 +223,8 @@ class SlaveApi:
     async def _is_absorbed(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
         """Whether a node is spared a needless ``shutdown`` or outdated ``publisherUpdate``."""
         if parsed.method == "shutdown":
-            caller_id, reason = parsed.string(0) or "", parsed.string(1) or ""
+            caller_id = parsed.string(0) or ""
+            reason = parsed.string(1) or ""
             return await self._adopter.absorb_shutdown(endpoint, caller_id, reason)
         if parsed.method != "publisherUpdate":
             return False

@@ -64,7 +64,8 @@ class KeptConnections(Generic[_K]):
     """
 
     def __init__(self, nodes: NodeClient, within: float) -> None:
-        self._nodes, self._within = nodes, within
+        self._nodes = nodes
+        self._within = within
         self.most = 0  # until it is known how many files may be open (`Ros1.reserve_range`)
         self._connections: dict[_K, _Connection] = {}
         self._waiting: dict[_K, _Connection] = {}
@@ -89,7 +90,9 @@ class KeptConnections(Generic[_K]):
             return False
         if conn is None:
             return False
-        conn.asked_at, conn.question, conn.received = now, self._nodes.pid_question(slave), b""
+        conn.asked_at = now
+        conn.question = self._nodes.pid_question(slave)
+        conn.received = b""
         self._waiting[key] = conn
         with contextlib.suppress(OSError):  # `collect` finds out
             conn.send()
@@ -180,7 +183,8 @@ class KeptConnections(Generic[_K]):
             raise BlockingIOError
         if body != conn.body and not self._is_from(conn.pid, body):
             return None
-        conn.body, conn.received = body, b""
+        conn.body = body
+        conn.received = b""
         return ProbeResult.ANSWERED
 
     def _is_from(self, pid: int, body: bytes) -> bool:

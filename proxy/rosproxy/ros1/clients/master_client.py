@@ -96,14 +96,17 @@ class MasterClient:
         master_address: str | None = None,
         longest: int = MAX_BODY,
     ) -> None:
-        self.master_uri, self.master_address = master_uri, master_address
+        self.master_uri = master_uri
+        self.master_address = master_address
         self._metrics = metrics
         uri = urlsplit(master_uri)
-        self._master_path, self._netloc = uri.path or "/", uri.netloc
+        self._master_path = uri.path or "/"
+        self._netloc = uri.netloc
         self._master_host_port = HostPort(uri.hostname or "", uri.port or 80)
         # By these two a call that comes back to the proxy tells which address has led it here:
         # --master-uri, or that of a node (`MasterApi`).
-        master_headers, node_headers = {LOOP_HEADER: instance}, {LOOP_HEADER: f"{instance} node"}
+        master_headers = {LOOP_HEADER: instance}
+        node_headers = {LOOP_HEADER: f"{instance} node"}
         self._master = HttpClient(master_headers, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
         self._nodes = HttpClient(node_headers, NODE_KEEPALIVE, NODE_CONNECTIONS, longest, NODES)
 
@@ -137,7 +140,9 @@ class MasterClient:
 
         Kept connections are told apart by address, so a new address means new connections.
         """
-        target, path, name = self.reach(self._master_host_port), self._master_path, self._netloc
+        target = self.reach(self._master_host_port)
+        path = self._master_path
+        name = self._netloc
         with _failures_of(f"master {self.master_uri}"):
             return await self._master.post(target, path, name, body, MASTER_TIMEOUT, limits.size)
 
@@ -146,7 +151,9 @@ class MasterClient:
 
         Raises Unreachable, and XmlRpcError as a long body does.
         """
-        target, path, name = self.reach(self._master_host_port), self._master_path, self._netloc
+        target = self.reach(self._master_host_port)
+        path = self._master_path
+        name = self._netloc
         with _failures_of(f"master {self.master_uri}"):
             return await self._master.pass_on(target, path, name, body, MASTER_TIMEOUT)
 
@@ -231,7 +238,8 @@ class MasterClient:
         Raises Unreachable, and XmlRpcError as a long body does.
         """
         with _failures_of(f"node at {slave}"):
-            target, name = self.reach(slave), str(slave)
+            target = self.reach(slave)
+            name = str(slave)
             return await self._nodes.pass_on(target, "/", name, body, NODE_TIMEOUT)
 
     async def call_node(

@@ -55,7 +55,8 @@ class NodeClient:
     """Questions to nodes; ``within`` is the time-out of each in seconds."""
 
     def __init__(self, upstream: MasterClient, within: float) -> None:
-        self._upstream, self._within = upstream, within
+        self._upstream = upstream
+        self._within = within
 
     async def probe(self, slave: HostPort, within: float | None = None) -> ProbeAnswer:
         """Call ``getPid``. Whatever answers in HTTP lives, even if it does not know that call."""

@@ -13,11 +13,13 @@ from collections.abc import Mapping
 from itertools import islice
 from typing import Any
 
-OUT, IN = "o", "i"
+OUT = "o"
+IN = "i"
 """Directions, as in ``getBusInfo``: of a publisher's connections, and of a subscriber's."""
 MOST_CONNECTIONS = 256
 """Connections of a topic that are read; `/rosout` of a large system has 200."""
-LEAST, GREATEST = -(2**31), 2**31 - 1
+LEAST = -(2**31)
+GREATEST = 2**31 - 1
 """Bounds of a number of XML-RPC."""
 Count = tuple[int, int]
 """Bytes and messages."""

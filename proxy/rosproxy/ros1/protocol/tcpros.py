@@ -34,7 +34,8 @@ def decode_header(body: bytes) -> dict[str, str]:
     the blanks. So that all see the same, none may be there twice. Raises HeaderError if one is, if
     a field's length leads outside the body, a field has no ``=`` or there are more than MAX_FIELDS.
     """
-    fields, position = dict[str, str](), 0
+    fields = dict[str, str]()
+    position = 0
     while position < len(body):
         if len(fields) == MAX_FIELDS:
             raise HeaderError(f"connection header of more than {MAX_FIELDS} fields")

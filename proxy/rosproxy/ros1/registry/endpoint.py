@@ -129,9 +129,11 @@ class Endpoint:
 
     def mark_alive(self, pid: int | None, topic_ports: Mapping[str, int], now: float) -> None:
         """Take in what its node has said of itself: it is served, and what it registered holds."""
-        self.trusted, self.topic_ports = True, dict(topic_ports)
+        self.trusted = True
+        self.topic_ports = dict(topic_ports)
         self.health.note(ProbeResult.ANSWERED, now)
-        self.health.pid, self.health.cleaned = pid, False
+        self.health.pid = pid
+        self.health.cleaned = False
 
     def hold(self) -> None:
         """Keep the lease while a call is on its way; see `release`."""
@@ -153,7 +155,8 @@ class Endpoint:
 
     def note_verified(self, pid: int | None, topic_ports: Mapping[str, int]) -> None:
         """Note that the node itself has borne out what the master says of it."""
-        self.topic_ports, self.trusted = dict(topic_ports), True
+        self.topic_ports = dict(topic_ports)
+        self.trusted = True
         # A known one stays: by it the prober finds out that this is another process.
         if self.health.pid is None:
             self.health.pid = pid
@@ -193,7 +196,8 @@ class Endpoint:
 
     def confirm(self) -> None:
         """Note that the node registered from its own address: what it says is believed."""
-        self.location, self.trusted = replace(self.location, confirmed=True), True
+        self.location = replace(self.location, confirmed=True)
+        self.trusted = True
 
     def note_topic_port(self, topic: str, port: int | None) -> None:
         """Note the TCPROS port that the node names for a topic now, if it does.

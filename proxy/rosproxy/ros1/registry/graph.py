@@ -73,7 +73,8 @@ def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
     ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
     ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not.
     """
-    tables, type_by_topic = msgspec.convert(state, tuple[_Table, _Table, _Table]), read_types(types)
+    tables = msgspec.convert(state, tuple[_Table, _Table, _Table])
+    type_by_topic = read_types(types)
     by_node: dict[str, list[Registration]] = {}
     for kind, rows in zip(_STATE_KINDS, tables, strict=True):
         for name, nodes in rows:

@@ -68,7 +68,8 @@ class Health:
 
     def note_hung_up(self) -> None:
         """Have the node probed at once: it has ended a connection that was to be kept."""
-        self.checked_at, self.hung_up_pid = None, self.pid
+        self.checked_at = None
+        self.hung_up_pid = self.pid
 
     @property
     def steady(self) -> bool:
@@ -85,22 +86,27 @@ class Health:
 
     def note_cleaned(self, at: float) -> None:
         """Note that its registrations were taken back at the master, as they were at a time."""
-        self.cleaned, self.cleaned_at = True, at
+        self.cleaned = True
+        self.cleaned_at = at
 
     def note_back(self, pid: int | None) -> None:
         """Note that it answers after all, as process ``pid``, and that it is registered again."""
-        self.pid, self.cleaned = pid, False
+        self.pid = pid
+        self.cleaned = False
 
     def suspect(self) -> None:
         """Have the node probed at once, as if another process could be there by now."""
-        self.checked_at, self.pid = None, -1
+        self.checked_at = None
+        self.pid = -1
 
     def note(self, probe: ProbeResult, now: float) -> bool:
         """Take in a probe result; whether the node went down by it."""
         was_down = self.down
         self.checked_at = now
         if probe is ProbeResult.ANSWERED:
-            self.answered_at, self.failing_since, self.failures = now, None, 0
+            self.answered_at = now
+            self.failing_since = None
+            self.failures = 0
             self.refused = self.has_ended = False
             return False
         self.failures += 1
@@ -112,7 +118,9 @@ class Health:
         """Note that the node has ended, whatever it is that its address answers."""
         self.failures = max(self.failures, FAILURES_TO_CLOSE)
         # Failing since ever, so that `clean_up` waits for nothing.
-        self.checked_at, self.failing_since, self.has_ended = now, float("-inf"), True
+        self.checked_at = now
+        self.failing_since = float("-inf")
+        self.has_ended = True
 
     def due(self, now: float, interval: float) -> bool:
         """Whether to probe: idle for ``interval`` seconds, or under suspicion."""

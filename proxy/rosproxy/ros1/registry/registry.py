@@ -89,7 +89,9 @@ class Registry:
             endpoint = self._add(uri, node, location, port, source)
         elif location.confirmed or not endpoint.location.confirmed:
             self._forget_node(endpoint)
-            endpoint.uri, endpoint.node, endpoint.location = uri, node, location
+            endpoint.uri = uri
+            endpoint.node = node
+            endpoint.location = location
             self._by_node.setdefault(node, {})[endpoint.port] = endpoint
             self.lease_changes += 1
         self._admit(endpoint, node, source)
@@ -102,7 +104,8 @@ class Registry:
         if HostPort(location.address, node.port) in self.by_slave or not self.pool.claim(port):
             return None
         endpoint = self._add(uri, node, location, port, location.address)
-        endpoint.trusted, endpoint.restored = False, True
+        endpoint.trusted = False
+        endpoint.restored = True
         self._admit(endpoint, node, location.address)
         return endpoint
 
@@ -160,7 +163,8 @@ class Registry:
         crowds = Counter(e.source for e in expendable if not e.proven)
 
         def order(endpoint: Endpoint) -> tuple[bool, int, bool, float]:
-            health, proven = endpoint.health, endpoint.proven
+            health = endpoint.health
+            proven = endpoint.proven
             crowd = 0 if proven else crowds[endpoint.source]
             return proven, -crowd, not health.refused, health.failing_since or 0.0
 

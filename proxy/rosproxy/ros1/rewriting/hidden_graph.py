@@ -25,11 +25,14 @@ def with_hidden(call: Call, listing: Any, registry: Registry) -> Any:
             return listing
         pairs = zip(_TABLES, listing, strict=True)
         return [_with_nodes(table, kind, registry) for kind, table in pairs]
-    kinds, prefix = [Kind.PUBLISHER, Kind.SUBSCRIBER], ""
+    kinds = [Kind.PUBLISHER, Kind.SUBSCRIBER]
+    prefix = ""
     if call.method == "getPublishedTopics":  # of a namespace, if it names one
-        kinds, namespace = kinds[:1], call.string(1) or ""
+        kinds = kinds[:1]
+        namespace = call.string(1) or ""
         prefix = f"{namespace.rstrip('/')}/" if namespace else ""
-    listed, types = read_types(listing), _types(kinds, registry)
+    listed = read_types(listing)
+    types = _types(kinds, registry)
     return listing + [
         [topic, type_]
         for topic, type_ in sorted(types.items())

@@ -94,7 +94,8 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
 
 def unregistering_endpoint(call: Call, caller: Caller, addressing: Addressing) -> Endpoint | None:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
-    spec, endpoint = method_spec(call.method), addressing.registry.by_caller.get(caller_id_of(call))
+    spec = method_spec(call.method)
+    endpoint = addressing.registry.by_caller.get(caller_id_of(call))
     if endpoint is None:
         return None
     if spec.caller_api is None:
@@ -143,7 +144,8 @@ def _import_result(
 
 
 def _import_uri(call: Call, triple: Value, caller: Caller, addressing: Addressing) -> list[Edit]:
-    text, kind = triple.items[2].string(), method_spec(call.method).reply
+    text = triple.items[2].string()
+    kind = method_spec(call.method).reply
     if text and kind is Reply.SLAVE_URI:
         return replace_value(triple, addressing.import_slave(text, caller))
     if text and kind is Reply.SERVICE_URI:

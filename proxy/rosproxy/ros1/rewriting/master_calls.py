@@ -225,7 +225,8 @@ def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
     subscribes to may be anything.
     """
     if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
-        call, endpoint = exported.request.calls[0], exported.outcomes[0]
+        call = exported.request.calls[0]
+        endpoint = exported.outcomes[0]
         if call and not isinstance(endpoint, LocalReply):
             return MasterReply(exported, reply, None, (CallResult(call, status, None, endpoint),))
     value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
@@ -241,11 +242,14 @@ def registering_uri(call: Call | None) -> str | None:
 
 def registration_of(call: Call, now: float, source: str) -> Registration | None:
     """What a call from an address registers or unregisters; None for any other call."""
-    spec, caller_id = method_spec(call.method), caller_id_of(call)
-    kind, name = spec.registers or spec.unregisters, call.string(spec.name)
+    spec = method_spec(call.method)
+    caller_id = caller_id_of(call)
+    kind = spec.registers or spec.unregisters
+    name = call.string(spec.name)
     if kind is None or not name:
         return None
-    name, type_ = resolve_name(name, caller_id), call.string(spec.type) or "*"
+    name = resolve_name(name, caller_id)
+    type_ = call.string(spec.type) or "*"
     service_api = call.string(spec.service_api)
     if service_api is not None:
         service_api = with_caller_address(service_api, source)

@@ -63,7 +63,8 @@ def hidden_registration(
     registration: Registration, endpoint: Endpoint, caller: Caller, addressing: Addressing
 ) -> LocalAnswer:
     """The answer to a registration that the master is not told of."""
-    caller, registry = replace(caller, endpoint=endpoint), addressing.registry
+    caller = replace(caller, endpoint=endpoint)
+    registry = addressing.registry
     fact = RegistryChange(registration, endpoint)
     if registration.kind is Kind.SERVICE:
         text = f"Registered [{registration.caller_id}] as provider of [{registration.name}]"
@@ -132,7 +133,8 @@ def publishers_for(
     if endpoint is None:
         return [*at_master]
     if hidden_registrations.is_hidden_subscriber(registry, endpoint, topic):
-        at_master, extra = [], hidden_registrations.publishers_inside(registry, topic)
+        at_master = []
+        extra = hidden_registrations.publishers_inside(registry, topic)
     else:
         extra = hidden_registrations.publishers(registry, topic)
     return [*dict.fromkeys([*at_master, *map(addressing.advertised_uri, extra)])]

@@ -71,7 +71,8 @@ def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
 
     Their order is kept; a publisher that is named twice is left out the second time.
     """
-    edits, listed = [], set()
+    edits = []
+    listed = set()
     for item in _publishers(call):
         uri = view.rewrite_in_call(item.text)
         # roscpp would connect twice to one that is listed twice (subscription.cpp, pubUpdate).
@@ -149,7 +150,8 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
 
     A newer one follows; a subscriber inside need not drop its connection in between.
     """
-    topic, listed = call.string(1) or "", set(announced_publishers(call))
+    topic = call.string(1) or ""
+    listed = set(announced_publishers(call))
     return any(
         endpoint.settles_at > now
         and topic in endpoint.names_at_master(Kind.PUBLISHER)

@@ -57,5 +57,6 @@ def _topic(items: list[Value]) -> str:
 def _receiver(items: list[Value]) -> HostPort | None:
     if len(items) < 4:
         return None
-    host, port = items[2].string(), items[3].integer()
+    host = items[2].string()
+    port = items[3].integer()
     return HostPort(host, port) if host and port and 0 < port < 65536 else None

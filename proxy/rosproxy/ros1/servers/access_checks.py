@@ -79,7 +79,8 @@ class AccessChecks:
         Those that register are judged once they have an endpoint (`judge_registration`).
         Raises Unreachable.
         """
-        caller, params = request.caller, _KnownParams(self._upstream)
+        caller = request.caller
+        params = _KnownParams(self._upstream)
         if self.idle:
             return [None] * len(request.calls)
         replies = list[LocalReply | None]()
@@ -90,7 +91,7 @@ class AccessChecks:
 
     def judge_long(self, method: str, head: bytes, source: str) -> LocalReply | None:
         """The reply to a long call of which only the head was read; None if it passes."""
-        caller_id, name = (*passing.first_strings(head, 2), None, None)[:2]
+        caller_id, name = passing.first_strings(head, 2)
         use = policing.param_use(method, caller_id or "", name)
         if use is None:
             return None
@@ -107,7 +108,8 @@ class AccessChecks:
         if affected is None or affected.kind is Kind.PARAM:  # parameters were judged before
             return admission
         address = admission.address if isinstance(admission, Endpoint) else caller.address
-        kind, callers = policing.KINDS[affected.kind], [affected.caller_id]
+        kind = policing.KINDS[affected.kind]
+        callers = [affected.caller_id]
         verdict = self._policy.ask(kind, affected.name, callers, address)
         if verdict.allowed:
             return admission
@@ -130,7 +132,8 @@ class AccessChecks:
         """What the policy changes in the master's reply."""
         if self.idle:
             return NO_REPLY_CHANGES
-        publishers, caller = dict[str, list[str]](), reply.exported.request.caller
+        publishers = dict[str, list[str]]()
+        caller = reply.exported.request.caller
         for result in reply.results:
             if method_spec(result.call.method).registers is Kind.SUBSCRIBER and result.endpoint:
                 topic = second_parameter_name(result.call)
@@ -139,7 +142,8 @@ class AccessChecks:
                 )
         params: frozenset[str] = frozenset()
         if self.filters_names(reply.exported.request):
-            kind, callers = RuleKind.GET_PARAM, [caller.caller_id]
+            kind = RuleKind.GET_PARAM
+            callers = [caller.caller_id]
             params = frozenset(
                 name
                 for name in reply.param_names()
@@ -171,7 +175,8 @@ class AccessChecks:
         An offer of UDPROS holds a header of its own, whose topic roscpp serves (topic_manager.cpp,
         requestTopic): it is refused where anything of the node may be denied.
         """
-        topic, caller_id = call.string(1) or "", call.string(0) or ""
+        topic = call.string(1) or ""
+        caller_id = call.string(0) or ""
         reason = self.outside_may_not(RuleKind.PUBLISH, topic, endpoint, source, caller_id)
         if reason is None and not policing.offers_tcpros_alone(call):
             if self.may_bypass(endpoint) or self._is_inside(source):
@@ -214,7 +219,8 @@ class AccessChecks:
         """The ROS triple of requestTopic for what a node inside may not have; None if it may."""
         if call.method != "requestTopic":
             return None
-        topic, caller_id = call.string(1) or "", call.string(0) or ""
+        topic = call.string(1) or ""
+        caller_id = call.string(0) or ""
         reason = self.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
         return None if reason is None else policing.no_publisher(topic, reason)
 

@@ -70,8 +70,10 @@ class NodeAdmission:
         cleanup: Cleanup,
         verification: Verification,
     ) -> None:
-        self._context, self._leases = context, leases
-        self._cleanup, self._verification = cleanup, verification
+        self._context = context
+        self._leases = leases
+        self._cleanup = cleanup
+        self._verification = verification
         self._making_room = asyncio.Lock()
 
     async def admit(self, call: Call, caller: Caller) -> CallOutcome:
@@ -106,7 +108,8 @@ class NodeAdmission:
 
         Somebody else at a source that hides several has to bear out its name as well.
         """
-        caller_id, location = call.string(0) or "", endpoint.location
+        caller_id = call.string(0) or ""
+        location = endpoint.location
         if location.address != caller.address and caller_id not in endpoint.caller_ids:
             name = await self._context.nodes.name(endpoint.slave, _service(call, caller))
             if name != caller_id:
@@ -145,8 +148,11 @@ class NodeAdmission:
         Ports that turn out to be taken are passed over. ``answers``: the node has just done so.
         Raises Unreachable.
         """
-        registry, leases, problems = self._context.registry, self._leases, self._context.problems
-        slave, source = HostPort(location.address, node.port), caller.address
+        registry = self._context.registry
+        leases = self._leases
+        problems = self._context.problems
+        slave = HostPort(location.address, node.port)
+        source = caller.address
         if slave not in registry.by_slave and not answers and self._is_crowded(source):
             answers = await self._comes_to_answer(slave, source)
             if not answers and self._is_crowded(source):
@@ -202,7 +208,9 @@ class NodeAdmission:
         endpoint = registry.dead_endpoint()
         if endpoint is None:
             return False
-        label, port, fields = endpoint.label, endpoint.port, endpoint.log_fields
+        label = endpoint.label
+        port = endpoint.port
+        fields = endpoint.log_fields
         text = "%s: %s does not answer: its port %d goes to another node"
         await self._cleanup.give_up(endpoint)
         if registry.by_port.get(port) is endpoint and endpoint.expendable:
@@ -266,7 +274,8 @@ class NodeAdmission:
         that the call registers. Outside it need only be there: a gateway registers nodes of another
         machine under names of its own, and no port is opened for that.
         """
-        source, caller_id = caller.address, call.string(0) or ""
+        source = caller.address
+        caller_id = call.string(0) or ""
         addresses = await resolve(self._context.upstream.reach(node).host, source)
         candidates = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not candidates:
@@ -275,7 +284,8 @@ class NodeAdmission:
             return NodeLocation(source, named=False)
         service = _service(call, caller)
         for address in candidates[:MOST_ADDRESSES]:
-            slave, client_kind = HostPort(address, node.port), self._context.client_kind(address)
+            slave = HostPort(address, node.port)
+            client_kind = self._context.client_kind(address)
             if client_kind is ClientKind.OUTSIDE:
                 bears_out = await self._answers(slave)  # a gateway gives it another name
             else:

@@ -59,7 +59,8 @@ class Callers:
         self._begun.set()
         self._context.problems.solved(SUBJECT)
         # Whoever waits now is woken; whoever comes to wait later waits for the next news.
-        news, self._news = self._news, asyncio.Event()
+        news = self._news
+        self._news = asyncio.Event()
         news.set()
 
     async def await_operator(self) -> None:
@@ -121,7 +122,8 @@ class Callers:
                 del waiting[source]
 
     def _report(self, text: str, kind: ClientKind) -> None:
-        context, now = self._context, self._context.now()
+        context = self._context
+        now = self._context.now()
         context.metrics.strangers.labels(kind.value).inc()
         context.problems.solved(SUBJECT)  # the last one is enough: there may be any number
         context.problems.add(SUBJECT, text)

@@ -23,8 +23,11 @@ class LongCall:
     def __init__(
         self, method: str, size: int, head: bytes, rest: StreamReader, watch: CallWatch
     ) -> None:
-        self.method, self.size = method, size
-        self._head, self._rest, self._watch = head, rest, watch
+        self.method = method
+        self.size = size
+        self._head = head
+        self._rest = rest
+        self._watch = watch
 
     async def pieces(self) -> AsyncIterator[bytes]:
         """The body, watched; its last piece comes once all of it was.

@@ -14,7 +14,8 @@ class DocumentReply(web.StreamResponse):
 
     def __init__(self, document: bytes, size: int | None = None) -> None:
         super().__init__()
-        self._document, self._size = document, len(document) if size is None else size
+        self._document = document
+        self._size = len(document) if size is None else size
         self._lasts = self._sent = False
 
     @property
@@ -27,7 +28,8 @@ class DocumentReply(web.StreamResponse):
         # aiohttp prepares what a handler returns once more (web_protocol.py, finish_response).
         if self._sent:
             return
-        self._sent, self._lasts = True, request.keep_alive
+        self._sent = True
+        self._lasts = request.keep_alive
         head = _head(request.version, self._lasts, self._size)
         for piece in pieces(head, self._document):
             await request.writer.write(piece)

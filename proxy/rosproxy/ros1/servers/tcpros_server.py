@@ -87,7 +87,8 @@ class TcprosServer:
     def traffic(self) -> Traffic:
         """Bytes by topic and service, of ended and open connections."""
         total = Traffic()
-        total.sent, total.received = dict(self._ended.sent), dict(self._ended.received)
+        total.sent = dict(self._ended.sent)
+        total.received = dict(self._ended.received)
         for relay in self.relays:
             total.add(relay.kind, relay.name, relay.sent, relay.received)
         return total
@@ -188,7 +189,8 @@ class InsideNodes:
     """
 
     def __init__(self, context: Context, access: AccessChecks) -> None:
-        self._context, self._access = context, access
+        self._context = context
+        self._access = access
         self._port_tasks: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
 
     def target(self, endpoint: Endpoint) -> "InsideNode":

@@ -45,7 +45,8 @@ STOP_TIMEOUT = 0.5
 """Seconds that calls under way get to end when the server stops."""
 READ_AHEAD = 64 * 1024
 """Bytes of a body that wait to be read, before the client has to wait."""
-MOST_LINE, MOST_FIELDS = 4096, 64
+MOST_LINE = 4096
+MOST_FIELDS = 64
 """Longest line of a request's header in bytes, and how many fields it has: ROS's have five."""
 VALUE = 400
 """Bytes of memory that a value of a document takes while its call is answered."""
@@ -62,7 +63,9 @@ class IncomingCall:
 
     def __init__(self, request: web.BaseRequest, hold: Callable[[int], None]) -> None:
         protocol = request.protocol
-        self.body, self.charge, self._request = b"", hold, request
+        self.body = b""
+        self.charge = hold
+        self._request = request
         self.source = _source(request)
         self.local = _address(protocol.sockname)
         self.host_header = request.headers.get("Host", "")
@@ -118,7 +121,8 @@ class HttpRefusal(Exception):
 
     def __init__(self, status: int, reason: str, text: str) -> None:
         super().__init__(text)
-        self.status, self.reason = status, reason
+        self.status = status
+        self.reason = reason
 
 
 class XmlRpcServer(web.Server):
@@ -147,8 +151,12 @@ class XmlRpcServer(web.Server):
             max_field_size=MOST_LINE,
             max_headers=MOST_FIELDS,
         )
-        self._context, self._service, self._greeting = context, service, greeting
-        self._limits, self._long_calls, self._guard = limits, long_calls, guard
+        self._context = context
+        self._service = service
+        self._greeting = greeting
+        self._limits = limits
+        self._long_calls = long_calls
+        self._guard = guard
         self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
         self._busy: set[web.RequestHandler] = set()
         self._mute: dict[web.RequestHandler, Callable[[], None]] = {}
@@ -194,7 +202,8 @@ class XmlRpcServer(web.Server):
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
         """Know a connection by the port that it came in on, and wait for its first request."""
         super().connection_made(handler, transport)
-        port, source = _address(handler.sockname).port, _address(handler.peername).host
+        port = _address(handler.sockname).port
+        source = _address(handler.peername).host
         self._by_port[port].add(handler)
         self._context.gate.enter(source, port)  # the acceptor counts until `dispatch` has ended
         self._mute[handler] = self._context.gate.wait(source, handler.force_close)
@@ -237,9 +246,13 @@ class XmlRpcServer(web.Server):
             with Charge(self._context.buffered, source) as charge:
                 return await self._answer(request, IncomingCall(request, charge.add))
         except HttpRefusal as refusal:
-            status, reason, text = refusal.status, refusal.reason, str(refusal)
+            status = refusal.status
+            reason = refusal.reason
+            text = str(refusal)
         except OverBudget as error:
-            status, reason, text = 503, "over_budget", str(error)
+            status = 503
+            reason = "over_budget"
+            text = str(error)
         self._context.refusals.note(reason, source, text)
         return web.Response(status=status, text=f"rosproxy: {text}\n")
 
@@ -301,7 +314,8 @@ class XmlRpcServer(web.Server):
         self, request: web.BaseRequest, call: IncomingCall
     ) -> Awaitable[bytes | LongReply] | None:
         """The answer to a whole call with more elements than are read, if it need not be read."""
-        service, limits = self._long_calls, self._limits
+        service = self._long_calls
+        limits = self._limits
         if service is None or not xmlrpc.exceeds_elements(call.body, limits):
             return None
         method = passing.method_of(call.body)
@@ -339,7 +353,8 @@ class XmlRpcServer(web.Server):
         """Take in a whole body, of which ``charged`` bytes are held already. Raises TooLong."""
         if len(body) > self._limits.size:
             raise TooLong(self._limits.size)
-        call.body, values = body, body.count(b"<value")
+        call.body = body
+        values = body.count(b"<value")
         call.charge(len(body) - charged + VALUE * values)
         if values > MANY_VALUES:
             await self._context.yield_to_others()

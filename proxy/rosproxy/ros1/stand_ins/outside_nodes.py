@@ -33,7 +33,8 @@ class Outside:
     """Reaches nodes outside. ``note_refused`` gets the stand-in of one that refuses: it ended."""
 
     def __init__(self, context: Context, note_refused: Callable[[StandIn], None]) -> None:
-        self._context, self._note_refused = context, note_refused
+        self._context = context
+        self._note_refused = note_refused
 
     async def refuses(self, uri: str, target: HostPort) -> bool:
         """Whether a node outside, or a service there, refuses connections.
@@ -112,7 +113,8 @@ class Outside:
 
     def _leads_back(self, target: HostPort) -> bool:
         """Whether an address and port are inside, or the proxy's own."""
-        stand_ins, address = self._context.stand_ins, target.host
+        stand_ins = self._context.stand_ins
+        address = target.host
         inside = stand_ins.is_bidirectional and is_inside(
             address, self._context.addressing.networks
         )
@@ -143,7 +145,8 @@ class OutsideNode:
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node, which is asked for its port again if the known one refuses."""
-        outside, stand_in = self._outside, self._stand_in
+        outside = self._outside
+        stand_in = self._stand_in
         is_service = parse_service_uri(stand_in.uri) is not None
         if stand_in.is_uri_kept or (is_service and kind == "service"):
             return await outside.connect(stand_in, stand_in.target.port)

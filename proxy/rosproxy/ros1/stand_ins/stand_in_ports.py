@@ -68,8 +68,12 @@ class StandInPorts:
         access: AccessChecks,
         plane: KernelPlane,
     ) -> None:
-        self._context, self._callers, self._stand_ins = context, callers, context.stand_ins
-        self._tcpros, self._access, self._plane = tcpros, access, plane
+        self._context = context
+        self._callers = callers
+        self._stand_ins = context.stand_ins
+        self._tcpros = tcpros
+        self._access = access
+        self._plane = plane
         self._acceptors: dict[HostPort, Acceptor] = {}
         self._refused: dict[str, None] = {}
         """URIs of nodes that refused when they were last tried, the oldest first; not too many."""
@@ -144,7 +148,8 @@ class StandInPorts:
 
     def status(self) -> list[dict[str, Any]]:
         """The ports with their nodes and open connections, for ``/status``."""
-        counts, ports = self._connections(), []
+        counts = self._connections()
+        ports = []
         sent: defaultdict[int, float] = defaultdict(float)
         received: defaultdict[int, float] = defaultdict(float)
         for relay in self._tcpros.relays:
@@ -204,7 +209,8 @@ class StandInPorts:
         self._pending_topics.add(topic)
         async with self._query_lock:
             if topic in self._pending_topics:  # nobody has asked since
-                topics, self._pending_topics = self._pending_topics, set()
+                topics = self._pending_topics
+                self._pending_topics = set()
                 self._publishers = await self._ask_publishers(topics)
             return self._publishers.get(topic, set())
 
@@ -269,7 +275,8 @@ class StandInPorts:
             sock = sockets.listen(local.host, local.port)
         except OSError as error:
             return f"can't be opened here ({error.strerror})"
-        serve, gate = partial(self._serve, stand_in), self._context.gate
+        serve = partial(self._serve, stand_in)
+        gate = self._context.gate
         self._acceptors[local] = Acceptor(self._context.tasks, sock, serve, gate)
         self._stand_ins.add(stand_in)
         self._open_fast_port(stand_in)
@@ -291,7 +298,8 @@ class StandInPorts:
         except OSError as error:
             log.debug("%s can't be opened: %s", candidate, error)
             return
-        serve, gate = partial(self._serve, stand_in), self._context.gate
+        serve = partial(self._serve, stand_in)
+        gate = self._context.gate
         self._acceptors[candidate] = Acceptor(self._context.tasks, sock, serve, gate)
         self._stand_ins.note_fast_port(stand_in, candidate.port)
 
@@ -303,7 +311,8 @@ class StandInPorts:
 
     async def _topic_listener(self, stand_in: StandIn, tcpros_port: int) -> HostPort:
         """The proxy's port for a node's topics: the fast port if the kernel forwards that to it."""
-        syncer, fast_port = self._plane.syncer, stand_in.fast_port
+        syncer = self._plane.syncer
+        fast_port = stand_in.fast_port
         if fast_port is None:
             return stand_in.local
         try:
@@ -386,7 +395,8 @@ class StandInPorts:
             return slave_api.with_address_in_reply(
                 parsed, reply, stand_in.target.host.lower(), address
             )
-        listener, tcpros_port = stand_in.local, slave_api.topic_port(parsed, reply)
+        listener = stand_in.local
+        tcpros_port = slave_api.topic_port(parsed, reply)
         if tcpros_port is not None:
             stand_in.note_topic_port(parsed.string(1) or "", tcpros_port)
             listener = await self._topic_listener(stand_in, tcpros_port)

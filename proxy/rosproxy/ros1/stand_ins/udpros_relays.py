@@ -84,7 +84,9 @@ class UdprosRelays:
     """Opens relays for the offers that pass, and ends them."""
 
     def __init__(self, context: Context, access: AccessChecks, outside: Outside) -> None:
-        self._context, self._access, self._outside = context, access, outside
+        self._context = context
+        self._access = access
+        self._outside = outside
         self._open: dict[UdprosSubscription, tuple[DatagramRelay, _RelayCondition]] = {}
 
     def __iter__(self) -> Iterator[tuple[UdprosSubscription, DatagramRelay]]:
@@ -104,7 +106,8 @@ class UdprosRelays:
     ) -> bytes:
         """The call of a subscriber, for a node inside: its offers lead to ports of the proxy."""
         proxy = self._context.caller_at(endpoint).proxy
-        topic, caller_id = call.string(1) or "", call.string(0) or ""
+        topic = call.string(1) or ""
+        caller_id = call.string(0) or ""
 
         def is_registered() -> bool:
             is_current = self._context.registry.by_port.get(endpoint.port) is endpoint
@@ -120,7 +123,8 @@ class UdprosRelays:
             target = await self._reachable(offered, source)
             if target is None:
                 return None
-            port, sources = endpoint.port, [endpoint.location.address]
+            port = endpoint.port
+            sources = [endpoint.location.address]
             subscription = UdprosSubscription(port, topic, caller_id, source, target, False)
             relay_port = self._relay_port(
                 subscription, condition, proxy, _candidates(subscription, PORTS), sources
@@ -131,8 +135,10 @@ class UdprosRelays:
 
     async def lead_inwards(self, stand_in: StandIn, call: Call, body: bytes, source: str) -> bytes:
         """The call of a subscriber inside, for a node outside: its offers lead to the proxy."""
-        topic, caller_id = call.string(1) or "", call.string(0) or ""
-        settings, registry = self._context.settings, self._context.registry
+        topic = call.string(1) or ""
+        caller_id = call.string(0) or ""
+        settings = self._context.settings
+        registry = self._context.registry
 
         def is_registered() -> bool:
             endpoint = registry.by_caller.get(caller_id)
@@ -148,7 +154,8 @@ class UdprosRelays:
         async def redirect(offered: HostPort) -> HostPort | None:
             # To the address that asks, whatever host the offer names: nobody has datagrams sent to
             # another machine inside.
-            target, port = HostPort(source, offered.port), stand_in.local.port
+            target = HostPort(source, offered.port)
+            port = stand_in.local.port
             subscription = UdprosSubscription(port, topic, caller_id, source, target, True)
             publisher = self._context.upstream.reach(stand_in.target).host
             sources = await resolve(publisher, NODES)
@@ -243,7 +250,8 @@ def _candidates(subscription: UdprosSubscription, ports: range) -> list[int]:
     seed = blake2b(
         f"{subscription.port} {subscription.topic} {subscription.caller_id}".encode(), digest_size=8
     ).digest()
-    first, count = int.from_bytes(seed, "big"), len(ports)
+    first = int.from_bytes(seed, "big")
+    count = len(ports)
     return [ports[(first + number) % count] for number in range(min(TRIES, count))]
 
 
@@ -254,7 +262,8 @@ async def _rewritten(
     redirect: Callable[[HostPort], Awaitable[HostPort | None]],
 ) -> bytes:
     """A call with each of its offers redirected, or taken out if there may or can be no relay."""
-    topic, edits = call.string(1) or "", list[Edit]()
+    topic = call.string(1) or ""
+    edits = list[Edit]()
     for offer in read_offers(call):
         target = None
         if offer.receiver and offer.topic == topic and condition.holds():

@@ -190,7 +190,8 @@ class Adopter:
             return None
         endpoint.hold()
         await self._leases.cleared(endpoint)
-        now, known_pid = self._context.now(), endpoint.health.pid
+        now = self._context.now()
+        known_pid = endpoint.health.pid
         endpoint.mark_alive(info.pid, info.topic_ports, now)
         # The endpoint was that of another process: the prober takes back what that one left.
         if known_pid not in (None, info.pid):

@@ -91,7 +91,8 @@ class ContainerEvents:
         self.context.retired = True  # before the wait: nobody registers meanwhile
         async with self._lock:
             await self.recovery.ensure()
-            end, registry = self.context.now() + RETIRE_TIMEOUT, self.context.registry
+            end = self.context.now() + RETIRE_TIMEOUT
+            registry = self.context.registry
             while any(e.pending for e in registry) and self.context.now() < end:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
             endpoints = list(registry)
@@ -133,7 +134,8 @@ class ContainerEvents:
 
     async def _move(self, moved: Mapping[str, str]) -> int:
         """Take in that containers have other addresses now; how many nodes that concerns."""
-        registry, addressing = self.context.registry, self.context.addressing
+        registry = self.context.registry
+        addressing = self.context.addressing
         candidates = liveness.movable(registry, moved, addressing.networks)
         answers = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
         infos = {e: info for e, info in zip(candidates, answers, strict=True) if info}
@@ -172,7 +174,8 @@ class ContainerEvents:
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
         self.leases.open(endpoint)
-        address, fields = endpoint.location.address, endpoint.log_fields
+        address = endpoint.location.address
+        fields = endpoint.log_fields
         log.info("%s is at %s now", endpoint.label, address, extra=fields)
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:

@@ -25,7 +25,8 @@ class LeaseMemory:
     """Reads and writes the parameter of this proxy."""
 
     def __init__(self, context: Context) -> None:
-        self._context, self._lock = context, asyncio.Lock()
+        self._context = context
+        self._lock = asyncio.Lock()
         settings = context.settings
         self.parameter = remembered_leases.parameter_of(settings.advertise_host, settings.ports)
         self._written_changes = -1
@@ -57,7 +58,8 @@ class LeaseMemory:
         async with self._lock:
             stored = await self._read()
             if stored != self._stored:
-                self._stored, self._written_changes = stored, -1
+                self._stored = stored
+                self._written_changes = -1
         await self.write()
 
     async def _read(self) -> object:
@@ -69,7 +71,8 @@ class LeaseMemory:
     async def _write(self, text: str) -> None:
         if text == self._stored:
             return
-        upstream, problems = self._context.upstream, self._context.problems
+        upstream = self._context.upstream
+        problems = self._context.problems
         try:
             if text:
                 await upstream.call_master("setParam", self.parameter, text)

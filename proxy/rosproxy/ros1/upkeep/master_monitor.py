@@ -39,7 +39,9 @@ class MasterMonitor:
     def __init__(
         self, context: Context, recovery: Recovery, registrar: Registrar, memory: LeaseMemory
     ) -> None:
-        self._context, self._recovery, self._registrar = context, recovery, registrar
+        self._context = context
+        self._recovery = recovery
+        self._registrar = registrar
         self._memory = memory
         self._looks = 0
         self.up: bool | None = None
@@ -93,7 +95,8 @@ class MasterMonitor:
             else:
                 log.warning("%s; waiting for it", error)
                 self._context.problems.add("master", error)
-        self.up, self.error = up, error
+        self.up = up
+        self.error = error
 
 
 def _port_hint(error: Exception) -> str:

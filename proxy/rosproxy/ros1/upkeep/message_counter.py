@@ -83,7 +83,8 @@ class MessageCounter:
         return answer.ask_at if answer else 0.0
 
     async def _ask(self, endpoint: Endpoint) -> None:
-        former, slave = self._answers.get(endpoint, _Answer(0.0)), endpoint.slave
+        former = self._answers.get(endpoint, _Answer(0.0))
+        slave = endpoint.slave
         within = self._context.settings.probe_timeout
         try:
             async with self._limit:

@@ -63,7 +63,8 @@ class PolicyEnforcer:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._lock:
             # Before anything is awaited: what changes meanwhile is left for the next look.
-            version, self._must_enforce = self._context.policy.version, False
+            version = self._context.policy.version
+            self._must_enforce = False
             cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
             try:
                 await self._recovery.ensure()

@@ -63,7 +63,8 @@ class Prober:
         context = self._context
         if context.retired:
             return
-        now, interval = context.now(), context.settings.probe_interval
+        now = context.now()
+        interval = context.settings.probe_interval
         for endpoint, result in self.kept_connections.collect(now).items():
             self._note_result(endpoint, result, now)
         busy = self._probing | self._recovery.verifying
@@ -107,7 +108,8 @@ class Prober:
 
     async def _look_after(self, endpoint: Endpoint, answer: ProbeAnswer | None) -> None:
         """Act on how a node has answered, or answers when it is called."""
-        slave, health = endpoint.slave, endpoint.health
+        slave = endpoint.slave
+        health = endpoint.health
         answer = answer or await self._context.nodes.probe(slave)
         if endpoint.slave != slave:
             return  # it has moved meanwhile

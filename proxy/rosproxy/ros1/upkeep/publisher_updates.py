@@ -35,7 +35,8 @@ class PublisherUpdates:
     """Hands subscribers their publishers."""
 
     def __init__(self, context: Context, stand_ins: StandInPorts) -> None:
-        self._context, self._stand_ins = context, stand_ins
+        self._context = context
+        self._stand_ins = stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._topics_underway: set[str] = set()
         self._changed_topics: dict[str, bool] = {}
@@ -55,7 +56,8 @@ class PublisherUpdates:
         self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
     ) -> bool:
         """The same for an endpoint's node: with the hidden publishers, by URIs that it can use."""
-        caller, addressing = self._context.caller_at(endpoint), self._context.addressing
+        caller = self._context.caller_at(endpoint)
+        addressing = self._context.addressing
         await self._stand_ins.listen_for(publishers, caller)
         uris = policing.publishers_for(endpoint, topic, publishers, addressing)
         imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)

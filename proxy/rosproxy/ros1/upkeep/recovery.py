@@ -71,10 +71,14 @@ class Recovery:
         access: AccessChecks,
         memory: LeaseMemory,
     ) -> None:
-        self._context, self._leases, self._plane = context, leases, plane
-        self._verifier, self._memory = Verifier(context.nodes), memory
+        self._context = context
+        self._leases = leases
+        self._plane = plane
+        self._verifier = Verifier(context.nodes)
+        self._memory = memory
         self._access = access
-        self._registrar, self._resubscriber = registrar, resubscriber
+        self._registrar = registrar
+        self._resubscriber = resubscriber
         self.verifying: set[Endpoint] = set()
         self._inspecting: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
@@ -122,7 +126,8 @@ class Recovery:
         # So nodes that came up during the announcement before are announced together.
         self._unannounced.append(endpoint)
         async with self._announcing:
-            endpoints, self._unannounced = self._unannounced, []
+            endpoints = self._unannounced
+            self._unannounced = []
             if endpoints:
                 await self._resubscriber.announce(endpoints)
 
@@ -131,7 +136,8 @@ class Recovery:
 
         Those that were inspected all that time and are silent count as failing from then on.
         """
-        end, awaited = self._context.now() + CLAIM_GRACE, set(self.verifying)
+        end = self._context.now() + CLAIM_GRACE
+        awaited = set(self.verifying)
         inspected = set(self._inspecting)
         while awaited & self.verifying and self._context.now() < end:
             if (
@@ -241,7 +247,8 @@ class Recovery:
         """
         if self._context.client_kind(claim.slave.host) is ClientKind.OUTSIDE:
             return False
-        registrations, ports = claim.registrations, claim.service_ports
+        registrations = claim.registrations
+        ports = claim.service_ports
         info, borne_out = await self._verifier.ask(claim.slave, registrations, ports)
         return False if info is None else borne_out
 

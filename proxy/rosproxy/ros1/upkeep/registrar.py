@@ -41,7 +41,9 @@ class Registrar:
     def __init__(
         self, context: Context, publisher_updates: PublisherUpdates, memory: LeaseMemory
     ) -> None:
-        self._context, self._publisher_updates, self._memory = context, publisher_updates, memory
+        self._context = context
+        self._publisher_updates = publisher_updates
+        self._memory = memory
         self._complete_state: tuple[bytes, int, frozenset[int]] = b"", -1, frozenset()
         """The master's state, our own and the ports of nodes that answered, when nothing of theirs
         was missing."""
@@ -105,7 +107,8 @@ class Registrar:
 
         While the master's state and ours are as they were when nothing was missing, nothing is.
         """
-        registry, started = self._context.registry, self._context.now()
+        registry = self._context.registry
+        started = self._context.now()
         alive = [e for e in registry if e.answers and not e.health.cleaned]
         our_state = registry.changes, frozenset(e.port for e in alive)
         last_digest = self._complete_state[0] if self._complete_state[1:] == our_state else b""
@@ -125,7 +128,8 @@ class Registrar:
 
     async def clean_up(self, endpoint: Endpoint) -> None:
         """Unregister a node that is gone at the master. Raises Unreachable."""
-        started, registrations = self._context.now(), list(endpoint.registrations.values())
+        started = self._context.now()
+        registrations = list(endpoint.registrations.values())
         await self._unregister(endpoint, registrations)
         endpoint.health.note_cleaned(started)
         self._context.metrics.cleanups.inc()
@@ -141,7 +145,8 @@ class Registrar:
 
         Names that have another URI by now are left alone. Raises Unreachable.
         """
-        addressing, upstream = self._context.addressing, self._context.upstream
+        addressing = self._context.addressing
+        upstream = self._context.upstream
         uris = await upstream.look_up("lookupNode", {r.caller_id for r in registrations})
         slave = parse_slave_uri(uri)
         if slave is None:
@@ -212,7 +217,8 @@ class Registrar:
 
         Raises Unreachable, MasterError.
         """
-        to_hide, to_show = list[EndpointRegistration](), list[EndpointRegistration]()
+        to_hide = list[EndpointRegistration]()
+        to_show = list[EndpointRegistration]()
         for count, (endpoint, registration) in enumerate(self._context.registry.registrations(), 1):
             if self._verdict(endpoint, registration).allowed == registration.hidden:
                 (to_show if registration.hidden else to_hide).append((endpoint, registration))
@@ -224,7 +230,9 @@ class Registrar:
         return len(to_hide), len(alive)
 
     def _verdict(self, endpoint: Endpoint, registration: Registration) -> Verdict:
-        policy, kind, address = self._context.policy, KINDS[registration.kind], endpoint.address
+        policy = self._context.policy
+        kind = KINDS[registration.kind]
+        address = endpoint.address
         verdict = policy.judge(kind, registration.name, [registration.caller_id], address)
         if registration.kind is Kind.PARAM and verdict.allowed:
             return policy.judge_below(
@@ -281,7 +289,8 @@ class Registrar:
         """
         if self._context.retired:
             return
-        addressing, current = self._context.addressing, decisions.to_register(registrations)
+        addressing = self._context.addressing
+        current = decisions.to_register(registrations)
         allowed = {(e, r): self._verdict(e, r).allowed for e, r in current}
         await self._conceal([pair for pair, is_allowed in allowed.items() if not is_allowed])
         permitted = [pair for pair, is_allowed in allowed.items() if is_allowed]
@@ -326,7 +335,8 @@ class Registrar:
         The master has nodes that moved by former advertised URIs: the registry knows what is
         theirs. Those that registered around the proxy it has by their own: it alone knows that.
         """
-        registry, addressing = self._context.registry, self._context.addressing
+        registry = self._context.registry
+        addressing = self._context.addressing
         calls: list[decisions.MethodCall] = []
         direct: dict[str, tuple[Endpoint, str]] = {}
         for name, (endpoint, uri) in former.items():
@@ -357,7 +367,8 @@ class Registrar:
         """
         if not former:
             return [], {}
-        upstream, uris = self._context.upstream, {name: uri for name, (_, uri) in former.items()}
+        upstream = self._context.upstream
+        uris = {name: uri for name, (_, uri) in former.items()}
         state = await upstream.read_registrations()
         registrations = [r for name in uris for r in state.get(name, [])]
         provided = {r.name for r in registrations if r.kind is Kind.SERVICE}

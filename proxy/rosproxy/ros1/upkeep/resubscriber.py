@@ -65,12 +65,12 @@ class Resubscriber:
         plane: KernelPlane,
         stand_ins: StandInPorts,
     ) -> None:
-        self._context, self._registrar, self._publisher_updates = (
-            context,
-            registrar,
-            publisher_updates,
-        )
-        self._tcpros, self._plane, self._stand_ins = tcpros, plane, stand_ins
+        self._context = context
+        self._registrar = registrar
+        self._publisher_updates = publisher_updates
+        self._tcpros = tcpros
+        self._plane = plane
+        self._stand_ins = stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._look_times: dict[Endpoint, list[float]] = {}
 
@@ -116,7 +116,8 @@ class Resubscriber:
 
     def _due(self) -> list[Endpoint]:
         """The endpoints that it is time to look at; each is named once per look."""
-        now, by_port = self._context.now(), self._context.registry.by_port
+        now = self._context.now()
+        by_port = self._context.registry.by_port
         current = {e: times for e, times in self._look_times.items() if by_port.get(e.port) is e}
         remaining = {e: [time for time in times if time > now] for e, times in current.items()}
         self._look_times = {e: times for e, times in remaining.items() if times}
@@ -176,7 +177,8 @@ class Resubscriber:
         """What the publishers themselves say of their connections."""
 
         async def read(endpoint: Endpoint) -> list[BusRow]:
-            upstream, timeout = self._context.upstream, self._context.settings.probe_timeout
+            upstream = self._context.upstream
+            timeout = self._context.settings.probe_timeout
             async with self._limit:
                 try:
                     rows = await upstream.call_node(endpoint.slave, timeout, "getBusInfo")
@@ -210,7 +212,8 @@ class Resubscriber:
 
         Nothing where these are reached without the proxy.
         """
-        both, publishers = self._context.stand_ins.is_bidirectional, graph.by_topic(Kind.PUBLISHER)
+        both = self._context.stand_ins.is_bidirectional
+        publishers = graph.by_topic(Kind.PUBLISHER)
         foreign = self._context.addressing.stand_in_target
         return [
             (endpoint, r, list(filter(foreign, publishers.get(r.name, ()))))

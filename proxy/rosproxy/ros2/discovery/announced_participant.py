@@ -64,13 +64,12 @@ def note_endpoints(
 ) -> None:
     """Note the readers and writers that a participant announces. Raises RtpsError."""
     for announcement in announcements:
-        kind, entity = announcement.kind, announcement.endpoint(datagram)
+        kind = announcement.kind
+        entity = announcement.endpoint(datagram)
         if kind is None or entity is None:
             continue
-        topic, type_name = (
-            announcement.topic(datagram),
-            announcement.parameters.text(datagram, Pid.TYPE_NAME) or "",
-        )
+        topic = announcement.topic(datagram)
+        type_name = announcement.parameters.text(datagram, Pid.TYPE_NAME) or ""
         qos = read_qos(datagram, announcement.parameters, kind is EndpointKind.WRITER)
         # For the status alone, which needs no more: a topic of ROS 2 has 255 bytes at most.
         endpoint = DdsEndpoint(kind, topic[:256], type_name[:256], qos)

@@ -183,7 +183,8 @@ class Domain(DomainParticipants):
                 return [self._passed(lease, datagram, True)]
             if self.outside.is_strange(source):
                 return []
-            passed, back = [datagram], list[Outgoing]()
+            passed = [datagram]
+            back = list[Outgoing]()
             if is_for_data or may_be_discovery(datagram):  # Cyclone DDS has one locator for both
                 if self._is_too_much(datagram, source, now):
                     return []
@@ -195,7 +196,8 @@ class Domain(DomainParticipants):
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What inside sends to a port that stands for locators outside."""
-        users, sent = list(self.outside.stand_ins.get(port, ())), list[Outgoing]()
+        users = list(self.outside.stand_ins.get(port, ()))
+        sent = list[Outgoing]()
         if not self.is_read_at_stand_in(port, datagram, source):
             is_of_participant = source in self.inside.count_by_address
             return self._to_outside(users, datagram) if is_of_participant else []
@@ -268,7 +270,8 @@ class Domain(DomainParticipants):
             return self._drop("malformed", source, str(error))
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        prefix, spdp = message.prefix, message.of_participant
+        prefix = message.prefix
+        spdp = message.of_participant
         if source_vendor(message.datagram) == NO_VENDOR or self.own.is_own(prefix):
             return []  # a proxy's own participants are not passed on
         if self.proofs.note(source, message.datagram, now):
@@ -464,7 +467,8 @@ class Domain(DomainParticipants):
             for reader in readers:
                 self.rediscovery.note_met(insider, reader)
         reader = readers[0] if readers else users[0][0].prefix
-        count, exported = len(insider.leases), partial(self.inside.exported, insider, now=now)
+        count = len(insider.leases)
+        exported = partial(self.inside.exported, insider, now=now)
         passed, questions = self.fragments.rewritten(port, message, reader, exported)
         back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count, now)
         return back + [sent for d in passed for sent in self._to_outside(_meant(users, d), d)]

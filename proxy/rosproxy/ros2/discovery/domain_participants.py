@@ -72,7 +72,8 @@ class DomainParticipants:
         ``own`` is a random prefix, ``secret`` random bytes, ``when`` Unix time.
         """
         pool.claim(settings.discovery_port)  # where outside announces itself: nobody gets it
-        ports, refused = LocatorPorts(pool, now), Refused(settings.note)
+        ports = LocatorPorts(pool, now)
+        refused = Refused(settings.note)
         proofs = AddressProofs(secret)
         keeper = Keeper.of(
             settings.host, settings.ports.listen, settings.number, when - now, settings.keeper_key

@@ -10,7 +10,9 @@ from rosproxy.leases.ports import PortMap
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 
-PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST = 250, 7400, 7410
+PORTS_PER_DOMAIN = 250
+SPDP_MULTICAST = 7400
+SPDP_UNICAST = 7410
 """DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
 PARTICIPANTS_TRIED = 32
 """How many well-known ports of a peer are told of participants inside: each program has one. Where

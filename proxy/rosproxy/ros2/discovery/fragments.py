@@ -31,9 +31,11 @@ from rosproxy.ros2.protocol.rtps import (
 )
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 
-LONGEST, SHORTEST = 60_000, 128
+LONGEST = 60_000
+SHORTEST = 128
 """Bytes of an announcement, and of a fragment. Real ones have some thousand."""
-MOST_BYTES, MOST_OF_ALL = 1024 * 1024, 16 * 1024 * 1024
+MOST_BYTES = 1024 * 1024
+MOST_OF_ALL = 16 * 1024 * 1024
 """Bytes of a participant's announcements that are remembered, and as many of datagrams that wait;
 of more the oldest go. Then the bytes of all participants."""
 MOST_FRAGMENTS = 64
@@ -230,10 +232,8 @@ class FragmentStore:
         rewrite: Rewrite,
     ) -> bool:
         """Note the fragments of one submessage; whether the sample has become whole by them."""
-        gathered, payloads = (
-            self._gathered(port, sample, frags),
-            dict(_payloads(message.datagram, sample, frags)),
-        )
+        gathered = self._gathered(port, sample, frags)
+        payloads = dict(_payloads(message.datagram, sample, frags))
         if gathered.whole is not None:
             return False
         gathered.fragments.update(payloads)
@@ -288,7 +288,8 @@ def _key(port: int, sample: Sample) -> _Key:
 
 def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tuple[int, bytes]]:
     """The fragments in a DATA_FRAG, each with its number. Raises RtpsError."""
-    count, last = -(-frags.total // frags.size), frags.first + frags.count - 1
+    count = -(-frags.total // frags.size)
+    last = frags.first + frags.count - 1
     if sample.payload is None or not 0 < frags.first <= last <= count:
         raise RtpsError(f"fragments {frags.first} to {last} of {count}")
     offset = sample.payload.start

@@ -72,7 +72,9 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
 
         One that is on several networks itself is served at the first. Raises RtpsError.
         """
-        prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
+        prefix = message.prefix
+        datagram = message.datagram
+        spdp = message.of_participant
         participant = self.find(prefix, source)
         if spdp is None:
             return participant
@@ -185,7 +187,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         """
         if newcomer.is_in_group:
             return []
-        near, settings = newcomer.proxy_address, self.settings
+        near = newcomer.proxy_address
+        settings = self.settings
         ears = {HostPort(near, p) for p in (settings.unicast_port, settings.multicast_port)}
         announcement = for_all(message.datagram)
         return [

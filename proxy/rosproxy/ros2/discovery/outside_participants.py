@@ -87,7 +87,9 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         Raises RtpsError.
         """
         require_rewritable(message)
-        prefix, datagram, spdp = message.prefix, message.datagram, message.of_participant
+        prefix = message.prefix
+        datagram = message.datagram
+        spdp = message.of_participant
         participant = self.find(prefix, source)
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
             if participant is not None:
@@ -460,7 +462,8 @@ def _leads_elsewhere(
     Without one it is behind NAT, as it seems, and may be reached by those that it has. So it may be
     by those of the other family, in which it was not heard.
     """
-    heard, host = outsider.address, locator.host
+    heard = outsider.address
+    host = locator.host
     if only_heard and (":" in host) == (":" in heard) and host != heard:
         return True
     # These addresses mean the reader's own machine or link, unless all is on one machine.

@@ -193,7 +193,8 @@ class Keeper:
         # The keeper's prefix stands for the proxy, its range and its domain.
         content = self.prefix + prefix + self.number(ports).to_bytes(8, "big")
         digest = int.from_bytes(blake2b(content, key=self.key, digest_size=8).digest(), "big")
-        lower, upper = digest & _HASH_MASK, digest >> _HASH_BITS & _HASH_MASK
+        lower = digest & _HASH_MASK
+        upper = digest >> _HASH_BITS & _HASH_MASK
         # The number of ports in both halves: so both grow with each port.
         return ((count << _HASH_BITS | upper) << HALF_BITS | count << _HASH_BITS | lower) + 1
 
@@ -228,7 +229,8 @@ class Keeper:
 
     def _ports(self, number: int) -> Iterator[int]:
         """The ports that a number holds; none if it can't be one of `number`."""
-        bits, width = number - 1, _width(self.ports)
+        bits = number - 1
+        width = _width(self.ports)
         while bits > 0:
             port = self.ports.first + (bits & (1 << width) - 1) - 1
             if port not in self.ports:

@@ -74,7 +74,8 @@ def destinations(datagram: bytes) -> set[bytes]:
 
     Cyclone DDS puts into one message what goes to one address, whoever is there.
     """
-    prefixes, prefix = set[bytes](), bytes(PREFIX)
+    prefixes = set[bytes]()
+    prefix = bytes(PREFIX)
     for kind, _, body in submessages(datagram):
         if kind == INFO_DST:
             prefix = datagram[body.start : body.start + PREFIX]
@@ -129,5 +130,6 @@ def _names_built_in(datagram: bytes, kind: int, body: Span) -> bool:
     if offset is None:
         return True
     require_size(body, offset + 4)
-    reader, writer = datagram[body.start + offset - 1], datagram[body.start + offset + 3]
+    reader = datagram[body.start + offset - 1]
+    writer = datagram[body.start + offset + 3]
     return _BUILT_IN in (reader & _BUILT_IN, writer & _BUILT_IN)

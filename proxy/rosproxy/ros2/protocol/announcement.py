@@ -13,7 +13,8 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import NO_VENDOR, SENTINEL, VERSION, SubmessageId, message_header
 
-_SPDP_READER, _SPDP_WRITER = 0x000100C7, 0x000100C2
+_SPDP_READER = 0x000100C7
+_SPDP_WRITER = 0x000100C2
 _PARTICIPANT = bytes([0, 0, 1, 0xC1])
 SPDP_ENDPOINTS = 0x01 | 0x02
 READER_ENDPOINTS = SPDP_ENDPOINTS | 0x08 | 0x20

@@ -19,7 +19,8 @@ from rosproxy.ros2.protocol.rtps import (
     walk_parameters,
 )
 
-_BIG, _LITTLE = 0x0002, 0x0003
+_BIG = 0x0002
+_LITTLE = 0x0003
 """PL_CDR_BE and PL_CDR_LE, the encodings of a parameter list."""
 
 
@@ -127,7 +128,8 @@ class ParameterList(msgspec.Struct, frozen=True):
 
     def zeroed(self, parameter: Parameter) -> Overwrite:
         """The edit that leaves nothing of a parameter's value."""
-        start, end = parameter.value.start, parameter.value.end
+        start = parameter.value.start
+        end = parameter.value.end
         return Overwrite(start, bytes(end - start))
 
 

@@ -21,10 +21,12 @@ import msgspec
 
 from rosproxy.ros2.protocol.parameters import Parameter, ParameterList, Pid
 
-MOST_PARTITIONS, LONGEST_PARTITION = 4, 64
+MOST_PARTITIONS = 4
+LONGEST_PARTITION = 64
 """Partitions that are read, and the bytes of each; ROS 2 itself uses none."""
 MOST_REPRESENTATIONS = 3
-_RELIABLE, _EXCLUSIVE = 2, 1
+_RELIABLE = 2
+_EXCLUSIVE = 1
 
 
 class Durability(IntEnum):
@@ -96,7 +98,8 @@ def _unpacked(
     """Numbers at the start of a parameter; none if it is too short, or not there."""
     if parameter is None:
         return ()
-    start, size = parameter.value.start, struct.calcsize(f"={layout}")
+    start = parameter.value.start
+    size = struct.calcsize(f"={layout}")
     if parameter.value.end - start < size:
         return ()
     return struct.unpack_from(parameters.order + layout, datagram, start)
@@ -118,7 +121,8 @@ def _strings(
     datagram: bytes, parameters: ParameterList, parameter: Parameter, count: int
 ) -> Iterator[str]:
     """The strings of a sequence, up to a bad one: a length, so many bytes, padded to four."""
-    offset, end = parameter.value.start + 4, parameter.value.end
+    offset = parameter.value.start + 4
+    end = parameter.value.end
     for _ in range(count):
         if offset + 4 > end:
             return

@@ -28,7 +28,8 @@ from rosproxy.ros2.protocol.rtps import (
 
 MOST_ASKED = 256
 """Samples that may be asked for at once: the bits of a set (9.4.2.6)."""
-_LITTLE, _FINAL = 0x01, 0x02
+_LITTLE = 0x01
+_FINAL = 0x02
 _GAP_SIZE = 28
 """Bytes of a GAP with one number."""
 _TO_READER = 5
@@ -50,7 +51,8 @@ def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
             order = "<" if flags & _LITTLE else ">"
             numbers = struct.unpack_from(order + "iIiI", datagram, body.start + 8)
             writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
-            first, last = _number(*numbers[:2]), _number(*numbers[2:])
+            first = _number(*numbers[:2])
+            last = _number(*numbers[2:])
             if last > LAST_NUMBER:
                 raise RtpsError(f"a heartbeat up to the number {last}")
             yield Heartbeat(writer, first, last)
@@ -120,7 +122,8 @@ def withheld(sample: Sample) -> Overwrite:
     for that, which no announcement of a reader or writer is.
     """
     order, flag = ("<", _LITTLE) if sample.little else (">", 0)
-    size, next_sequence = sample.body.end - sample.body.start, sample.sequence + 1
+    size = sample.body.end - sample.body.start
+    next_sequence = sample.sequence + 1
     if size < _GAP_SIZE + 4:
         raise RtpsError(f"a sample of discovery in {size} bytes")
     # It may be 0: the length 0 of a PAD means none, not up to the end (9.4.5.1.3).

@@ -4,7 +4,9 @@ Topics are called ``rt/chatter`` in DDS; a service has two topics, ``rq/addReque
 ``rr/addReply``; an action has services and topics below ``_action``. Types have a namespace more.
 """
 
-_TOPIC, _REQUEST, _REPLY = "rt/", "rq/", "rr/"
+_TOPIC = "rt/"
+_REQUEST = "rq/"
+_REPLY = "rr/"
 _DDS_NAMESPACE = "::dds_::"
 
 

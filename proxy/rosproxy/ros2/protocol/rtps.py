@@ -23,8 +23,11 @@ from enum import IntEnum
 import msgspec
 
 MAGIC = b"RTPS"
-VERSION, NO_VENDOR, RTI = b"\x02\x03", b"\x00\x00", b"\x01\x01"
-FAST_DDS, CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"
+VERSION = b"\x02\x03"
+NO_VENDOR = b"\x00\x00"
+RTI = b"\x01\x01"
+FAST_DDS = b"\x01\x0f"
+CYCLONE_DDS = b"\x01\x10"
 HEADER = 20
 """Bytes of a message's header."""
 ALIGNMENT = 4
@@ -47,9 +50,14 @@ MOST_PARAMETERS = 512
 """Parameters of a list that are read, its end among them; real ones have less than a hundred."""
 MOST_INLINE_BYTES = 16 * 1024
 """Bytes of all inline QoS in a datagram. A sample of discovery has 24 to 36."""
-_LITTLE_HEADER, _BIG_HEADER = struct.Struct("<HH"), struct.Struct(">HH")
+_LITTLE_HEADER = struct.Struct("<HH")
+_BIG_HEADER = struct.Struct(">HH")
 
-_LITTLE, _QOS, _DATA, _KEY, _FRAGMENT_KEY = 0x01, 0x02, 0x04, 0x08, 0x04
+_LITTLE = 0x01
+_QOS = 0x02
+_DATA = 0x04
+_KEY = 0x08
+_FRAGMENT_KEY = 0x04
 _CHECKSUM = 0x60
 """Which checksum a HEADER_EXTENSION has, if any (DDSI-RTPS 2.5, 9.4.5.2)."""
 
@@ -75,12 +83,14 @@ class SubmessageId(IntEnum):
     DATA_FRAG = 0x16
 
 
-STATISTICS, RTI_CRC = 0x80, 0x80
+STATISTICS = 0x80
+RTI_CRC = 0x80
 """Submessages from 0x80 on have a meaning for each vendor. Of Fast DDS it is at the end of each
 message, where that went and how many bytes; of RTI Connext a checksum."""
 
 # Plain numbers: a member of an enumeration is slow to look up, and this is done for each datagram.
-_INFO_SRC, INFO_DST = SubmessageId.INFO_SRC.value, SubmessageId.INFO_DST.value
+_INFO_SRC = SubmessageId.INFO_SRC.value
+INFO_DST = SubmessageId.INFO_DST.value
 _DATA_FRAG = SubmessageId.DATA_FRAG.value
 _WITH_SAMPLE = frozenset({SubmessageId.DATA.value, _DATA_FRAG})
 _MAY_BE_EMPTY = frozenset({SubmessageId.PAD.value, SubmessageId.INFO_TS.value})
@@ -238,7 +248,9 @@ def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
     Raises RtpsError if a length leads outside, is none that all read alike, or an INFO_DST is too
     short: so what is kept of a message can be read again later.
     """
-    offset, count, size = HEADER, 0, len(datagram)
+    offset = HEADER
+    count = 0
+    size = len(datagram)
     while offset < size:
         body = offset + 4
         if body > size:
@@ -266,7 +278,8 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
     length leads outside or is none that all read alike, or there are too many.
     """
     unpack = (_LITTLE_HEADER if little else _BIG_HEADER).unpack_from
-    offset, last = span.start, span.end - 4
+    offset = span.start
+    last = span.end - 4
     for _ in range(MOST_PARAMETERS):
         if offset > last:
             raise RtpsError("a parameter list without an end")
@@ -287,9 +300,11 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
 def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment: bool) -> Sample:
     fixed_size = 32 if is_fragment else 20
     require_size(body, fixed_size)
-    start, little = body.start, bool(flags & _LITTLE)
+    start = body.start
+    little = bool(flags & _LITTLE)
     to_qos = _unpack("H", datagram, start + 2, flags)
-    high, low = _unpack("i", datagram, start + 12, flags), _unpack("I", datagram, start + 16, flags)
+    high = _unpack("i", datagram, start + 12, flags)
+    low = _unpack("I", datagram, start + 16, flags)
     sequence = (high << 32) + low
     if not 0 < sequence <= LAST_NUMBER:
         raise RtpsError(f"a sample with the number {sequence}")
@@ -299,7 +314,8 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
     qos = None
     if flags & _QOS:
         *_, (_, _, end) = walk_parameters(datagram, Span(offset, body.end), little)
-        qos, offset = Span(offset, end), end
+        qos = Span(offset, end)
+        offset = end
     key = bool(flags & (_FRAGMENT_KEY if is_fragment else _KEY))
     # DATA_FRAG has no flag for it: it always carries some (9.4.5.4).
     has_payload = is_fragment or bool(flags & (_DATA | _KEY))

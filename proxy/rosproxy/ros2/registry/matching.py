@@ -143,7 +143,8 @@ def _type(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 def _partition(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
     """Whether they have no partition in common; the default is the partition with an empty name."""
-    offered, requested = writer.qos.partitions, reader.qos.partitions
+    offered = writer.qos.partitions
+    requested = reader.qos.partitions
     if offered is None or requested is None:
         return None
     if any(_may_be_same_partition(*pair) for pair in product(offered or ("",), requested or ("",))):
@@ -168,7 +169,8 @@ def _reliability(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 
 def _durability(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
-    offered, requested = writer.qos.durability, reader.qos.durability
+    offered = writer.qos.durability
+    requested = reader.qos.durability
     return Mismatch("durability", offered.name, requested.name) if offered < requested else None
 
 
@@ -196,10 +198,8 @@ def _ownership(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
 
 def _representation(writer: DdsEndpoint, reader: DdsEndpoint) -> Mismatch | None:
     """Whether a reader does not take what a writer writes: its first kind (XTypes 1.3)."""
-    offered, requested = (
-        writer.qos.representations or (_XCDR,),
-        reader.qos.representations or (_XCDR,),
-    )
+    offered = writer.qos.representations or (_XCDR,)
+    requested = reader.qos.representations or (_XCDR,)
     if offered[0] in requested:
         return None
     names = [_REPRESENTATIONS.get(kind, str(kind)) for kind in (offered[0], *requested)]

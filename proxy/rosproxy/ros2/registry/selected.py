@@ -13,7 +13,9 @@ from rosproxy.ros2.protocol.rtps import source_prefix
 
 NEWS_TIMEOUT = 3.0
 """Seconds from the start that an operator has to tell the first time."""
-MOST_HELD, MOST_HELD_EACH, LONGEST_HELD = 256, 8, 8192
+MOST_HELD = 256
+MOST_HELD_EACH = 8
+LONGEST_HELD = 8192
 """Addresses of which announcements are held, participants at each, and bytes of each."""
 
 

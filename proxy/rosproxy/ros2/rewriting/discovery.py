@@ -277,7 +277,8 @@ def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[
 
 
 def _announcement(datagram: bytes, sample: Sample) -> Announcement:
-    parameters, inline = payload_parameters(datagram, sample), inline_parameters(datagram, sample)
+    parameters = payload_parameters(datagram, sample)
+    inline = inline_parameters(datagram, sample)
     ended = sample.is_key_only or _tells_an_end(datagram, inline)
     # An end may have no payload, but not one in which nobody has looked for whose it is.
     if parameters is None and (sample.payload or not ended):
@@ -299,7 +300,8 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
 def _require_own(datagram: bytes, sample: Sample, parameters: ParameterList | None) -> None:
     """Raise RtpsError if an announcement is about another participant than the one it is of."""
     for parameter in parameters.all(*_IDENTITIES) if parameters else ():
-        start, end = parameter.value.start, parameter.value.end
+        start = parameter.value.start
+        end = parameter.value.end
         if datagram[start : min(start + PREFIX, end)] != sample.prefix:
             raise RtpsError(_OF_ANOTHER)
 

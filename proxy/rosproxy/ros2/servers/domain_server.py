@@ -73,8 +73,11 @@ class DomainServer:
         changed: Callable[[], None],
         awaited: float = 0.0,
     ) -> None:
-        self._bind, self._now, self._is_inside = bind, now, is_inside
-        self._changed, self._told_changes = changed, 0
+        self._bind = bind
+        self._now = now
+        self._is_inside = is_inside
+        self._changed = changed
+        self._told_changes = 0
         pool = PortPool(settings.ports.listen)
         # A new prefix for each process: only to an observer that they don't know yet participants
         # announce themselves at once, and send what they had told the former one.
@@ -87,7 +90,8 @@ class DomainServer:
         self._stand_ins: dict[int, socket.socket] = {}
         self._synced_changes = 0
         self._groups = GroupEars(settings.multicast_port, self._read_group, self._stop_reading)
-        self._secret, self._heard = b"", asyncio.Event()
+        self._secret = b""
+        self._heard = asyncio.Event()
         self._reader = DiscoveryReader()
         self._next_part: asyncio.Handle | None = None
         self._admitting: dict[bytes, float] = {}
@@ -101,7 +105,8 @@ class DomainServer:
 
         Raises OSError if the group's port or the well-known one is taken.
         """
-        settings, domain = self.domain.settings, self.domain
+        settings = self.domain.settings
+        domain = self.domain
         self._groups.open(_families(self._bind))
         well_known = datagrams.bind(self._bind, settings.unicast_port)
         self._read(well_known, self._from_inside(domain.heard_inside), self._is_read_of_inside)
@@ -122,7 +127,8 @@ class DomainServer:
 
     async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
         """What a trial finds out; its event is set when a secret comes in at the discovery port."""
-        self._secret, self._heard = secret, asyncio.Event()
+        self._secret = secret
+        self._heard = asyncio.Event()
         return await trial(self._heard)
 
     def join(self, addresses: Iterable[str]) -> None:
@@ -193,7 +199,8 @@ class DomainServer:
         """Announce the observer, by multicast and to those that may not get that; keep ports."""
         for address in self._groups.joined:
             self._observe(address)
-        settings, inside = self.domain.settings, list(self.domain.inside.by_prefix.values())
+        settings = self.domain.settings
+        inside = list(self.domain.inside.by_prefix.values())
         self._send(
             Outgoing(
                 p.metatraffic,
@@ -264,7 +271,8 @@ class DomainServer:
 
         Docker's internal networks do not, where bridged packets are filtered (br_netfilter).
         """
-        settings, counts = self.domain.settings, self.domain.inside.count_by_address
+        settings = self.domain.settings
+        counts = self.domain.inside.count_by_address
         for address in addresses:
             announcement = self.domain.own.announced_inside(settings.proxy_address_for(address))
             count = counts.get(address, 0)
@@ -420,10 +428,12 @@ class DomainServer:
 
     def _sync_stand_ins(self) -> list[int]:
         """Open and close the ports for participants outside; those that can't be opened."""
-        outside, closed = self.domain.outside, list[int]()
+        outside = self.domain.outside
+        closed = list[int]()
         if outside.changes == self._synced_changes:
             return closed
-        self._synced_changes, wanted = outside.changes, outside.stand_ins
+        self._synced_changes = outside.changes
+        wanted = outside.stand_ins
         for port in self._stand_ins.keys() - wanted.keys():
             self._stop_reading(self._stand_ins.pop(port))
         for port in wanted.keys() - self._stand_ins.keys():

@@ -21,7 +21,9 @@ from rosproxy.forwarding.datagrams import RECEIVE_BUFFER
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import interface_index
 
-GROUP, GROUP_FAST_DDS6, GROUP_CYCLONE6 = "239.255.0.1", "ff1e::ffff:efff:1", "ff02::ffff:efff:1"
+GROUP = "239.255.0.1"
+GROUP_FAST_DDS6 = "ff1e::ffff:efff:1"
+GROUP_CYCLONE6 = "ff02::ffff:efff:1"
 """Where participants announce themselves (DDSI-RTPS 2.5, 9.6.2.4.1)."""
 _SHARED = {socket.AF_INET: (GROUP,), socket.AF_INET6: (GROUP_FAST_DDS6,)}
 _OF_LINK = {socket.AF_INET: (), socket.AF_INET6: (GROUP_CYCLONE6,)}
@@ -73,7 +75,9 @@ class GroupEars:
         begin: Callable[[socket.socket], None],
         end: Callable[[socket.socket], None],
     ) -> None:
-        self._port, self._begin, self._end = port, begin, end
+        self._port = port
+        self._begin = begin
+        self._end = end
         self._shared: dict[str, list[socket.socket]] = {}
         self._networks: dict[str, _Network] = {}
 
@@ -195,10 +199,12 @@ def join(sock: socket.socket, address: str) -> Membership | None:
     """
     packed = socket.inet_pton(sock.family, sock.getsockname()[0].partition("%")[0])
     if sock.family == socket.AF_INET6:
-        level, option = socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP
+        level = socket.IPPROTO_IPV6
+        option = socket.IPV6_JOIN_GROUP
         request = packed + interface_index(address).to_bytes(4, sys.byteorder)
     else:
-        level, option = socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP
+        level = socket.IPPROTO_IP
+        option = socket.IP_ADD_MEMBERSHIP
         request = packed + socket.inet_aton(address)
     try:
         sock.setsockopt(level, option, request)

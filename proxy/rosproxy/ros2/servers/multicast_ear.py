@@ -60,7 +60,8 @@ class Ear:
     """Carries announcements from `start` on, until it is closed; needs a running event loop."""
 
     def __init__(self, settings: EarSettings) -> None:
-        self._settings, self._loop = settings, asyncio.get_running_loop()
+        self._settings = settings
+        self._loop = asyncio.get_running_loop()
         self._proof = RelayProof(settings.secret, time.time)
         self._sockets: list[socket.socket] = []
         self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain

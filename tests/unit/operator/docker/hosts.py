@@ -106,7 +106,8 @@ class Hosts(Invariants):
 
     def attach(self, n: int, m: int) -> None:
         if boxes := self.strangers():
-            box, network = pick(boxes, n), pick(NETWORKS, m)
+            box = pick(boxes, n)
+            network = pick(NETWORKS, m)
             if network in self.engine.networks and network not in box.networks:
                 self.engine.join(box, network)
 

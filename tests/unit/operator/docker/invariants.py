@@ -95,7 +95,8 @@ class Invariants:
         for action in plan.actions:
             if not isinstance(action, CreateSandbox):
                 continue
-            key, ports = action.key, action.range
+            key = action.key
+            ports = action.range
             had = [own.range for _, own in self.own() if own.key == key]
             had += [self.served[key]] if key in self.served else []
             new = {port for port in ports.ports() if not any(port in old for old in had)}

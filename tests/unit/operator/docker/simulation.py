@@ -291,7 +291,9 @@ class Engine:
         return [box for box in self.boxes if box.name == name]
 
     def _create(self, action: Creation) -> None:
-        name, labels, uplink = action.name, own_labels(action), self.settings.uplink
+        name = action.name
+        labels = own_labels(action)
+        uplink = self.settings.uplink
         if self.named(name) or not self.image:
             raise Failed(f"can't create {name}")
         if isinstance(action, CreateSandbox):
@@ -346,7 +348,8 @@ class Engine:
             raise Failed("cannot join network of a non running container")
         assert home.own is None, "only users' containers are redirected"
         assert box.redirect is not None
-        box.state, box.exit_code = "exited", int(self.redirects_fail)
+        box.state = "exited"
+        box.exit_code = int(self.redirects_fail)
         box.namespace = home.namespace
         if self.redirects_fail:
             raise Failed("ended with 1")
@@ -391,7 +394,8 @@ class Controller:
     """The operator that plans, carries out and may be killed anywhere."""
 
     def __init__(self, engine: Engine, settings: PlanSettings) -> None:
-        self.engine, self.settings = engine, settings
+        self.engine = engine
+        self.settings = settings
         self.memory = DockerMemory()
         self.now = 1000.0
 

@@ -96,7 +96,8 @@ def wrapped(error: OSError) -> Exception:
     """As it comes out of requests over a UNIX socket."""
     inner = urllib3.exceptions.ProtocolError("Connection aborted.", error)
     outer = requests.ConnectionError(inner)
-    inner.__context__, outer.__context__ = error, inner
+    inner.__context__ = error
+    outer.__context__ = inner
     return outer
 
 

@@ -71,7 +71,8 @@ def observer() -> DockerObserver:
 
 async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
     look = await observer().look(5.0)
-    state, name = look.state, proxy_name(KEY)
+    state = look.state
+    name = proxy_name(KEY)
     assert [container.name for container in state.containers] == ["talker"]
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
     assert [(proxy.key, proxy.range) for proxy in state.proxies] == [(KEY, RANGE)]

@@ -306,7 +306,8 @@ def test_who_follows_the_advice_is_told_nothing_more(
     env: str, labels: dict[str, str], neighbours: dict[str, Any]
 ) -> None:
     settings = replace(SETTINGS, master_uri=KEY.master_uri)
-    others, more = neighbours["containers"], {"sandboxes": neighbours.get("sandboxes", [])}
+    others = neighbours["containers"]
+    more = {"sandboxes": neighbours.get("sandboxes", [])}
 
     def told(talker: Container) -> list[str]:
         seen = observed(talker, *others, **more)

@@ -65,7 +65,8 @@ from tests.unit.operator.docker.builders import (
 
 TWO = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
 KEY = Key("", HERE, 0)
-NEAR, EAR = "172.30.0.2", HostPort(UPLINK.gateway, RANGE.last)
+NEAR = "172.30.0.2"
+EAR = HostPort(UPLINK.gateway, RANGE.last)
 MADE = CreateEar(ear_name(KEY), KEY, RANGE, HERE, EAR, HostPort(NEAR, RANGE.first))
 BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
 PROXY = Create(proxy_name(KEY), KEY, RANGE, BOX.name, ear=EAR)

@@ -13,7 +13,8 @@ from rosproxy_operator.docker.planner.actions import Action, Connect, CreateNetw
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.plan import Group
 
-ONE, OTHER = Key("http://one:11311", "192.0.2.1"), Key("http://other:11311", "192.0.2.1")
+ONE = Key("http://one:11311", "192.0.2.1")
+OTHER = Key("http://other:11311", "192.0.2.1")
 UPLINK = Group(None, (CreateNetwork("0-rosproxy"),))
 
 
@@ -26,7 +27,8 @@ class Host:
         self.taken: list[tuple[str, int | None]] = []
         self.outcomes: list[str] = []
         self.finished = asyncio.Event()
-        self.tasks, self.time = Tasks(), 100.0
+        self.tasks = Tasks()
+        self.time = 100.0
         self.work = Executor(
             self.tasks,
             self.finished.set,

@@ -68,7 +68,8 @@ def test_towards_a_container_it_is_the_address_that_others_know(routes: dict[str
 
 
 def test_a_host_without_other_networks_is_known_by_its_gateway(routes: dict[str, str]) -> None:
-    routes["172.18.0.5"], routes["192.0.2.1"] = "172.18.0.1", "127.0.0.1"
+    routes["172.18.0.5"] = "172.18.0.1"
+    routes["192.0.2.1"] = "127.0.0.1"
     assert host.own_address_towards("172.18.0.5", ["172.18.0.1"]) == "172.18.0.1"
 
 

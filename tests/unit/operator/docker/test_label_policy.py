@@ -29,7 +29,8 @@ from tests.unit.operator.docker.builders import (
 
 RULES = parse_rules("deny publish /camera/*")
 COMMON = administrators_policy([parse_rules("deny slave shutdown")], "enforce")
-A, B = "172.18.0.5", "172.18.0.6"
+A = "172.18.0.5"
+B = "172.18.0.6"
 
 
 def layer(name: str, *addresses: str, rules: tuple[Rule, ...] = RULES) -> PolicyLayer:
@@ -138,7 +139,8 @@ def test_those_of_gone_containers_take_no_room_from_others() -> None:
 
 def test_the_same_look_is_the_same_policy() -> None:
     layers = [layer("b", B, A), layer("a", A), layer("a", B, rules=RULES * 2)]
-    first, second = ProxyNews(), ProxyNews()
+    first = ProxyNews()
+    second = ProxyNews()
     for news, order in ((first, layers), (second, layers[::-1])):
         seen = observed(**both())
         facts = replace(network_facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))

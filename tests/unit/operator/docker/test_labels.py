@@ -256,7 +256,8 @@ def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
 
 def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
     """Either alone leads to the next mistake: the other one then names no master, or the proxy."""
-    uri, settings = "http://192.0.2.7:11311", replace(SETTINGS, redirect=False)
+    uri = "http://192.0.2.7:11311"
+    settings = replace(SETTINGS, redirect=False)
     _, (problem,) = read(container(labels=ON, env=uri), settings)
     advice = f"set ROS_MASTER_URI=http://rosproxy:11311 and the label rosproxy.master-uri={uri}, or"
     assert advice in problem.text

@@ -8,7 +8,8 @@ from rosproxy_operator.docker.planner.labels.own_address import wrong_own_addres
 from rosproxy_operator.docker.planner.model import Key
 from tests.unit.operator.docker.builders import HERE, KEY, ROBOT, container, observed, read_members
 
-TOWARDS, FAR = "198.51.100.7", "203.0.113.9"
+TOWARDS = "198.51.100.7"
+FAR = "203.0.113.9"
 
 
 def wrong(key: Key = KEY, **variables: str) -> str:

@@ -50,7 +50,8 @@ from tests.unit.operator.docker.builders import (
     sandbox,
 )
 
-NAME, PORTS = proxy_name(KEY), sandbox_name(KEY)
+NAME = proxy_name(KEY)
+PORTS = sandbox_name(KEY)
 ALIASES = ("robot", "rosproxy", NAME)
 ARM = Key("http://arm:11311", HERE)
 ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master_uri}

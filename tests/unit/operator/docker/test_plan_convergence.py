@@ -69,7 +69,9 @@ def test_a_bad_object_does_not_change_what_is_done_for_others(
         host.run(number, number)
     for happen, n, m in events:
         happen(host, n, m)
-    seen, memory, now = host.engine.observe(), host.controller.memory, host.controller.now
+    seen = host.engine.observe()
+    memory = host.controller.memory
+    now = host.controller.now
     bad = replace(bad, labels={**bad.labels, "rosproxy.advertise-host": more + " "})
     with_bad = replace(seen, containers=(bad, *seen.containers))
     alone = planned(seen, SETTINGS, memory, now)

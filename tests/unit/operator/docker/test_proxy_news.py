@@ -126,7 +126,8 @@ def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
         assert news.body(nodes, 0.0) == addresses
 
 
-OLD, NEW = "172.18.0.5", "172.18.0.9"
+OLD = "172.18.0.5"
+NEW = "172.18.0.9"
 HERE, AWAY, THERE, NOBODY = (
     told(look(*containers))
     for containers in (
@@ -199,7 +200,8 @@ def test_container_that_changes_networks_takes_its_nodes_along() -> None:
 
 
 def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> None:
-    app, other = ("t", "app"), ("t", "other")
+    app = ("t", "app")
+    other = ("t", "other")
     both = NetworkFacts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
     after = replace(both, addresses={other: "172.19.0.9"})
 

@@ -29,7 +29,8 @@ from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, both, cont
 
 WHERE = HostPort("172.30.0.2", 11312)
 PREFIX = "01.0f.45.d1.3c.00.a7.12.00.00.00.00"
-FIRST, SECOND = ProxyAccess(WHERE, "token", "run 1"), ProxyAccess(WHERE, "token", "run 2")
+FIRST = ProxyAccess(WHERE, "token", "run 1")
+SECOND = ProxyAccess(WHERE, "token", "run 2")
 
 
 class Proxies(ProxyClient):
@@ -215,7 +216,8 @@ async def test_a_policy_is_told_before_who_may_use_it_and_only_when_it_has_chang
     proxies = Proxies()
     settings = replace(SETTINGS, policy=COMMON)
     sync = DockerProxySync(tasks, proxies, settings, lambda: None)
-    label, addresses = "label of container node0", ["172.18.0.5"]
+    label = "label of container node0"
+    addresses = ["172.18.0.5"]
     for policy, access, calls in (
         ("", FIRST, [["administrator"], addresses]),
         ("", FIRST, [addresses]),

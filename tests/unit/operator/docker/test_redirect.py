@@ -61,7 +61,8 @@ def node(name: str = "talker", env: str = MASTER, mode: str = "", **labels: str)
 def nodes_proxy(near: str = NEAR, proxy: str = "running", key: Key = KEY) -> dict[str, Any]:
     """The proxy of these nodes, with an address on their network."""
     pair = both(key=key)
-    (box,), (process,) = pair["sandboxes"], pair["proxies"]
+    (box,) = pair["sandboxes"]
+    (process,) = pair["proxies"]
     places = [replace(p, address=near if p.network == "app" else "") for p in
               box.container.attachments]  # fmt: skip
     box = Sandbox(key, replace(box.container, attachments=tuple(places)), box.range,

@@ -137,14 +137,16 @@ def test_which_container_an_event_is_about(event: dict[str, Any], container: str
 def test_the_signature_changes_with_each_connection() -> None:
     row: dict[str, Any] = captured.running()
     before = signature(row)
-    row["State"], row["Status"] = "paused", "Up 3 seconds (Paused)"
+    row["State"] = "paused"
+    row["Status"] = "Up 3 seconds (Paused)"
     assert signature(row) == before
     row["NetworkSettings"]["Networks"]["app"] = captured.end("another", "172.29.0.2")
     assert signature(row) != before
 
 
 def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
-    key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
+    key = Key("http://robot:11311", "192.0.2.10")
+    ports = PortRange(11400, 11401)
     box = Sandbox(key, Container("1", "box", "created"), ports, "")
     listening = frozenset({22, 11400, 11401})
     assert foreign_ports([box], [], listening) == {22}
@@ -152,7 +154,8 @@ def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
 
 
 def test_the_port_of_an_ear_is_no_strangers() -> None:
-    key, ports = Key("", "192.0.2.10", 0), PortRange(11400, 11431)
+    key = Key("", "192.0.2.10", 0)
+    ports = PortRange(11400, 11431)
     ear = EarContainer(key, Container("1", "ear", "running"), ports, "")
     assert foreign_ports([], [ear], frozenset({11400, 11431})) == {11400}
 

@@ -42,7 +42,8 @@ def test_after_whatever_happened_nothing_is_left(containers: int, events: list) 
     for happen, n, m in events:
         happen(host, n, m)
         host.check()  # which also notes who has which ports
-    host.engine.redirects_fail, host.engine.uninstalls = False, True
+    host.engine.redirects_fail = False
+    host.engine.uninstalls = True
     before = [(box.id, box.name, box.state, dict(box.networks)) for box in host.strangers()]
     networks = {n.id for n in host.engine.networks.values() if not n.made_by_operator}
 

@@ -111,7 +111,8 @@ class ApiServer:
             return web.json_response(_resources(request.path))
         namespace = ""
         if parts[0] == "namespaces":
-            namespace, parts = parts[1], parts[2:]
+            namespace = parts[1]
+            parts = parts[2:]
         kind, name, sub = (*parts, "", "")[:3]
         refusal = self.refusals.get((request.method, kind))
         if refusal:
@@ -183,7 +184,8 @@ class ApiServer:
             and _has_fields(query.get("fieldSelector", ""), obj)
         ]
         meta = {"resourceVersion": str(next(self._numbers))}
-        first, limit = int(query.get("continue") or 0), int(query.get("limit") or 10**6)
+        first = int(query.get("continue") or 0)
+        limit = int(query.get("limit") or 10**6)
         if len(items) > first + limit:
             meta["continue"] = str(first + limit)
         page = items[first : first + limit]
@@ -295,7 +297,8 @@ def _labelled(selector: str, labels: dict[str, str]) -> bool:
 
 
 def _parts(selector: str) -> list[str]:
-    depth, parts = 0, [""]
+    depth = 0
+    parts = [""]
     for letter in selector:
         depth += {"(": 1, ")": -1}.get(letter, 0)
         if letter == "," and not depth:

@@ -96,7 +96,8 @@ class Clusters(World):
         if self.nodes:
             self.pods += 1
             with contextlib.suppress(Refused):
-                node, protocol = pick(self.nodes, n), pick(("TCP", "UDP"), m // 14)
+                node = pick(self.nodes, n)
+                protocol = pick(("TCP", "UDP"), m // 14)
                 self.cluster.add_pod(f"pod-{self.pods}", node, {}, [FIRST + m % 14], protocol)
             self.cluster.schedule()
 
@@ -183,7 +184,8 @@ class Clusters(World):
     def reject(self, n: int, m: int) -> None:
         """The kubelet ends a proxy: its ports are taken, or it needs the room."""
         if pods := [pod for pod in self.own() if node_of(pod)]:
-            pod, reason = pick(pods, n), pick(("NodePorts", "Evicted", "NodePorts"), m)
+            pod = pick(pods, n)
+            reason = pick(("NodePorts", "Evicted", "NodePorts"), m)
             pod["status"] = {"phase": "Failed", "reason": reason, "message": "so it is"}
 
     def delete_service(self, n: int, m: int) -> None:

@@ -87,7 +87,8 @@ def proxy(
     **changes: Any,
 ) -> ProxyPod:
     """A proxy's pod, by default one that runs; ``changes`` are of its `Pod`."""
-    of, on = of or rosproxy(), on or node()
+    of = of or rosproxy()
+    on = on or node()
     body: dict[str, Any] = copy.deepcopy(
         dict(manifests.proxy_pod(site(of, on, ports, publish), settings))
     )

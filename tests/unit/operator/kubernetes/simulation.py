@@ -113,7 +113,8 @@ class Cluster:
     """
 
     def __init__(self, namespace: str = NAMESPACE) -> None:
-        self.namespace, self.state = namespace, State()
+        self.namespace = namespace
+        self.state = State()
         self.forbidden = False
         self.numbers = itertools.count(1)
         self.addresses: dict[str, str] = {}
@@ -269,7 +270,8 @@ class Cluster:
                 self._run(pod)
 
     def _run(self, pod: Object) -> None:
-        uid, container = meta(pod)["uid"], pod["spec"]["containers"][0]
+        uid = meta(pod)["uid"]
+        container = pod["spec"]["containers"][0]
         if uid not in self.addresses:
             network = self.state.nodes[node_of(pod)]["spec"]["podCIDRs"][0]
             self.addresses[uid] = network.replace(".0/24", f".{next(self.numbers)}")
@@ -374,7 +376,8 @@ class Controller:
     """A controller that looks, plans, carries out, and may be killed anywhere."""
 
     def __init__(self, cluster: Cluster, settings: ClusterSettings) -> None:
-        self.cluster, self.settings = cluster, settings
+        self.cluster = cluster
+        self.settings = settings
         self.state = ClusterState()
         self.failures: dict[Name, dict[Name, str]] = {}
         self.now = 1000.0
@@ -406,7 +409,8 @@ class Controller:
             self.cluster.apply(action)
         except Refused as error:
             assert isinstance(action, CreateProxy | CreateEar | CreateService | CreatePolicy)
-            name, state = name_of(dict(action.body)), self.cluster.state
+            name = name_of(dict(action.body))
+            state = self.cluster.state
             kinds = {
                 CreateProxy: state.pods, CreateEar: state.pods, CreateService: state.services,
             }  # fmt: skip
@@ -418,7 +422,9 @@ class Controller:
         return {}
 
     def lose_memory(self) -> None:
-        self.state, self.failures, self.old = ClusterState(), {}, None
+        self.state = ClusterState()
+        self.failures = {}
+        self.old = None
 
 
 SETTINGS = replace(ClusterSettings(), image="rosproxy:1", bounds=Bounds(images=("*",)))

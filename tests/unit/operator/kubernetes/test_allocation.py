@@ -40,12 +40,14 @@ ARM = {names.INJECT: "arm"}
 OURS = {names.INJECT: "robot"}
 
 
-A, B = pod("a", labels=ARM), pod("b", labels=OURS)
+A = pod("a", labels=ARM)
+B = pod("b", labels=OURS)
 
 
 def two(*more: Any, arm: Any = None, robot: Any = None) -> ClusterSnapshot:
     """Two RosProxies, with their Services, and other things."""
-    arm, robot = arm or rosproxy("arm"), robot or rosproxy()
+    arm = arm or rosproxy("arm")
+    robot = robot or rosproxy()
     return observed(arm, robot, service(arm), service(robot), *more)
 
 
@@ -304,7 +306,8 @@ def test_only_one_of_two_gets_the_masters_port() -> None:
 
 
 def test_who_has_the_masters_port_keeps_it() -> None:
-    arm, robot = publishing(11500, "arm"), publishing(11500)
+    arm = publishing(11500, "arm")
+    robot = publishing(11500)
     action = creation(look(two(A, B, proxy(robot, publish=11500), arm=arm, robot=robot)))
     assert action.of.name == "arm"
     assert host_ports(action) == list(NEXT.ports())

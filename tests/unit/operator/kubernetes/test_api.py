@@ -177,7 +177,8 @@ async def test_a_page_of_large_objects_is_asked_for_in_parts(
     server.put("pods", pod("q", **{f"a{number}": "x" * 60 for number in range(1000)}))
 
     def listed() -> set[str]:
-        found, token = set[str](), ""
+        found = set[str]()
+        token = ""
         while True:
             page = api.page("pods", "", token)
             found |= names(page.items)

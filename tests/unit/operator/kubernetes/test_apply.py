@@ -50,7 +50,8 @@ class Carried:
 
     def __init__(self, api: Api) -> None:
         self.counted: list[tuple[str, str]] = []
-        self.tasks, self.proxies = Tasks(), ProxyClient()
+        self.tasks = Tasks()
+        self.proxies = ProxyClient()
         self.applier = ClusterApplier(api, self.proxies, self.tasks, self.count, self.doubt)
         self.doubts = 0
 
@@ -154,7 +155,8 @@ async def test_a_lost_service_gets_its_address_or_another(
 
 async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Carried) -> None:
     server.put("rosproxies", rosproxy_obj(), NAMESPACE)
-    old, new = proxy_obj(), proxy_obj(node="node2")
+    old = proxy_obj()
+    new = proxy_obj(node="node2")
     for pod in (old, new):
         server.put("pods", pod, NAMESPACE)
     server.put("services", body("Service", "new"), NAMESPACE)
@@ -338,7 +340,8 @@ async def _retire(server: ApiServer, carry: Carried, ip: str) -> None:
 
     obj = proxy_obj(status={"phase": "Running", "podIP": ip})
     server.put("pods", obj, NAMESPACE)
-    proxy, seen = proxy_pod(obj), snapshot_of(server, KEY)
+    proxy = proxy_pod(obj)
+    seen = snapshot_of(server, KEY)
     assert proxy is not None
     action = DeleteProxy(OF, proxy.pod.id, proxy.pod.uid, "RosProxy deleted", retire=True)
     await carry.applier.carry_out([action, action], seen)

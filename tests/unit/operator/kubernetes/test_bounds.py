@@ -181,7 +181,8 @@ def test_what_it_had_stays_as_it_is() -> None:
 
 
 def test_ports_of_one_that_asks_for_too_much_are_still_his() -> None:
-    bad, good = rosproxy("arm", image="mine:1"), rosproxy(ports=2)
+    bad = rosproxy("arm", image="mine:1")
+    good = rosproxy(ports=2)
     plan = look(observed(bad, good, service(good), proxy(bad), pod()), settings=OWN)
     action = creation(plan)
     assert action.of == ROBOT

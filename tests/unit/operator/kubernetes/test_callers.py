@@ -19,7 +19,8 @@ def who(*things: Any) -> tuple[str, ...] | None:
 
 
 def test_selected_pods_on_its_node() -> None:
-    local, remote = pod("a", ip="10.244.1.5"), pod("b", on="two", ip="10.244.2.5")
+    local = pod("a", ip="10.244.1.5")
+    remote = pod("b", on="two", ip="10.244.2.5")
     assert who(rosproxy(), local, remote) == ("10.244.1.5",)
     assert who() == ()
 

@@ -102,7 +102,8 @@ async def test_a_real_handshake(host: str) -> None:
 
 
 async def test_another_ca_or_name_is_refused() -> None:
-    pair, other = certificates.make(NAMES, NOW), certificates.make(NAMES, NOW)
+    pair = certificates.make(NAMES, NOW)
+    other = certificates.make(NAMES, NOW)
     async with served(pair) as (port, _):
         with pytest.raises(ssl.SSLCertVerificationError):
             await in_thread(call, port, other.ca)
@@ -323,7 +324,8 @@ async def test_a_directory_is_read_again(tmp_path: Path) -> None:
     directory = CertificateDirectory(str(tmp_path))
     with pytest.raises(InvalidCertificate, match=r"--webhook-cert-dir: .*tls.crt: No such file"):
         directory.refresh()
-    pair, other = certificates.make(NAMES, NOW), certificates.make(NAMES, NOW)
+    pair = certificates.make(NAMES, NOW)
+    other = certificates.make(NAMES, NOW)
     write(tmp_path, pair)
     assert directory.refresh().certificate == pair.certificate
     write(tmp_path, other)
@@ -344,7 +346,8 @@ async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> 
 
 async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
     class Broken:
-        every, problems = 1.0, ()
+        every = 1.0
+        problems = ()
 
         def refresh(self) -> KeyPair:
             raise RuntimeError("oops")

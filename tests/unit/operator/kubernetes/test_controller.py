@@ -42,14 +42,16 @@ class Running:
     """A controller at work."""
 
     def __init__(self, api: Api) -> None:
-        self.metrics, self.term = ClusterMetrics(), 1
+        self.metrics = ClusterMetrics()
+        self.term = 1
         api.gate.open = lambda: bool(self.term)
         settings = KubernetesSettings(resync=60.0)
         self.controller = KubernetesController(settings, api, self.metrics, lambda: self.term)
         self.task = asyncio.create_task(self.controller.run())
 
     def looks(self, outcome: str = "ok") -> float:
-        name, labels = "rosproxy_operator_looks_total", {"outcome": outcome}
+        name = "rosproxy_operator_looks_total"
+        labels = {"outcome": outcome}
         return self.metrics.registry.get_sample_value(name, labels) or 0.0
 
 
@@ -114,7 +116,8 @@ async def test_what_happens_during_a_look_is_seen_by_the_next_one(
     put_all(server)
     server.drop("pods", "talker", NAMESPACE)
     await until(lambda: bool(server.all("services")) and running.looks() > 2)
-    store, real = running.controller._store, SandboxFailures.read
+    store = running.controller._store
+    real = SandboxFailures.read
 
     async def read(self: SandboxFailures, observed: ClusterSnapshot) -> set[str]:
         namespaces = await real(self, observed)
@@ -144,11 +147,13 @@ async def test_it_settles(server: ApiServer, running: Running) -> None:
     put_all(server)
     running.controller.wake()
     await until(lambda: bool(proxies(server)))
-    before, now = -1, await look()
+    before = -1
+    now = await look()
     for _ in range(20):
         if now == before:
             break
-        before, now = now, await look()
+        before = now
+        now = await look()
     assert [await look() for _ in range(3)] == [now] * 3
 
 

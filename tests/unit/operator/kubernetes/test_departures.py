@@ -16,7 +16,8 @@ from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Prox
 from tests.unit.operator.kubernetes.objects import look, node, observed, pod, proxy, rosproxy
 
 PROXY = "uid-proxy-robot-one"
-TALKER, LISTENER = "10.244.1.7", "10.244.1.8"
+TALKER = "10.244.1.7"
+LISTENER = "10.244.1.8"
 
 
 def seen(*things: Any, names: tuple[str, ...] = (TALKER,), **more: Any) -> ClusterSnapshot:

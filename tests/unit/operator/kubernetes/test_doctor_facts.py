@@ -161,14 +161,16 @@ OWN: Obj = {"source": {"component": NAME}}
 
 
 def found(events: list[Obj], rosproxy: Obj | None = None, ready: bool = False) -> list[str]:
-    proxy, of = proxy_obj(), rosproxy or rosproxy_obj()
+    proxy = proxy_obj()
+    of = rosproxy or rosproxy_obj()
     recent = recent_events(events, [of], [proxy], NOW)
     uids = {proxy["metadata"]["uid"]} if ready else set()
     return [f"{f.severity.name} {f.subject}: {f.text}" for f in event_findings(recent, uids)]
 
 
 def test_events_of_rosproxies_and_their_pods_the_newest_first() -> None:
-    proxy, stranger = proxy_obj(), pod_obj("stranger")
+    proxy = proxy_obj()
+    stranger = pod_obj("stranger")
     name = f"pod {NAMESPACE}/{proxy['metadata']['name']}"
     events = [
         event(proxy, "BackOff", "older", 300),
@@ -219,7 +221,8 @@ def test_whoever_made_it_its_time_is_found(more: Obj) -> None:
 
 async def test_of_pods_that_are_gone_nothing_is_told(server: ApiServer, api: Api) -> None:
     there, gone, other = (pod_obj(name) for name in ("there", "gone", "other"))
-    of, proxy = rosproxy_obj(), proxy_obj(status={"conditions": [{"type": "Ready"}]})
+    of = rosproxy_obj()
+    proxy = proxy_obj(status={"conditions": [{"type": "Ready"}]})
     server.put("pods", there, NAMESPACE)
     server.put("pods", {**other, "metadata": {**other["metadata"], "uid": "anew"}}, NAMESPACE)
     for obj in (there, gone, other, proxy):

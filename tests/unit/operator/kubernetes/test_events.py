@@ -127,7 +127,8 @@ def test_a_message_is_not_longer_than_the_api_server_takes():
 
 
 def test_what_is_done_is_told():
-    body, pod = proxy_obj(), Name("robots", "rosproxy-arm-node1-1")
+    body = proxy_obj()
+    pod = Name("robots", "rosproxy-arm-node1-1")
     actions: list[Action] = [
         CreateProxy(ARM, body),
         SetImage(ARM, pod, "u", "rosproxy:2"),

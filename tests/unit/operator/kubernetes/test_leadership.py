@@ -151,7 +151,9 @@ class Operator:
         self.candidate = after_resignation(self.candidate)
         if record := released_record(store.record, self.candidate.name):
             store.write(record)
-        self.candidate, self.step = Candidate(f"{self.candidate.name}'"), 0  # it is started again
+        # it is started again
+        self.candidate = Candidate(f"{self.candidate.name}'")
+        self.step = 0
 
 
 STEPS = st.lists(
@@ -174,7 +176,8 @@ def test_never_two_at_once(
 
     And somebody takes the Lease away.
     """
-    store, now = Store(LeaseRecord("0") if made else None), 0.0
+    store = Store(LeaseRecord("0") if made else None)
+    now = 0.0
     operators = [Operator(Candidate(name), own) for name, own in zip("abc", ahead, strict=True)]
     for index, passed, action in steps:
         now += passed
@@ -204,8 +207,10 @@ def leading(operators: list[Operator], now: float) -> list[str]:
 @pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "killed"])
 def test_another_one_takes_over(stopped: bool) -> None:
     """Of those that look each second, one leads a second after a stop, 12 after a kill."""
-    store, now = Store(LeaseRecord("0")), 0.0
-    first, second = Operator(Candidate("a"), 0.0), Operator(Candidate("b"), 50.0)
+    store = Store(LeaseRecord("0"))
+    now = 0.0
+    first = Operator(Candidate("a"), 0.0)
+    second = Operator(Candidate("b"), 50.0)
     for operator in (first, second):
         operator.round(store, now)
     assert leading([first, second], now) == ["a"]

@@ -103,7 +103,8 @@ def test_ports_for_datagrams_are_those_of_the_range() -> None:
 
 
 def test_it_can_do_nothing_that_it_need_not() -> None:
-    pod, box = spec(), container()
+    pod = spec()
+    box = container()
     assert pod["automountServiceAccountToken"] is False
     assert pod["enableServiceLinks"] is False
     assert pod["securityContext"]["runAsNonRoot"] is True
@@ -163,7 +164,8 @@ def test_what_spec_says_goes_into_the_pod() -> None:
         "host_aliases": ({"ip": "192.0.2.9", "hostnames": ["robot"]},),
         "resources": {"requests": {"cpu": "1"}},
     }
-    pod, box = spec(**more), container(**more)
+    pod = spec(**more)
+    box = container(**more)
     assert pod["imagePullSecrets"] == [{"name": "secret"}]
     assert pod["hostAliases"] == [{"ip": "192.0.2.9", "hostnames": ["robot"]}]
     assert (box["image"], box["imagePullPolicy"]) == ("rosproxy:7", "Never")

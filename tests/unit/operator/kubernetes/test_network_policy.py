@@ -93,7 +93,8 @@ def test_the_masters_port_is_for_selected_pods() -> None:
 
 
 def test_a_pod_selector_is_taken_over() -> None:
-    tier, x = ("tier", "In", frozenset({"b", "a"})), ("x", "Exists", frozenset[str]())
+    tier = ("tier", "In", frozenset({"b", "a"}))
+    x = ("x", "Exists", frozenset[str]())
     _, second, _ = rules(pod_selector=Selector({"app": "x"}, (tier, x)))
     assert second["from"] == [
         {
@@ -184,7 +185,8 @@ def test_a_role_that_lacks_the_right_is_told() -> None:
 def test_the_ports_that_stand_in_for_outside_are_for_selected_pods() -> None:
     """For UDP, too: there the proxy takes what UDPROS sends out."""
     everybody, pods, _ = rules(direction="both")
-    first, last = PORTS[0], PORTS[-1]
+    first = PORTS[0]
+    last = PORTS[-1]
     stand_ins = [
         {"protocol": protocol, "port": first, "endPort": last} for protocol in ("TCP", "UDP")
     ]

@@ -42,7 +42,8 @@ class Together:
     def __init__(self, shared: bool) -> None:
         nodes = ALIKE if shared else APART
         self.worlds = Clusters("ros", ALIKE), Clusters("arms", nodes)
-        self.state, self.now = ClusterState(), 1000.0
+        self.state = ClusterState()
+        self.now = 1000.0
 
     def observe(self) -> ClusterSnapshot:
         first, second = (world.observe() for world in self.worlds)
@@ -128,7 +129,8 @@ def test_planning_by_parts_is_planning_it_all(shared: bool, events: list) -> Non
         union = all_of(observed)
         both.state = partition_state(both.state, union)
         whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
-        pieces, state = [], ClusterState(begun=both.state.begun)
+        pieces = []
+        state = ClusterState(begun=both.state.begun)
         for partition in partitions(observed):
             before = partition_state(both.state, partition)
             part_plan = plan(

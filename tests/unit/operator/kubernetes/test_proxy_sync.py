@@ -38,7 +38,9 @@ class Told(ProxyClient):
         self.told: list[Any] = []
         self.callers: list[Any] = []
         self.deaf = False
-        self.former, self.version, self.listening = True, "1", 0
+        self.former = True
+        self.version = "1"
+        self.listening = 0
         self.changed = asyncio.Event()
         self.waited: list[tuple[str, float]] = []
         self.policies: list[Any] = []
@@ -97,7 +99,9 @@ class Told(ProxyClient):
 
 class Talk:
     def __init__(self) -> None:
-        self.proxies, self.tasks, self.changes = Told(), Tasks(), 0
+        self.proxies = Told()
+        self.tasks = Tasks()
+        self.changes = 0
         self.all = ClusterProxySync(self.tasks, self.proxies, self.changed)
 
     def changed(self, namespaces: Iterable[str]) -> None:
@@ -230,12 +234,14 @@ async def test_one_unanswered_question_is_no_silence(talk: Talk) -> None:
 
 
 async def test_news_are_repeated_until_they_are_heard(talk: Talk) -> None:
-    talk.proxies.says, talk.proxies.hears = UP, False
+    talk.proxies.says = UP
+    talk.proxies.hears = False
     talk.all.follow([proxy()])
     talk.all.report_gone({UID: ["10.0.0.2"], "nobody": ["10.0.0.3"]})
     await until(lambda: len(talk.proxies.told) > 2)
     talk.all.report_gone({UID: ["10.0.0.1"]})
-    talk.proxies.hears, changes = True, talk.changes
+    talk.proxies.hears = True
+    changes = talk.changes
     await until(lambda: talk.proxies.told[-1] == {"gone": ["10.0.0.1", "10.0.0.2"]})
     count = len(talk.proxies.told)
     await talk.asked()
@@ -291,7 +297,8 @@ async def test_it_is_told_who_may_call(talk: Talk) -> None:
 
 async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
     """And what a proxy does not understand keeps nothing else from it."""
-    talk.proxies.says, talk.proxies.deaf = UP, True
+    talk.proxies.says = UP
+    talk.proxies.deaf = True
     talk.all.follow([proxy()], KEY)
     talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     talk.all.report_gone({UID: ["10.0.0.1"]})
@@ -344,7 +351,8 @@ async def test_its_policy_is_told_anew_when_it_was_started_again(talk: Talk) -> 
 
 async def test_without_its_policy_nobody_is_let_in(talk: Talk) -> None:
     """And the operator can say why; what else it is told and asked goes on."""
-    talk.proxies.says, talk.proxies.refuses = UP, PolicyRefused("knows no policies")
+    talk.proxies.says = UP
+    talk.proxies.refuses = PolicyRefused("knows no policies")
     talk.all.follow([proxy()], KEY)
     talk.all.report_policies({UID: (LAYER,)})
     talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
@@ -389,11 +397,13 @@ async def listening(talk: Talk) -> None:
 
 
 async def test_one_that_tells_of_changes_is_not_asked(talk: Talk) -> None:
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
     asked = talk.proxies.asked
-    talk.proxies.says, talk.proxies.version = DOWN, "2"
+    talk.proxies.says = DOWN
+    talk.proxies.version = "2"
     talk.proxies.changed.set()
     await until(lambda: not talk.all.reports[UID].master_up)
     await listening(talk)
@@ -403,7 +413,8 @@ async def test_one_that_tells_of_changes_is_not_asked(talk: Talk) -> None:
 
 
 async def test_who_is_waited_for_can_be_told(talk: Talk) -> None:
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
     talk.all.report_policies({UID: (LAYER,)})
@@ -422,7 +433,8 @@ async def test_what_stays_there_is_not_told_over_and_over(
 ) -> None:
     """The operator looks again what has become of it after a while, not at once."""
     monkeypatch.setattr(proxy_sync, "EVERY", 3600.0)
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
     talk.all.report_gone({UID: ["10.0.0.1"]})
@@ -435,7 +447,8 @@ async def test_what_stays_there_is_not_told_over_and_over(
 
 @pytest.mark.parametrize("subject", ["policy", "callers"])
 async def test_what_is_not_confirmed_is_told_again(talk: Talk, subject: str) -> None:
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
     if subject == "policy":
@@ -451,20 +464,24 @@ async def test_what_is_not_confirmed_is_told_again(talk: Talk, subject: str) -> 
 
 
 async def test_another_process_is_told_anew(talk: Talk) -> None:
-    talk.proxies.former, talk.proxies.says = False, {**UP, "instance": "a"}
+    talk.proxies.former = False
+    talk.proxies.says = {**UP, "instance": "a"}
     talk.all.follow([proxy()], KEY)
     talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     await listening(talk)
-    talk.proxies.says, talk.proxies.version = {**UP, "instance": "b"}, "2"
+    talk.proxies.says = {**UP, "instance": "b"}
+    talk.proxies.version = "2"
     talk.proxies.changed.set()
     await until(lambda: len(talk.proxies.callers) == 2)
 
 
 async def test_one_that_falls_silent_is_asked_until_it_answers(talk: Talk) -> None:
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
-    talk.proxies.says, talk.proxies.version = None, "2"
+    talk.proxies.says = None
+    talk.proxies.version = "2"
     talk.proxies.changed.set()
     await until(lambda: not talk.all.reports[UID].answered)
     talk.proxies.says = UP
@@ -473,7 +490,8 @@ async def test_one_that_falls_silent_is_asked_until_it_answers(talk: Talk) -> No
 
 
 async def test_nobody_is_waited_for_who_is_not_there(talk: Talk) -> None:
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
     talk.all.follow([])
@@ -492,7 +510,8 @@ async def test_proxies_whose_masters_hang_keep_nobody_waiting(
         return {}
 
     monkeypatch.setattr(talk.proxies, "containers", containers)
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     (well, *sick) = [
         replace(proxy(), pod=replace(proxy().pod, uid=f"uid-{number}"))
         for number in range(proxy_sync.AT_ONCE + 2)
@@ -509,14 +528,17 @@ async def test_one_that_leads_no_more_tells_nothing_more(
     talk: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also if it lost the lead while it was telling something."""
-    leading, asked, hears = True, asyncio.Event(), asyncio.Event()
+    leading = True
+    asked = asyncio.Event()
+    hears = asyncio.Event()
 
     async def policy(*_: object) -> None:
         asked.set()
         await hears.wait()
 
     monkeypatch.setattr(talk.proxies, "policy", policy)
-    talk.proxies.former, talk.proxies.says = False, UP
+    talk.proxies.former = False
+    talk.proxies.says = UP
     talk.all = ClusterProxySync(talk.tasks, talk.proxies, talk.changed, lambda: leading)
     talk.all.follow([proxy()], KEY)
     await listening(talk)

@@ -355,7 +355,8 @@ async def test_what_only_an_event_tells(
             "lastTimestamp": stamp,
         }
         server.put("events", event, NAMESPACE)
-    snapshot, failures = await begun(server, seen), SandboxFailures(api)
+    snapshot = await begun(server, seen)
+    failures = SandboxFailures(api)
     assert await failures.read(snapshot) == {NAMESPACE}
     (proxy,) = failures.with_messages(snapshot).proxies
     assert proxy.stuck is PodFailure.PORTS

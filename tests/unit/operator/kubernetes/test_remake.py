@@ -89,7 +89,8 @@ def test_nobody_is_evicted_while_there_is_no_service() -> None:
 
 
 def test_one_goes_at_a_time() -> None:
-    a, b = of_set("a"), of_set("b")
+    a = of_set("a")
+    b = of_set("b")
     plan = look(cluster(b, a), now=100.0)
     assert evicted(plan) == ["a"]
     going = look(cluster(replace(a, deleting=True), b), plan.state, 110.0)
@@ -104,7 +105,8 @@ def test_one_goes_at_a_time() -> None:
 
 def test_a_webhook_that_does_not_work_costs_a_pod_a_minute() -> None:
     """And also where nothing is left between one pod and the next."""
-    state, gone = ClusterState(), list[float]()
+    state = ClusterState()
+    gone = list[float]()
     for second in range(3600):
         snapshot = cluster(of_set(f"pod-{second}")) if second % 2 else cluster()
         plan = look(snapshot, state, 100.0 + second)

@@ -31,7 +31,9 @@ def refusing(name: Name = PROXY, text: str = "violates PodSecurity baseline") ->
 
 def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
     seen = replace(scene(), failures=refusing())
-    plan, now, pauses = look(replace(seen, failures={})), 100.0, []
+    plan = look(replace(seen, failures={}))
+    now = 100.0
+    pauses = []
     assert kinds(plan) == [CreateProxy]
     for _ in range(8):
         seen = written(seen, look(seen, plan.state, now))
@@ -74,18 +76,22 @@ def test_what_was_deleted_and_is_still_listed_is_not_deleted_again_at_once() -> 
 def test_a_proxy_that_ends_is_made_anew_and_not_in_a_tight_loop() -> None:
     without = scene()
     evicted = scene(proxy(phase="Failed"))
-    memory, now, created = ClusterState(), 100.0, 0
+    memory = ClusterState()
+    now = 100.0
+    created = 0
     for _ in range(100):
         plan = look(without, memory, now)
         if any(isinstance(action, CreateProxy) for action in done(plan)):
             created += 1
             plan = look(evicted, plan.state, now)
-        memory, now = plan.state, now + 1.0
+        memory = plan.state
+        now = now + 1.0
     assert 5 <= created <= 12
 
 
 def test_a_proxy_that_was_well_is_made_anew_at_once_when_it_is_gone() -> None:
-    without, memory = scene(), ClusterState()
+    without = scene()
+    memory = ClusterState()
     for now in range(100, 200, 10):
         plan = look(without, memory, now)
         assert kinds(plan) == [CreateProxy]

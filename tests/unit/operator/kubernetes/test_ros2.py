@@ -160,7 +160,8 @@ def test_the_service_leads_to_the_well_known_port():
 
 
 def test_proxies_of_several_nodes_are_each_others_peers():
-    of, far = of2(Ros2Spec(peers=("robot",))), node("two", addresses={"InternalIP": "192.0.2.2"})
+    of = of2(Ros2Spec(peers=("robot",)))
+    far = node("two", addresses={"InternalIP": "192.0.2.2"})
     pods_and_proxies = (
         pod(),
         pod(name="b", on="two"),
@@ -176,7 +177,8 @@ def test_proxies_of_several_nodes_are_each_others_peers():
 
 def test_ports_of_udp_are_kept_clear_of_others():
     of = of2()
-    tcp, udp = pod(name="tcp", ports=()), pod(name="udp", labels={}, udp_ports=frozenset({11402}))
+    tcp = pod(name="tcp", ports=())
+    udp = pod(name="udp", labels={}, udp_ports=frozenset({11402}))
     tcp = replace(tcp, labels={}, host_ports=frozenset({11400}))
     action = creation(look(observed(of, service(of), pod(), tcp, udp)))
     assert some.ports_of(action) == "11403-11406"

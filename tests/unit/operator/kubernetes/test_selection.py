@@ -73,20 +73,23 @@ def test_pods_that_no_selector_takes(labels):
 
 
 def test_a_rosproxy_that_is_being_deleted_takes_no_pod():
-    gone, new = rosproxy("gone", deleting=True), rosproxy("new")
+    gone = rosproxy("gone", deleting=True)
+    new = rosproxy("new")
 
     assert select_rosproxy(pod(), [gone, new]) is new
 
 
 def test_of_two_the_label_decides():
-    arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
+    arm = rosproxy("arm", ALL)
+    leg = rosproxy("leg", ALL)
 
     assert select_rosproxy(pod(labels={INJECT: "leg"}), [arm, leg]) is leg
 
 
 @pytest.mark.parametrize("labels", [{INJECT: "true"}, {}, {INJECT: "third"}])
 def test_a_pod_that_two_select_has_none(labels):
-    arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
+    arm = rosproxy("arm", ALL)
+    leg = rosproxy("leg", ALL)
 
     finding = select_rosproxy(pod(labels=labels), [leg, arm])
 

@@ -62,8 +62,11 @@ class Running:
     """What a replica serves, the webhook and its liveness, before an API server."""
 
     def __init__(self, server: ApiServer, api: Api) -> None:
-        self.server, self.controller, self.metrics = server, Woken(), ClusterMetrics()
-        self.liveness, self.webhook = free_ports(1), free_ports(1)
+        self.server = server
+        self.controller = Woken()
+        self.metrics = ClusterMetrics()
+        self.liveness = free_ports(1)
+        self.webhook = free_ports(1)
         rotation = CertificateRotation(CertificateDirectory(""), self.metrics)
         rotation.pair = PAIR
         plan = ClusterSettings(bounds=Bounds(max_ports=64))
@@ -355,7 +358,8 @@ async def test_nonsense_is_refused(running: Running) -> None:
 
 
 async def test_everything_that_would_surprise_is_off() -> None:
-    settings, controller = kopf.OperatorSettings(), cast(Any, Woken())
+    settings = kopf.OperatorSettings()
+    controller = cast(Any, Woken())
     cluster_serving = ClusterServing(KubernetesSettings(), controller, None)
     await cluster_serving.configure(settings)
     assert not settings.posting.enabled

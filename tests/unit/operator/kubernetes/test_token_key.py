@@ -91,7 +91,8 @@ async def test_whoever_was_faster_has_the_right_one(
     server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put(server)
-    slower, faster = TokenKey(api, SECRET), TokenKey(api, SECRET)
+    slower = TokenKey(api, SECRET)
+    faster = TokenKey(api, SECRET)
     real = api.get
 
     def get(*words: Any) -> dict[str, Any]:

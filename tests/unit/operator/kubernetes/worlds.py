@@ -54,7 +54,8 @@ class World:
     """A cluster with a controller, and what must always hold there."""
 
     def __init__(self, namespace: str = NAMESPACE, names: dict[str, str] = NODES) -> None:
-        self.namespace, self.names = namespace, names
+        self.namespace = namespace
+        self.names = names
         self.cluster = Cluster(namespace)
         self.controller = Controller(self.cluster, SETTINGS)
         for name, ip in list(names.items())[:2]:
@@ -201,7 +202,8 @@ class World:
 
     def come_to_rest(self, _n: int = 0, _m: int = 0) -> None:
         """Nothing else happens: everything must be as wished after some looks."""
-        self.cluster.forbidden, self.controller.old = False, None
+        self.cluster.forbidden = False
+        self.controller.old = None
         self.cluster.step()
         self.check()
         self.cluster.made = 0
@@ -292,7 +294,8 @@ class World:
             self.check_versions(place, proxy, env)
             token = names.token_of(self.cluster.key, proxy.pod.id, place.node)
             assert env["ROSPROXY_ADMIN_TOKEN_HASH"] == hash_token(token)
-            service, master = "http://roscore.ros.svc:11311", rosproxy["master"]
+            service = "http://roscore.ros.svc:11311"
+            master = rosproxy["master"]
             assert env.get("ROS_MASTER_URI") == (master and master.get("uri", service))
             publish = master and master.get("publish")
             if publish and not self.told(plan, place, "PortConflict"):

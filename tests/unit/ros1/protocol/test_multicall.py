@@ -24,8 +24,10 @@ from tests.unit.builders import (
     python_values,
 )
 
-OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/"
-SERVICE, OUT_SERVICE = "rosrpc://10.0.0.5:50001", "rosrpc://robot-host:45000"
+OWN = "http://10.0.0.5:40001/"
+OUT = "http://robot-host:45000/"
+SERVICE = "rosrpc://10.0.0.5:50001"
+OUT_SERVICE = "rosrpc://robot-host:45000"
 FULL = "http://full:40001/"
 NODE = make_caller("10.0.0.5", master=MASTER)
 FAULT = {"faultCode": 1, "faultString": "method is not supported"}
@@ -59,7 +61,8 @@ SHUTDOWN = [
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_the_end_of_a_rospy_node(dialect: str) -> None:
     call, reply = DIALECTS[dialect]
-    addressing, results = world(), [[[1, "Unregistered", 1]]] * 3
+    addressing = world()
+    results = [[[1, "Unregistered", 1]]] * 3
     done = exchange(addressing, NODE, call("system.multicall", SHUTDOWN), reply(results))
     assert done.sent == call(
         "system.multicall",
@@ -192,7 +195,8 @@ NO_CALLS: list[tuple[Any, ...]] = [
 
 @pytest.mark.parametrize("params", NO_CALLS)
 def test_what_holds_no_call_goes_to_the_master_as_it_is(params: tuple[Any, ...]) -> None:
-    body, reply = py_call("system.multicall", *params), dump_fault(1, "no")
+    body = py_call("system.multicall", *params)
+    reply = dump_fault(1, "no")
     done = exchange(world(), NODE, body, reply)
     assert done.sent == body
     assert done.received == reply

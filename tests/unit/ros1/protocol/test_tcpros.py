@@ -60,7 +60,8 @@ def test_round_trip(fields: dict[str, str]) -> None:
 
 def test_a_header_cut_inside_a_field_is_refused_at_every_byte() -> None:
     body = SUBSCRIBER[4:]
-    complete, position = {0}, 0
+    complete = {0}
+    position = 0
     while position < len(body):
         position += 4 + struct.unpack_from("<I", body, position)[0]
         complete.add(position)

@@ -98,7 +98,8 @@ def test_soup_between_sound_tags_is_read_as_by_expat(soup: str, root: str) -> No
 
 @pytest.mark.parametrize("depth", range(1, 16))
 def test_depth_is_bounded_as_by_expat(depth: int) -> None:
-    body, limits = py_call("x", [["deep"]]), Limits(1000, 100, depth)
+    body = py_call("x", [["deep"]])
+    limits = Limits(1000, 100, depth)
     assert read(body, limits) == by_expat(body, limits)
     assert (read(body, limits)[0] == "refused") is (depth < 11)
 
@@ -150,6 +151,7 @@ def test_what_is_taken_for_lists_is_what_expat_reads(soup: str) -> None:
 
 @given(VALUES, st.integers(0, 40))
 def test_a_reply_that_is_too_deep_is_no_lists_either(value: Any, depth: int) -> None:
-    body, limits = py_reply([value]), Limits(10_000, 1000, depth)
+    body = py_reply([value])
+    limits = Limits(10_000, 1000, depth)
     if fast.lists(body, limits) is not None:
         assert by_expat(body, limits)[0] == "reply"

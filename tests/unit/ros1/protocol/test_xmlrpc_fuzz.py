@@ -133,7 +133,8 @@ def test_the_slave_side_leaves_other_values_alone(
     method: str, values: list[Any], dialect: Any
 ) -> None:
     call, reply = dialect
-    body, answer = call(method, *values), reply([1, "said", values])
+    body = call(method, *values)
+    answer = reply([1, "said", values])
     parsed = xmlrpc.parse_call(body)
     named = values[2] if len(values) > 2 and isinstance(values[2], list) else []
     publishers = [item for item in named if isinstance(item, str)]

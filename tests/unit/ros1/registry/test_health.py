@@ -4,7 +4,9 @@ import pytest
 
 from rosproxy.ros1.registry.node_health import Health, ProbeResult
 
-A, R, S = ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT
+A = ProbeResult.ANSWERED
+R = ProbeResult.REFUSED
+S = ProbeResult.SILENT
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,10 @@ from rosproxy.ros1.registry.node_health import Health
 from rosproxy.ros1.registry.registry import MOST_ADMISSIONS, RangeExhausted, Registry
 from tests.unit.builders import own_uri
 
-PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+PUB = Kind.PUBLISHER
+SUB = Kind.SUBSCRIBER
+SRV = Kind.SERVICE
+PARAM = Kind.PARAM
 
 
 def make_registry(size: int = 4) -> Registry:
@@ -67,8 +70,10 @@ def test_an_endpoint_is_keyed_by_address_and_port() -> None:
 
 
 def test_two_containers_with_the_same_uri_are_two_endpoints() -> None:
-    registry, uri = make_registry(), "http://node:40001/"
-    first, second = admit(registry, uri, "10.0.0.5"), admit(registry, uri, "10.0.0.6")
+    registry = make_registry()
+    uri = "http://node:40001/"
+    first = admit(registry, uri, "10.0.0.5")
+    second = admit(registry, uri, "10.0.0.6")
     assert first is not second
     assert registry.by_node(at(uri)) == [first, second]
     assert registry.admitted(at(uri), "10.0.0.5") is first
@@ -109,7 +114,8 @@ def test_an_endpoint_that_was_only_claimed_is_confirmed_by_its_own_address() -> 
 
 def test_a_source_that_means_another_node_by_now_stays_admitted_when_the_old_one_goes() -> None:
     """Removing the old endpoint took the new one's admission along."""
-    registry, uri = make_registry(), "http://node:40001/"
+    registry = make_registry()
+    uri = "http://node:40001/"
     old = admit(registry, uri, "10.0.0.5", "10.0.0.9")
     new = admit(registry, uri, "10.0.0.6", "10.0.0.9")
     registry.remove(old)
@@ -120,7 +126,8 @@ def test_a_source_that_means_another_node_by_now_stays_admitted_when_the_old_one
 
 def test_the_same_uri_that_comes_back_gets_the_same_port_while_it_can() -> None:
     registry = make_registry(3)
-    first, second = node(registry, 5), node(registry, 6)
+    first = node(registry, 5)
+    second = node(registry, 6)
     registry.remove(first)
     registry.remove(second)
     assert node(registry, 6).port == second.port
@@ -189,7 +196,8 @@ def test_registrations_keep_an_endpoint_unless_it_was_cleaned_up() -> None:
     assert registry.longest_idle() is endpoint
     endpoint.connections = 1
     assert registry.longest_idle() is None
-    endpoint.connections, endpoint.pending = 0, 1
+    endpoint.connections = 0
+    endpoint.pending = 1
     assert registry.longest_idle() is None
 
 
@@ -203,10 +211,8 @@ def test_a_call_under_way_keeps_an_endpoint() -> None:
 
 def test_restored_endpoints_have_the_port_that_they_had() -> None:
     registry = make_registry()
-    address, place = (
-        HostPort("10.0.0.5", 40001),
-        NodeLocation("10.0.0.5", named=True, confirmed=False),
-    )
+    address = HostPort("10.0.0.5", 40001)
+    place = NodeLocation("10.0.0.5", named=True, confirmed=False)
     endpoint = registry.restore(own_uri("10.0.0.5"), address, place, 45002)
     assert endpoint
     assert (endpoint.port, endpoint.trusted) == (45002, False)
@@ -243,7 +249,8 @@ def test_an_endpoint_without_a_name_has_a_label_too() -> None:
 
 def test_a_name_that_registers_from_another_uri_loses_what_it_had() -> None:
     registry = make_registry()
-    old, new = node(registry, 5), node(registry, 6)
+    old = node(registry, 5)
+    new = node(registry, 6)
     for kind, name in [(PUB, "/a"), (SRV, "/s"), (PARAM, "/p")]:
         register(registry, old, kind, name)
     register(registry, old, SUB, "/a", "/other")
@@ -256,7 +263,8 @@ def test_a_name_that_registers_from_another_uri_loses_what_it_had() -> None:
 
 def test_a_service_has_one_provider() -> None:
     registry = make_registry()
-    old, new = node(registry, 5), node(registry, 6)
+    old = node(registry, 5)
+    new = node(registry, 6)
     register(registry, old, SRV, "/s", "/old")
     registration = register(registry, new, SRV, "/s", "/new")
     assert registry.services.get("/s") == (new, registration)
@@ -344,7 +352,8 @@ def test_endpoints_may_be_removed_while_they_are_gone_through() -> None:
 
 def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
     registry = make_registry()
-    endpoint, port = node(registry, 5), 45000
+    endpoint = node(registry, 5)
+    port = 45000
     registration = register(registry, endpoint, PUB, "/a")
     assert registry.move({endpoint: NodeLocation("10.0.0.9", False)}) == [endpoint]
     assert (endpoint.slave, endpoint.port, endpoint.uri) == (
@@ -372,7 +381,8 @@ def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> Non
 
 def test_two_nodes_may_swap_their_addresses() -> None:
     registry = make_registry()
-    first, second = node(registry, 5), node(registry, 6)
+    first = node(registry, 5)
+    second = node(registry, 6)
     places = {first: NodeLocation("10.0.0.6", False), second: NodeLocation("10.0.0.5", False)}
     assert registry.move(places) == [first, second]
     assert registry.by_slave.get(HostPort("10.0.0.6", 40001)) is first
@@ -383,7 +393,9 @@ def test_two_nodes_may_swap_their_addresses() -> None:
 
 def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
     registry = make_registry()
-    first, holder, third = node(registry, 5), node(registry, 6), node(registry, 7)
+    first = node(registry, 5)
+    holder = node(registry, 6)
+    third = node(registry, 7)
     places = {third: NodeLocation("10.0.0.5", False), first: NodeLocation("10.0.0.6", False)}
     assert registry.move(places) == []
     assert [e.location.address for e in (first, holder, third)] == [
@@ -443,7 +455,8 @@ def failing(
     address = f"10.0.0.{number}"
     endpoint = admit(registry, own_uri(address), address, f"10.0.0.{source}")
     endpoint.health.answered_at = 1.0 if proven else None
-    endpoint.health.failures, endpoint.health.failing_since = failures, float(number)
+    endpoint.health.failures = failures
+    endpoint.health.failing_since = float(number)
     register(registry, endpoint, PUB, f"/topic{number}", f"/node{number}")
     return endpoint
 
@@ -476,20 +489,17 @@ def test_the_dead_give_way_in_order() -> None:
 
 def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> None:
     registry = make_registry()
-    address, place = (
-        HostPort("10.0.0.5", 40001),
-        NodeLocation("10.0.0.5", named=True, confirmed=False),
-    )
+    address = HostPort("10.0.0.5", 40001)
+    place = NodeLocation("10.0.0.5", named=True, confirmed=False)
     claim = registry.restore(own_uri("10.0.0.5"), address, place, 45000)
     assert claim
     register(registry, claim, PUB, "/a")
     assert registry.dead_endpoint() is None  # it is being asked
     claim.health.failures = 1
     assert registry.dead_endpoint() is claim
-    claim.health.failures, claim.health.answered_at = (
-        0,
-        5.0,
-    )  # something answers that is not the node
+    # something answers that is not the node
+    claim.health.failures = 0
+    claim.health.answered_at = 5.0
     assert registry.dead_endpoint() is claim
     claim.trusted = True
     assert registry.dead_endpoint() is None

@@ -81,7 +81,8 @@ class Registries(RuleBasedStateMachine):
         moved = self.registry.move(places)
         assert {endpoint: endpoint.port for endpoint in self.registry} == ports
         for endpoint, slave in before.items():
-            old, port = slave.host, slave.port
+            old = slave.host
+            port = slave.port
             if endpoint in moved:
                 new = places[endpoint].address
                 assert endpoint.slave == HostPort(new, port)
@@ -146,7 +147,8 @@ class Registries(RuleBasedStateMachine):
 
     @invariant()
     def every_port_is_free_held_or_blocked(self) -> None:
-        pool, leased = self.registry.pool, set(self.registry.by_port)
+        pool = self.registry.pool
+        leased = set(self.registry.by_port)
         assert pool.free + len(leased) + len(pool.blocked) == len(PORTS)
         assert not leased & self.blocked
         assert all(port in PORTS for port in leased)

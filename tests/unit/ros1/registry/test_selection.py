@@ -7,7 +7,9 @@ import pytest
 from rosproxy.ros1.registry.client_kinds import ClientKind, client_kind, refusal
 
 NETWORKS = (ip_network("10.0.0.0/24"), ip_network("fd00::/64"))
-ADMITTED, OUTSIDE, UNSELECTED = ClientKind.ADMITTED, ClientKind.OUTSIDE, ClientKind.UNSELECTED
+ADMITTED = ClientKind.ADMITTED
+OUTSIDE = ClientKind.OUTSIDE
+UNSELECTED = ClientKind.UNSELECTED
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,8 @@ def open_fast_port(stand_ins: StandIns, stand_in: StandIn) -> HostPort:
 
 def test_two_whose_ports_would_be_the_same_get_one_each() -> None:
     """Their URIs give the same number; of a hundred nodes outside, two do in one case of two."""
-    stand_ins, first = make_stand_ins(direction="both"), make_stand_in(1)
+    stand_ins = make_stand_ins(direction="both")
+    first = make_stand_in(1)
     second = next(
         stand_in for stand_in in map(make_stand_in, count(2)) if stand_in.port == first.port
     )
@@ -39,7 +40,8 @@ def test_two_whose_ports_would_be_the_same_get_one_each() -> None:
 
 
 def test_who_finds_all_taken_has_none() -> None:
-    stand_ins, stand_in = make_stand_ins(direction="both"), make_stand_in(1)
+    stand_ins = make_stand_ins(direction="both")
+    stand_in = make_stand_in(1)
     for stand_in.fast_attempts in range(TRIES):
         stand_ins.by_port[stand_in.port] = make_stand_in(2)
     assert stand_ins.choose_fast_candidate(stand_in) is None

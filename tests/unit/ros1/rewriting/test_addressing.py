@@ -169,8 +169,10 @@ def test_what_is_no_endpoint_of_ours_is_imported_and_exported_as_it_is(uri: str)
 
 
 def two_with_the_same_uri() -> tuple[Addressing, str, str]:
-    addressing, uri = make_addressing(), "http://node:40001/"
-    first, second = add_node(addressing, uri, "10.0.0.5"), add_node(addressing, uri, "10.0.0.6")
+    addressing = make_addressing()
+    uri = "http://node:40001/"
+    first = add_node(addressing, uri, "10.0.0.5")
+    second = add_node(addressing, uri, "10.0.0.6")
     return addressing, addressing.advertised_uri(first), addressing.advertised_uri(second)
 
 
@@ -203,10 +205,12 @@ def test_two_containers_with_the_same_uri_each_mean_their_own(
 
 def test_a_uri_that_a_caller_would_take_for_its_own_is_not_given_to_it() -> None:
     """A neighbour's URI that reads like the caller's own led the caller to itself."""
-    addressing, uri = make_addressing(), "http://node:40001/"
+    addressing = make_addressing()
+    uri = "http://node:40001/"
     resolvable = add_node(addressing, uri, "10.0.0.5", named=True)
     add_node(addressing, uri, "10.0.0.6")
-    outside, caller = addressing.advertised_uri(resolvable), make_caller("10.0.0.6")
+    outside = addressing.advertised_uri(resolvable)
+    caller = make_caller("10.0.0.6")
     given = addressing.import_slave(outside, caller)
     assert given == f"http://{PROXY}:45000/"
     assert addressing.export_slave(given, caller) == outside
@@ -214,7 +218,8 @@ def test_a_uri_that_a_caller_would_take_for_its_own_is_not_given_to_it() -> None
 
 def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
     """It registers from the gateway's address and is found at its own."""
-    addressing, uri = make_addressing(), "http://node:40001/"
+    addressing = make_addressing()
+    uri = "http://node:40001/"
     add_node(addressing, uri, "10.0.0.6")
     node = HostPort("node", 40001)
     place = add_node(addressing, uri, "10.0.0.5", confirmed=False).location

@@ -23,10 +23,13 @@ from tests.unit.builders import (
     raw_call,
 )
 
-ID, TOPIC, TYPE = "/ns/talker", "/chatter", "std_msgs/String"
+ID = "/ns/talker"
+TOPIC = "/chatter"
+TYPE = "std_msgs/String"
 OWN = "http://10.0.0.5:40001/"
 OUT = "http://robot-host:45000/"
-SERVICE, OUT_SERVICE = "rosrpc://10.0.0.5:50001", "rosrpc://robot-host:45000"
+SERVICE = "rosrpc://10.0.0.5:50001"
+OUT_SERVICE = "rosrpc://robot-host:45000"
 LAPTOP = "http://laptop:33445/"
 OTHER = "http://10.0.0.6:40001/"
 OTHER_OUT = "http://robot-host:45001/"

@@ -28,7 +28,8 @@ def make(*registrations: tuple[str, Kind, str, bool]) -> Addressing:
     registry = Registry(PORTS)
     for number, (name, kind, resource, is_hidden) in enumerate(registrations, 1):
         address = f"10.0.0.{number}"
-        uri, node = f"http://{address}:1/", HostPort(address, 1)
+        uri = f"http://{address}:1/"
+        node = HostPort(address, 1)
         endpoint = registry.admit(uri, node, NodeLocation(address, named=True), address)
         registry.register(endpoint, Registration(kind, resource, name, "T", hidden=is_hidden))
     ports = PortMap(PORTS, PORTS)

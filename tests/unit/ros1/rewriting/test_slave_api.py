@@ -23,8 +23,10 @@ from tests.unit.builders import (
     python_values,
 )
 
-OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/"
-OTHER, OTHER_OUT = "http://10.0.0.6:40001/", "http://robot-host:45001/"
+OWN = "http://10.0.0.5:40001/"
+OUT = "http://robot-host:45000/"
+OTHER = "http://10.0.0.6:40001/"
+OTHER_OUT = "http://robot-host:45001/"
 FAR_OUT = "http://robot-host:45002/"
 FAR_RELAYED = f"http://{PROXY}:45002/"
 LAPTOP = "http://laptop:33445/"
@@ -258,7 +260,8 @@ def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
     add_registration(addressing, endpoint, Kind.PUBLISHER, "/a")
-    ours, other = addressing.advertised_uri(endpoint), "http://laptop:1/"
+    ours = addressing.advertised_uri(endpoint)
+    other = "http://laptop:1/"
     endpoint.settles_at = 5.0
 
     def outdated(topic: str, publishers: list[str], now: float) -> bool:

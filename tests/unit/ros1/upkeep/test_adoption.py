@@ -14,7 +14,9 @@ from rosproxy.ros1.upkeep.decisions.recovery_claims import confirmed_by
 from rosproxy.ros1.upkeep.decisions.registration import is_known_as
 from tests.unit.builders import add_node, make_addressing
 
-PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
+PUB = Kind.PUBLISHER
+SUB = Kind.SUBSCRIBER
+SRV = Kind.SERVICE
 C1 = ("10.0.0.5", {"c1", "3f2a91c0b7de"})
 C2 = ("10.0.0.6", {"c2", "twin"})
 C3 = ("10.0.0.7", {"c3", "twin"})
@@ -76,7 +78,8 @@ def direct(caller_id: str, topics: Sequence[str], *addresses: str, kind: Kind = 
     return DirectNode(caller_id, "http://twin:40001/", places(*addresses), registrations)
 
 
-SIX, SEVEN = "10.0.0.6:40001", "10.0.0.7:40001"
+SIX = "10.0.0.6:40001"
+SEVEN = "10.0.0.7:40001"
 LOCATED = [
     # what a node has at the master, what the nodes at its places say, where it is
     (["/a"], {SIX: ["/a"]}, SIX),
@@ -148,7 +151,8 @@ def test_doubts_tell_what_was_found() -> None:
 
 
 def test_two_containers_with_the_same_names_and_ports() -> None:
-    first, second = direct("/n1", ["/a"], SIX, SEVEN), direct("/n2", ["/b"], SIX, SEVEN)
+    first = direct("/n1", ["/a"], SIX, SEVEN)
+    second = direct("/n2", ["/b"], SIX, SEVEN)
     six, seven = places(SIX, SEVEN)
     located, doubts = locate([first, second], {SIX: ["/b", "/rosout"], SEVEN: ["/a"]})
     assert located == {seven: [first], six: [second]}
@@ -193,7 +197,8 @@ def test_whose_uri_has_changed(caller_id: str, reason: str, name: str | None) ->
     assert policy.renamed_node(caller_id, reason) == name
 
 
-LITERAL, ADVERTISED = "http://c1:40001/", "http://robot-host:45000/"
+LITERAL = "http://c1:40001/"
+ADVERTISED = "http://robot-host:45000/"
 NAMES = [
     # registered around the proxy before? what the master has, whether no other has its name
     (False, ADVERTISED, True),

@@ -124,7 +124,9 @@ def test_nobody_who_is_due_or_unused_is_passed_over(
         add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter")
     if direct:
         endpoint.note_former_uri(endpoint.uri)
-    endpoint.health, endpoint.connections, endpoint.idle_since = health, connections, idle_since
+    endpoint.health = health
+    endpoint.connections = connections
+    endpoint.idle_since = idle_since
     passed_over = not liveness.to_look_at([endpoint], 12.0, 5.0)
     if passed_over:
         assert not liveness.is_due(endpoint, 12.0, 5.0)
@@ -177,7 +179,8 @@ def test_what_is_due_first_once_a_node_has_answered(
 ) -> None:
     endpoint = add_node(make_addressing())
     endpoint.trusted = trusted
-    endpoint.health.cleaned, endpoint.health.pid = cleaned, known_pid
+    endpoint.health.cleaned = cleaned
+    endpoint.health.pid = known_pid
     if direct:
         endpoint.note_former_uri(endpoint.uri)
     assert liveness.after_answer(endpoint, 7) is due

@@ -16,7 +16,8 @@ from rosproxy.ros1.upkeep.decisions import recovery_claims
 from rosproxy.ros1.upkeep.decisions.recovery_claims import Claim
 from tests.unit.builders import add_node, add_registration, make_addressing
 
-PUB, SRV = Kind.PUBLISHER, Kind.SERVICE
+PUB = Kind.PUBLISHER
+SRV = Kind.SERVICE
 
 
 def make_registration(name: str, caller_id: str = "/n") -> Registration:
@@ -129,7 +130,8 @@ def claim(
     return Claim(port, node, node, list(map(make_registration, topics)), named)
 
 
-A, B = "10.0.0.5", "10.0.0.6"
+A = "10.0.0.5"
+B = "10.0.0.6"
 SETTLED = [
     # claims: port, address, topics at the master, topics that the node asked said; who is kept
     ([], []),
@@ -247,7 +249,8 @@ def test_a_node_bears_out_what_the_master_says_of_it(
 
 
 def test_names_that_are_not_the_node_s_are_told_apart() -> None:
-    own, former = make_registration("/a", "/own"), make_registration("/b", "/former")
+    own = make_registration("/a", "/own")
+    former = make_registration("/b", "/former")
     service = Registration(SRV, "/s", "/former")
     everything = [
         own,

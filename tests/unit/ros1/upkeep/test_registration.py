@@ -18,7 +18,10 @@ from tests.unit.builders import (
     py_reply,
 )
 
-PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+PUB = Kind.PUBLISHER
+SUB = Kind.SUBSCRIBER
+SRV = Kind.SERVICE
+PARAM = Kind.PARAM
 
 
 def make_registration(
@@ -36,7 +39,8 @@ def said(published: Iterable[str] | None, subscribed: Iterable[str] | None = ())
     return NodeInfo(7, types[0], types[1])
 
 
-OWN, SERVICE = "http://10.0.0.5:40001/", "rosrpc://10.0.0.5:50001"
+OWN = "http://10.0.0.5:40001/"
+SERVICE = "rosrpc://10.0.0.5:50001"
 BY_NODE = [
     # how the node registers and unregisters
     (
@@ -59,7 +63,8 @@ BY_NODE = [
 def test_the_proxy_calls_the_master_exactly_as_the_node_did(
     register: bytes, unregister: bytes
 ) -> None:
-    addressing, node = make_addressing(), make_caller("10.0.0.5")
+    addressing = make_addressing()
+    node = make_caller("10.0.0.5")
     done = exchange(addressing, node, register, py_reply([1, "", []]))
     endpoint = addressing.registry.by_port[45000]
     (registration,) = endpoint.registrations.values()
@@ -196,7 +201,8 @@ def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
 
 def test_who_was_subscribed_to_it_and_who_is_known_still() -> None:
     uris = dict.fromkeys(("/unknown", "/common", "/another", "/taken"), "U")
-    before, after = [None, "U", "U", "other"], [None, None, "U", "other"]
+    before = [None, "U", "U", "other"]
+    after = [None, None, "U", "other"]
     ended, remaining = decisions.read_release(uris, [*before, 1, 1, 1, 1, *after])
     assert ended == [Registration(PARAM, decisions.COMMON_PARAMETER, "/common")]
     assert remaining == {"/another": "U", "/taken": "other"}

@@ -11,8 +11,12 @@ from rosproxy.ros1.upkeep.decisions import resubscription as decisions
 from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription
 from tests.unit.builders import add_node, add_registration, make_addressing
 
-PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
-LAPTOP, ROBOT, ELSEWHERE = "192.168.1.77", "192.168.1.5", "172.17.0.1"
+PUB = Kind.PUBLISHER
+SUB = Kind.SUBSCRIBER
+SRV = Kind.SERVICE
+LAPTOP = "192.168.1.77"
+ROBOT = "192.168.1.5"
+ELSEWHERE = "172.17.0.1"
 HOSTS = {"/a": [LAPTOP], "/b": [LAPTOP], "/c": [ROBOT], "/d": []}
 
 
@@ -34,7 +38,8 @@ def names(subscriptions: Iterable[TopicSubscription]) -> list[str]:
 
 def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
     addressing = make_addressing()
-    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
+    first = add_node(addressing)
+    second = add_node(addressing, "http://10.0.0.6:40001/")
     add_registration(addressing, first, PUB, "/t")
     add_registration(addressing, first, SUB, "/in")
     for topic in ("/t", "/u"):
@@ -169,7 +174,8 @@ def test_a_host_with_as_many_connections_in_the_kernel_as_subscriptions_has_no_s
 
 def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:
     addressing = make_addressing()
-    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
+    first = add_node(addressing)
+    second = add_node(addressing, "http://10.0.0.6:40001/")
     first.fast_peers = {LAPTOP: 5}
     left = [*subscribed(first, "/a"), *subscribed(second, "/a")]
     assert decisions.unconnected(left, {}, HOSTS) == subscribed(second, "/a")

@@ -19,7 +19,8 @@ ROSPY = [[["/image", 500, [[1, 5000, 50, "1"], [2, 3000, 30, "1"]]]],
          [["/scan", [[3, 700, 7, -1, "1"], [4, 100, 1, -1, "1"]]]], []]  # fmt: skip
 ROSCPP = [[["/image", 500, [[1, 5000, 4900, 50, 1], [2, 3000, 2900, 30, 1]]]],
           [["/scan", [[3, 700, 7, 0, 1], [4, 100, 1, 0, 1]]]]]  # fmt: skip
-IMAGE, SCAN = ("o", "/image"), ("i", "/scan")
+IMAGE = ("o", "/image")
+SCAN = ("i", "/scan")
 
 
 @pytest.mark.parametrize("stats", [ROSPY, ROSCPP])

@@ -20,10 +20,15 @@ from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
 
-INSIDE, OTHER, NEAR = "172.30.0.5", "172.30.0.6", "172.30.0.2"
-HOST, ROBOT, STRANGER = "10.0.0.1", "10.0.0.9", "10.0.0.66"
+INSIDE = "172.30.0.5"
+OTHER = "172.30.0.6"
+NEAR = "172.30.0.2"
+HOST = "10.0.0.1"
+ROBOT = "10.0.0.9"
+STRANGER = "10.0.0.66"
 EAR = HostPort("172.30.0.1", 7500)
-A, B = b"\x01\x0f" + bytes(10), b"\x01\x0f" + bytes(range(10))
+A = b"\x01\x0f" + bytes(10)
+B = b"\x01\x0f" + bytes(range(10))
 NETWORK = ip_network("172.30.0.0/24")
 SECRET = "a secret of both"
 UNIX_TIME = 1.7e9

@@ -15,7 +15,8 @@ from rosproxy.ros2.registry.participants import DdsSecurity, LocatorFault, Parti
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.protocol.messages import VALUES, data, message, payload
 
-INSIDE, OTHER = "172.30.0.5", "172.30.0.6"
+INSIDE = "172.30.0.5"
+OTHER = "172.30.0.6"
 LARGE_DATA = bytes.fromhex(
     "525450530202010f010f3d110557fad8000000000901080058e3036b3c4ce3961505940100001000000100c7"
     "000100c2000000000100000000030000150004000202000016000400010f000050001000010f3d110557fad8"

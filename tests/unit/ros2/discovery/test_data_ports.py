@@ -138,7 +138,8 @@ def test_a_participant_that_has_not_announced_itself_is_not_read() -> None:
 
 def test_discovery_is_charged_and_user_data_is_not() -> None:
     domain = met()
-    port, before = data_lease(domain), allowance_left(domain, ROBOT)
+    port = data_lease(domain)
+    before = allowance_left(domain, ROBOT)
     domain.at_lease(port, USER, ROBOT, NOW)
     assert allowance_left(domain, ROBOT) == before
     domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
@@ -159,7 +160,8 @@ def test_user_data_passes_unread(source: str) -> None:
 @pytest.mark.parametrize("source", [ROBOT, STRANGER])
 def test_fast_dds_ignores_discovery_there_and_nothing_is_read(source: str) -> None:
     domain = met(FAST_DDS)
-    port, before = data_lease(domain), allowance_left(domain, source)
+    port = data_lease(domain)
+    before = allowance_left(domain, source)
     announced = sedp(B, ROBOT, 7000)
     assert not domain.is_read_at(port, announced, source)
     assert domain.at_lease(port, announced, source, NOW) == [
@@ -214,7 +216,8 @@ def test_what_inside_announces_at_a_stand_in_for_user_data_is_policed(vendor: by
 
 def test_nothing_is_read_at_a_stand_in_for_user_data_of_fast_dds() -> None:
     domain = met(FAST_DDS, both_ways=True)
-    port, announced = data_stand_in(domain), sedp(A, INSIDE, 7000)
+    port = data_stand_in(domain)
+    announced = sedp(A, INSIDE, 7000)
     assert not domain.is_read_at_stand_in(port, announced, INSIDE)
     assert domain.at_stand_in(port, announced, INSIDE, NOW) == [
         Outgoing(HostPort(ROBOT, 7411), announced)

@@ -93,7 +93,8 @@ def test_no_locator_leads_to_another_host() -> None:
 
 
 def test_after_a_restart_the_observer_learns_which_ones_there_are() -> None:
-    before, after = both_ways(), both_ways()
+    before = both_ways()
+    after = both_ways()
     (port,) = [p for p, (_, lease) in before.inside.leases.items() if lease.target.port == 7410]
     before.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     after.heard_outside(sedp(B, ROBOT, 7000, to=after.own.observer.prefix), ROBOT, NOW)
@@ -142,7 +143,8 @@ def test_fragments_go_to_whom_each_names(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(
         "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
     )
-    domain, readers = domains.make_domain(), (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
+    domain = domains.make_domain()
+    readers = (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
     meet(domain)
     for number, reader in enumerate(readers):
         domain.heard_outside(spdp(reader, ROBOT, 7420 + 10 * number), ROBOT, NOW)
@@ -164,7 +166,8 @@ def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(
         "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
     )
-    domain, readers = domains.make_domain(), (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
+    domain = domains.make_domain()
+    readers = (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
     meet(domain)
     for number, reader in enumerate(readers):
         domain.heard_outside(spdp(reader, ROBOT, 7420 + 10 * number), ROBOT, NOW)

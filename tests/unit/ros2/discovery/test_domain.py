@@ -319,7 +319,8 @@ def test_a_participant_says_which_ports_it_had() -> None:
 
 
 def test_what_a_peer_says_of_a_port_counts_more_than_what_others_do() -> None:
-    domain, outsider = make_domain(), bytes([1, 15, *range(10, 20)])
+    domain = make_domain()
+    outsider = bytes([1, 15, *range(10, 20)])
     for prefix, source in ((A, ROBOT), (B, STRANGER)):
         for port in (45002, 45005):
             domain.at_lease(port, sedp(outsider, ROBOT, 7410, to=prefix), source, 0.1)
@@ -360,7 +361,8 @@ def test_participants_are_reminded_until_they_keep_their_ports() -> None:
 @given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, EAR.host]))
 @pytest.mark.parametrize("start", [b"", b"RTPS\x02\x03\x01\x0f" + A, spdp(A, INSIDE)[:120]])
 def test_nothing_that_is_sent_breaks_it(start: bytes, rest: bytes, source: str) -> None:
-    domain, datagram = make_domain(), start + rest
+    domain = make_domain()
+    datagram = start + rest
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     (stand_in,) = domain.outside.stand_ins

@@ -17,8 +17,10 @@ from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, submessages
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
 from tests.unit.ros2.protocol.messages import PREFIX, data, fragment, message, payload, submessage
 
-LOCATOR, LEASED = HostPort("172.30.0.5", 7411), HostPort("10.0.0.1", 45001)
-PORT, READER = 45000, b"reader's pre"
+LOCATOR = HostPort("172.30.0.5", 7411)
+LEASED = HostPort("10.0.0.1", 45001)
+PORT = 45000
+READER = b"reader's pre"
 HEARTBEAT = submessage(0x07, 0, bytes(28))
 
 
@@ -80,13 +82,15 @@ def test_fragments_carry_what_the_whole_would(
 
 
 def test_nothing_goes_on_before_all_is_there() -> None:
-    store, sent = FragmentStores(), cut(described(300), 128)
+    store = FragmentStores()
+    sent = cut(described(300), 128)
     assert [through(store, datagram) for datagram in sent[:-1]] == [[]] * (len(sent) - 1)
     assert len(through(store, sent[-1])) == len(sent)
 
 
 def test_what_is_hidden_is_a_gap_in_each_datagram() -> None:
-    store, sent = FragmentStores(), cut(described(300), 128)
+    store = FragmentStores()
+    sent = cut(described(300), 128)
     got = [forwarded for datagram in sent for forwarded in through(store, datagram, hidden)]
     for before, after in zip(sent, got, strict=True):
         kinds = [kind for kind, _, _ in submessages(after)]
@@ -96,7 +100,8 @@ def test_what_is_hidden_is_a_gap_in_each_datagram() -> None:
 
 
 def test_each_way_has_its_own_fragments() -> None:
-    store, (first, *rest) = FragmentStores(), cut(described(100), 128)
+    store = FragmentStores()
+    (first, *rest) = cut(described(100), 128)
     through(store, first)
     for datagram in rest:
         assert store.rewritten(PORT + 1, read_discovery(datagram), READER, led) == ([], [])
@@ -104,8 +109,10 @@ def test_each_way_has_its_own_fragments() -> None:
 
 def test_who_sends_a_fragment_again_is_asked_for_the_others() -> None:
     """As Cyclone DDS does: it sends the first alone to who asks for a sample."""
-    store, sent = FragmentStores(), cut(described(100), 128, sequence=7)
-    first, third = read_discovery(sent[0]), read_discovery(sent[2])
+    store = FragmentStores()
+    sent = cut(described(100), 128, sequence=7)
+    first = read_discovery(sent[0])
+    third = read_discovery(sent[2])
     assert store.rewritten(PORT, first, READER, led) == ([], [])
     assert store.rewritten(PORT, third, READER, led) == ([], [])
     _, (asked,) = store.rewritten(PORT, first, READER, led)
@@ -164,7 +171,9 @@ def test_a_whole_announcement_wakes_its_own_datagrams_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All that waited were walked through for each that became whole."""
-    stores, is_whole, looks = FragmentStores(), FragmentStore._is_whole, list[object]()
+    stores = FragmentStores()
+    is_whole = FragmentStore._is_whole
+    looks = list[object]()
 
     def counted(store: FragmentStore, datagram: fragments._WaitingDatagram) -> bool:
         looks.append(datagram)
@@ -183,7 +192,8 @@ def test_a_whole_announcement_wakes_its_own_datagrams_alone(
 
 
 def test_a_datagram_waits_for_all_that_it_has_a_part_of() -> None:
-    size, store = 128, FragmentStores()
+    size = 128
+    store = FragmentStores()
     whole = described(20)
     chunks = [whole[at : at + size] for at in range(0, len(whole), size)]
     parts = {
@@ -209,7 +219,8 @@ def test_a_datagram_waits_for_all_that_it_has_a_part_of() -> None:
 
 def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fragments, "MOST_OF_ALL", 100 * OVERHEAD)
-    stores, sent = FragmentStores(), cut(described(100), 128)
+    stores = FragmentStores()
+    sent = cut(described(100), 128)
     assert [through(stores, datagram) for datagram in sent[:-1]] == [[]] * (len(sent) - 1)
     for number in range(1, 400):
         prefix = bytes([9, 9, number % 2]) + bytes(9)

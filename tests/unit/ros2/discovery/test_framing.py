@@ -60,12 +60,11 @@ def announced(parameters: bytes, little: bool = True) -> bytes:
 
 def behind_an_unaligned_parameter() -> bytes:
     """Read without rounding up, the next three bytes begin one that ends before what is allowed."""
-    denied, allowed, end = (
-        topic("rt/secret", False),
-        topic("rt/public", False),
-        parameter(1, b"", False),
-    )
-    one_byte, unknown = struct.pack(">HHB", 0x8000, 1, 0), struct.pack(">HH", 0x8000, 256)
+    denied = topic("rt/secret", False)
+    allowed = topic("rt/public", False)
+    end = parameter(1, b"", False)
+    one_byte = struct.pack(">HHB", 0x8000, 1, 0)
+    unknown = struct.pack(">HH", 0x8000, 256)
     assert unknown[3:] == denied[:1]
     before = bytes(256 - len(denied[1:]) - 4)
     told = parameter(0x8000, before + allowed + end + bytes(3), False)

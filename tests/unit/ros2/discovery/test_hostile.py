@@ -183,7 +183,8 @@ def test_an_exhausted_range_is_not_searched_for_each_locator(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A datagram with two thousand locators took 140 ms, by which nobody else was served."""
-    domain, ordered = make_domain(), list[str]()
+    domain = make_domain()
+    ordered = list[str]()
 
     def order_for(key: str, ports: PortRange) -> Iterator[int]:
         ordered.append(key)
@@ -224,7 +225,8 @@ def test_no_port_of_the_range_leads_to_the_range() -> None:
 
 
 def test_users_data_of_before_a_restart_is_not_charged() -> None:
-    domain, user = make_domain(), message(submessage(0x07, 0, bytes(28)), prefix=B)
+    domain = make_domain()
+    user = message(submessage(0x07, 0, bytes(28)), prefix=B)
     for _ in range(int(BURST) + 5):
         domain.at_lease(45007, user, ROBOT, 0.5)
     assert domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.6)
@@ -263,7 +265,8 @@ def test_the_texts_of_an_address_take_so_many_bytes() -> None:
 def test_readers_and_writers_of_an_address_have_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
     end = DdsEndpoint(EndpointKind.READER, "t", "T")
     monkeypatch.setattr(participants, "MOST_ENDPOINT_BYTES_PER_ADDRESS", 5 * end.size)
-    notes, many = EndpointNotes(), [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
+    notes = EndpointNotes()
+    many = [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
     for participant in many:
         notes.note(participant, b"0001", end)
         notes.note(participant, b"0001", end)

@@ -46,7 +46,8 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     """What goes on of what A says inside, and B outside, by each way that there is."""
     (stand_in,) = domain.outside.stand_ins
     (lease,) = [le for le in domain.inside.by_prefix[A].leases.values() if le.target.port == 7410]
-    inside, outside = message(said, prefix=A), message(said, prefix=B)
+    inside = message(said, prefix=A)
+    outside = message(said, prefix=B)
     yield domain.at_stand_in(stand_in, inside, INSIDE, NOW)
     yield domain.heard_inside(inside, INSIDE, NOW)
     yield domain.at_lease(lease.port, outside, ROBOT, NOW)

@@ -21,7 +21,8 @@ from rosproxy.ros2.protocol.rtps import source_prefix
 from tests.unit.ros2.discovery.domains import kept_halves, kept_number
 
 RANGE = PortRange(11400, 11463)
-PEER, BACK = bytes(range(12)), HostPort("172.30.0.2", 7410)
+PEER = bytes(range(12))
+BACK = HostPort("172.30.0.2", 7410)
 ADDRESS = "172.30.0.5"
 KEY = keeper_key("a secret of the proxy")
 keys = st.sampled_from([b"", KEY])
@@ -45,7 +46,8 @@ def answered(keeper: Keeper, number: int, proof: int = 1, prefix: bytes = PEER) 
 
 @given(some_ports, keys)
 def test_numbers_hold_ports_and_prove_them(ports: list[int], key: bytes) -> None:
-    keeper, later = make_keeper(key=key), make_keeper(1000.0, key)
+    keeper = make_keeper(key=key)
+    later = make_keeper(1000.0, key)
     count = answered(later, keeper.number(ports), keeper.proof(PEER, ports))
     assert count == (len(ports) if key else 0)
     assert later.former_ports(PEER) == ports
@@ -144,7 +146,9 @@ def test_all_ports_that_a_former_version_kept_by_one_writer_are_read() -> None:
 
 
 def test_another_secret_has_another_witness() -> None:
-    keeper, other, without = make_keeper(), make_keeper(key=b"another"), make_keeper(key=b"")
+    keeper = make_keeper()
+    other = make_keeper(key=b"another")
+    without = make_keeper(key=b"")
     assert keeper.prefix == other.prefix == without.prefix
     assert len({keeper.prefix, keeper.witness, other.witness, without.witness}) == 4
     assert without.witness == b""
@@ -164,7 +168,8 @@ def test_no_number_names_a_port_outside_of_the_range(number: int, size: int, key
 
 
 def test_the_next_process_is_the_same_keeper_and_counts_on() -> None:
-    first, later = make_keeper(1000.0), make_keeper(2000.0)
+    first = make_keeper(1000.0)
+    later = make_keeper(2000.0)
     assert first.prefix == later.prefix
     assert first.prefix != Keeper.of("10.0.0.1", RANGE, 1, 0.0).prefix
     asked = [count_of(keeper.questions(PEER, BACK, 0.0)[-1]) for keeper in (first, later)]
@@ -180,7 +185,8 @@ def test_participants_that_come_and_go_do_not_raise_the_count_of_others() -> Non
 
     A container whose participants came and went for an hour had others ignore the next process.
     """
-    first, later = make_keeper(1000.0), make_keeper(1001.0)
+    first = make_keeper(1000.0)
+    later = make_keeper(1001.0)
     for number in range(100):
         first.questions(number.to_bytes(12, "big"), BACK, 0.0)
         first.forget(number.to_bytes(12, "big"))
@@ -193,7 +199,8 @@ def test_participants_that_come_and_go_do_not_raise_the_count_of_others() -> Non
 
 @given(some_ports, st.integers(0, 63))
 def test_a_longer_range_has_the_same_keeper(ports: list[int], more: int) -> None:
-    keeper, longer = make_keeper(), make_keeper(ports=PortRange(11400, 11463 + more))
+    keeper = make_keeper()
+    longer = make_keeper(ports=PortRange(11400, 11463 + more))
     assert keeper.prefix == longer.prefix
     assert answered(longer, keeper.number(ports), keeper.proof(PEER, ports)) == len(ports)
     assert longer.former_ports(PEER) == ports

@@ -139,7 +139,8 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     sent = meet(domain)
     assert is_farewell(by(domain.own.keeper.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
-    parting, meeting = settle(domain, NOW), settle(domain, NOW + APART_TIME)
+    parting = settle(domain, NOW)
+    meeting = settle(domain, NOW + APART_TIME)
 
     for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
         assert [is_farewell(datagram) for datagram in told] == [True]
@@ -200,7 +201,8 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
 
 
 def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
-    domain, port = moved(), RANGE.listen.last - 2
+    domain = moved()
+    port = RANGE.listen.last - 2
     domain.returning.note_former({A: (*PORTS, port)}, {})
     meet(domain)
     settle(domain, NOW)
@@ -217,7 +219,8 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     domain.returning.note_former({A: ports}, domain.inside.by_prefix)
     meet(domain)
     assert not set(domain.inside.by_prefix[A].ports) & set(ports)
-    parting, meeting = settle(domain, NOW), settle(domain, NOW + APART_TIME)
+    parting = settle(domain, NOW)
+    meeting = settle(domain, NOW + APART_TIME)
     assert [is_farewell(datagram) for datagram in by(A, to(parting, ROBOT))] == [True]
     assert [is_farewell(datagram) for datagram in by(A, to(meeting, ROBOT))] == [False]
 

@@ -11,7 +11,8 @@ from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.rtps import source_prefix, submessages
 from tests.unit.ros2.protocol.messages import data, message, submessage
 
-OWN, PEER = bytes(range(12)), b"\x01\x0f" + bytes(10)
+OWN = bytes(range(12))
+PEER = b"\x01\x0f" + bytes(10)
 WRITERS = 0x000003C2
 
 

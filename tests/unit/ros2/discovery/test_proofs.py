@@ -334,7 +334,8 @@ def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
 
 
 def test_a_process_has_questions_of_its_own() -> None:
-    first, second = AddressProofs(b"one"), AddressProofs(b"another")
+    first = AddressProofs(b"one")
+    second = AddressProofs(b"another")
     asked = [source_prefix(p.question(LAPTOP, A, [])) for p in (first, second)]
     assert len(Counter(asked)) == 2
 

@@ -17,12 +17,16 @@ from rosproxy.ros2.discovery.discovery_rates import (
 
 @given(st.lists(st.tuples(st.floats(0, 0.01), st.integers(0, 2000)), max_size=60))
 def test_no_source_gets_more_than_its_allowance(heard: list[tuple[float, int]]) -> None:
-    rates, now, used, last = DiscoveryRates(), 0.0, 0, 0
+    rates = DiscoveryRates()
+    now = 0.0
+    used = 0
+    last = 0
     for pause, led_to in heard:
         now += pause
         if rates.take("a", 100, now):
             rates.charge("a", led_to)
-            used, last = used + 1 + led_to, led_to
+            used = used + 1 + led_to
+            last = led_to
     assert used - last <= BURST + now * PER_SECOND + 1
     assert rates.take("b", 100, now)
 

@@ -29,8 +29,11 @@ from tests.unit.ros2.discovery.domains import (
 )
 from tests.unit.ros2.protocol.messages import data, fragment, message, payload, submessage
 
-USER, BUILT_IN, UNKNOWN = 0x00001203, 0x000003C7, 0
-TIME, TO_A = submessage(0x09, 0, bytes(8)), submessage(0x0E, 0, A)
+USER = 0x00001203
+BUILT_IN = 0x000003C7
+UNKNOWN = 0
+TIME = submessage(0x09, 0, bytes(8))
+TO_A = submessage(0x0E, 0, A)
 SAID = data(bytes(1200), writer=USER)
 
 
@@ -56,7 +59,8 @@ def shared() -> tuple[Domain, int, int]:
     domain = make_domain(both_ways=True)
     domain.heard_inside(message(announcement(A, INSIDE), prefix=A), INSIDE, NOW)
     domain.heard_outside(message(announcement(B, ROBOT), prefix=B), ROBOT, NOW)
-    (port,), (stand_in,) = domain.inside.leases, domain.outside.stand_ins
+    (port,) = domain.inside.leases
+    (stand_in,) = domain.outside.stand_ins
     assert domain.inside.leases[port][1].kind is LeaseKind.METATRAFFIC
     return domain, port, stand_in
 

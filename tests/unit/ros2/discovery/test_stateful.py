@@ -41,8 +41,10 @@ from tests.unit.ros2.discovery.domains import (
 from tests.unit.ros2.protocol.messages import data, fragment, message, payload, submessage
 
 PREFIXES = [A, B, bytes([9]) * 12]
-NEAR_BY, FAR = [INSIDE, OTHER], [ROBOT, STRANGER]
-PREFIX, ADDRESS = st.sampled_from(PREFIXES), st.sampled_from(NEAR_BY + FAR)
+NEAR_BY = [INSIDE, OTHER]
+FAR = [ROBOT, STRANGER]
+PREFIX = st.sampled_from(PREFIXES)
+ADDRESS = st.sampled_from(NEAR_BY + FAR)
 PORT = st.integers(7410, 7440)
 OWN = bytes([5]) * 12
 MEANT = st.sampled_from([OWN, *PREFIXES])
@@ -112,7 +114,8 @@ class Neighbours(RuleBasedStateMachine):
         )
         self.domain.own.observer.prefix = OWN
         self.now = 0.0
-        self.came, self.went = Counter[str](), Counter[str]()
+        self.came = Counter[str]()
+        self.went = Counter[str]()
         self.proven = {ROBOT}
         self.answered = set[str]()
         self.asked = set[str]()
@@ -240,7 +243,8 @@ class Neighbours(RuleBasedStateMachine):
 
     @invariant()
     def leases_are_of_those_inside(self) -> None:
-        inside, pool = self.domain.inside, self.domain.ports.pool
+        inside = self.domain.inside
+        pool = self.domain.ports.pool
         assert pool.free + len(inside.leases) + 1 == len(pool.range)
         leases = [
             lease

@@ -77,7 +77,8 @@ def string(text: str, mark: str) -> bytes:
 
 
 def written(qos: EndpointQos, mark: str) -> list[tuple[int, bytes]]:
-    partitions, kinds = qos.partitions or (), qos.representations
+    partitions = qos.partitions or ()
+    kinds = qos.representations
     rows = b"".join(string(name, mark) for name in partitions)
     values = struct.pack(f"{mark}I{len(kinds)}h", len(kinds), *kinds)
     return [

@@ -53,7 +53,8 @@ def test_a_sample_is_found_with_its_writer_and_its_place(little: bool) -> None:
 
 @BOTH
 def test_inline_qos_stands_before_the_payload(little: bool) -> None:
-    qos, content = parameter_list([(0x71, b"\0\0\0\3")], little), payload([], little)
+    qos = parameter_list([(0x71, b"\0\0\0\3")], little)
+    content = payload([], little)
     whole = message(data(content, qos=qos, little=little, key=True))
     (sample,) = samples(whole)
     assert sample.is_key_only
@@ -197,13 +198,16 @@ def test_the_prefix_of_a_message() -> None:
 
 def test_all_that_a_message_names_are_meant() -> None:
     """One message of Cyclone DDS may be for several at one address."""
-    first, second = bytes([1] * 12), bytes([2] * 12)
+    first = bytes([1] * 12)
+    second = bytes([2] * 12)
     to_first, to_second, to_all = (submessage(0x0E, 0, p) for p in (first, second, bytes(12)))
-    ack, info = submessage(0x06, 1, bytes(24)), submessage(0x09, 1, bytes(8))
+    ack = submessage(0x06, 1, bytes(24))
+    info = submessage(0x09, 1, bytes(8))
     assert destinations(message(info, to_first, ack, to_second, info, ack)) == {first, second}
     assert destinations(message(to_first, ack, to_second)) == {first}
     assert destinations(message(ack, to_first, ack)) == set()
     assert destinations(message(to_first, ack, to_all, ack)) == set()
     assert destinations(message(info)) == set()
-    extension, unknown = submessage(0x00, 1, bytes(8)), submessage(0x80, 1, bytes(56))
+    extension = submessage(0x00, 1, bytes(8))
+    unknown = submessage(0x80, 1, bytes(56))
     assert destinations(message(extension, to_first, ack, to_all, unknown)) == {first}

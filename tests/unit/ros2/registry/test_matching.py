@@ -19,7 +19,8 @@ from rosproxy.ros2.registry.matching import (
 from rosproxy.ros2.registry.participants import DdsEndpoint, EndpointKind, Participant
 from tests.unit.ros2.protocol.test_qos import QOS
 
-STRING, LOG = "std_msgs::msg::dds_::String_", "rcl_interfaces::msg::dds_::Log_"
+STRING = "std_msgs::msg::dds_::String_"
+LOG = "rcl_interfaces::msg::dds_::Log_"
 RELIABLE = EndpointQos(reliable=True)
 
 

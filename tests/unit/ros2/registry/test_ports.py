@@ -20,7 +20,8 @@ from rosproxy.ros2.registry.locator_ports import (
 from rosproxy.ros2.registry.participants import LeaseKind
 
 RANGE = PortRange(45000, 45019)
-DATA, METATRAFFIC = LeaseKind.DATA, LeaseKind.METATRAFFIC
+DATA = LeaseKind.DATA
+METATRAFFIC = LeaseKind.METATRAFFIC
 OTHERS = NamedBy.OTHERS
 PROVEN = NamedBy.PROVEN
 PEER = NamedBy.PEER
@@ -71,14 +72,17 @@ def test_who_says_what_it_had_gets_it(prefix: bytes, had: int) -> None:
 
 
 def test_what_outside_says_counts_more_than_ones_own_word() -> None:
-    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    pool = ports()
+    prefix = bytes(12)
+    other_prefix = bytes(range(12))
     pool.note_former_user(45007, other_prefix, DATA, PEER, 0.5)
     assert pool.take(prefix, locator(0), DATA, SETTLING, 45007) != 45007
     assert pool.take(other_prefix, locator(0), DATA, SETTLING) == 45007
 
 
 def test_a_port_for_metatraffic_is_none_for_data() -> None:
-    pool, prefix = ports(), bytes(12)
+    pool = ports()
+    prefix = bytes(12)
     pool.note_former_user(45007, prefix, METATRAFFIC, PEER, 0.5)
     assert pool.take(prefix, locator(1), DATA, SETTLING) != 45007
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == 45007
@@ -97,7 +101,9 @@ def test_where_several_are_named_their_own_word_decides(had: list[tuple[bytes, i
 
 def test_each_locator_of_a_participant_gets_its_own_port() -> None:
     """Fast DDS has two for data, and outside names the participant at both."""
-    pool, prefix, had = ports(), bytes(12), {0: 45003, 1: 45007}
+    pool = ports()
+    prefix = bytes(12)
+    had = {0: 45003, 1: 45007}
     for port in had.values():
         pool.note_former_user(port, prefix, DATA, PEER, 0.5)
     taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
@@ -105,7 +111,9 @@ def test_each_locator_of_a_participant_gets_its_own_port() -> None:
 
 
 def test_each_locator_gets_its_own_port_though_outside_names_one_alone() -> None:
-    pool, prefix, had = ports(), bytes(12), {0: 45003, 1: 45007}
+    pool = ports()
+    prefix = bytes(12)
+    had = {0: 45003, 1: 45007}
     pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
     taken = {n: pool.take(prefix, locator(n), DATA, SETTLING, port) for n, port in had.items()}
     assert taken == had
@@ -114,7 +122,9 @@ def test_each_locator_gets_its_own_port_though_outside_names_one_alone() -> None
 @given(st.permutations([0, 1, 2]))
 def test_each_locator_gets_its_own_port_without_a_word(order: list[int]) -> None:
     """Where it can be: as long as nobody had the port that it wants."""
-    before, after, prefix = ports(), ports(), bytes(12)
+    before = ports()
+    after = ports()
+    prefix = bytes(12)
     had = {n: before.take(prefix, locator(n), DATA, SETTLING) for n in range(3)}
     for port in had.values():
         after.note_former_user(port or 0, prefix, DATA, PEER, 0.5)
@@ -123,20 +133,24 @@ def test_each_locator_gets_its_own_port_without_a_word(order: list[int]) -> None
 
 def test_a_locator_for_both_kinds_keeps_its_port() -> None:
     """Of Cyclone DDS: outside may have sent data alone, and the announcement begins with either."""
-    pool, prefix = ports(), bytes(12)
+    pool = ports()
+    prefix = bytes(12)
     pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING, 45007) == 45007
 
 
 def test_a_locator_for_both_kinds_keeps_its_port_without_a_word() -> None:
-    pool, prefix = ports(), bytes(12)
+    pool = ports()
+    prefix = bytes(12)
     first, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
     pool.note_former_user(first, prefix, DATA, PEER, 0.5)
     assert pool.take(prefix, locator(0), METATRAFFIC, SETTLING) == first
 
 
 def test_a_stranger_names_nobody_where_a_peer_has() -> None:
-    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    pool = ports()
+    prefix = bytes(12)
+    other_prefix = bytes(range(12))
     pool.note_former_user(45007, prefix, DATA, PEER, 0.5)
     pool.note_former_user(45007, other_prefix, DATA, OTHERS, 0.5)
     assert pool.take(other_prefix, locator(0), DATA, SETTLING, 45007) != 45007
@@ -145,7 +159,8 @@ def test_a_stranger_names_nobody_where_a_peer_has() -> None:
 
 def test_where_too_many_are_named_that_tells_nothing() -> None:
     """Nobody can take a port from whom it was by naming all the world there."""
-    pool, prefix = ports(), bytes(12)
+    pool = ports()
+    prefix = bytes(12)
     for number in range(1, 100):
         pool.note_former_user(45007, number.to_bytes(12, "big"), DATA, PEER, 0.5)
     pool.note_former_user(45007, b"a stranger's", DATA, OTHERS, 0.5)
@@ -153,7 +168,9 @@ def test_where_too_many_are_named_that_tells_nothing() -> None:
 
 
 def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
-    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    pool = ports()
+    prefix = bytes(12)
+    other_prefix = bytes(range(12))
     for port in RANGE.ports():
         pool.note_former_user(port, other_prefix, DATA, PEER, 0.5)
     first, second, *_ = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
@@ -161,7 +178,9 @@ def test_a_port_of_somebody_who_may_come_back_is_better_than_none() -> None:
 
 
 def test_what_was_heard_is_forgotten_after_a_time() -> None:
-    pool, prefix, other_prefix = ports(), bytes(12), bytes(range(12))
+    pool = ports()
+    prefix = bytes(12)
+    other_prefix = bytes(range(12))
     (first, *_) = order_for(f"{prefix.hex()} {locator(0)}", RANGE)
     pool.note_former_user(first, other_prefix, DATA, PEER, 0.5)
     pool.note_former_user(45000, other_prefix, DATA, PEER, REMEMBERED + 1)
@@ -244,7 +263,8 @@ def test_equal_claims_give_the_port_to_neither(is_proven: bool, port: int) -> No
 
 def test_a_proof_gets_a_port_back_from_a_participant_that_came_first() -> None:
     pool = ports()
-    first, later = b"a" * 12, b"b" * 12
+    first = b"a" * 12
+    later = b"b" * 12
     had = pool.take(first, locator(0), DATA, SETTLING)
     assert had is not None
     pool.note_claims(later, [had], 0)
@@ -266,7 +286,8 @@ def test_what_the_kernel_forwarded_stays_with_its_locator() -> None:
 
 
 def test_a_name_that_may_be_forged_makes_a_word_no_better_and_voids_one_without_a_rival() -> None:
-    liar, owner = b"a" * 12, b"b" * 12
+    liar = b"a" * 12
+    owner = b"b" * 12
     pool = ports()
     pool.note_former_user(45007, liar, DATA, OTHERS, 0.5)
     pool.note_claims(owner, [45007], 0)

@@ -11,7 +11,8 @@ from rosproxy.ros2.registry.selected import (
     SelectedAddresses,
 )
 
-ADDRESS, OTHER_ADDRESS = "172.30.0.5", "172.30.0.6"
+ADDRESS = "172.30.0.5"
+OTHER_ADDRESS = "172.30.0.6"
 
 
 def said(number: int, text: bytes = b"") -> bytes:

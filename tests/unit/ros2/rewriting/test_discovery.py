@@ -29,7 +29,8 @@ from tests.unit.ros2.protocol.messages import (
 )
 
 BOTH = pytest.mark.parametrize("little", [True, False], ids=["little", "big"])
-INSIDE, HOST = "172.30.0.5", "10.0.0.1"
+INSIDE = "172.30.0.5"
+HOST = "10.0.0.1"
 
 
 def nothing(told: Announcement) -> bool:

@@ -6,7 +6,8 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.registry.participants import EndpointKind
 from rosproxy.ros2.rewriting.policing import rule_about
 
-READER, WRITER = EndpointKind.READER, EndpointKind.WRITER
+READER = EndpointKind.READER
+WRITER = EndpointKind.WRITER
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,8 @@ def find_members(
 
 def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tuple[Member, str]:
     """A container whose key is known, with how its nodes find the proxy, and a warning."""
-    container, key = request.container, request.key
+    container = request.container
+    key = request.key
     if key.is_ros2:
         return request, ""
     needs, text = readers.proxy_alias(container, key)
@@ -157,7 +158,8 @@ def _requests(
 
 
 def _ros2_request(container: Container, observed: HostState, settings: PlanSettings) -> Member:
-    labels, host = container.labels, readers.advertise_host(container.labels, settings)
+    labels = container.labels
+    host = readers.advertise_host(container.labels, settings)
     ros_versions.refuse_unserved(container, host)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
@@ -265,7 +267,8 @@ def _advertised(request: Member, observed: HostState) -> str:
 
     A name that can't be resolved for a moment must not take a proxy away.
     """
-    key, networks = request.key, request.container.networks
+    key = request.key
+    networks = request.container.networks
     towards = observed.far if key.is_ros2 else observed.advertise.get(master(key).host, "")
     sandboxes = [
         s

@@ -309,7 +309,8 @@ def master_by_address(container: Container, key: Key) -> HostPort | None:
     That is its master's own address, or where a label gives the master by name any address: the
     name may lead to another one by now. None for a name, and for IPv6.
     """
-    target, real = parse_slave_uri(container.master_uri), master(key)
+    target = parse_slave_uri(container.master_uri)
+    real = master(key)
     if target is None or target.port != real.port or ":" in target.host:
         return None
     if not is_address(target.host) or is_loopback(target.host):

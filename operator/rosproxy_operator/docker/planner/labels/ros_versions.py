@@ -66,7 +66,8 @@ def _is_marked_ros2(container: Container) -> bool:
 def domain(container: Container) -> int:
     """The domain of its participants: from the label, else its variable, else 0."""
     if DOMAIN in container.labels:
-        source, text = named(DOMAIN, container.labels), container.labels[DOMAIN]
+        source = named(DOMAIN, container.labels)
+        text = container.labels[DOMAIN]
     else:
         text = container.variables.get("ROS_DOMAIN_ID", "") or "0"
         source = f"its variable ROS_DOMAIN_ID={quoted(text)}"

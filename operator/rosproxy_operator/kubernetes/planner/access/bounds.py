@@ -162,7 +162,8 @@ def _missing_consent(rosproxy: RosProxy, consents: Consents) -> str:
 
     Whether that Service exists is not told: only the other namespace is to know.
     """
-    service, namespace = rosproxy.spec.master.service, rosproxy.id.namespace
+    service = rosproxy.spec.master.service
+    namespace = rosproxy.id.namespace
     if service is None or service.namespace == namespace:
         return ""
     allowed = consents.get(service, frozenset())

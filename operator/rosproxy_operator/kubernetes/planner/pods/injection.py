@@ -168,16 +168,19 @@ def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:
     """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name."""
     if uri == VALUE_AT_RUNTIME:
         return True
-    master, service = parse_slave_uri(uri.strip()), service_id(rosproxy_id)
+    master = parse_slave_uri(uri.strip())
+    service = service_id(rosproxy_id)
     if master is None or master.port != MASTER_PORT:
         return False
-    host, name = master.host.lower().rstrip("."), f"{service.name}.{service.namespace}"
+    host = master.host.lower().rstrip(".")
+    name = f"{service.name}.{service.namespace}"
     return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
 def _masters_of(rosproxy: RosProxy) -> frozenset[HostPort]:
     """How the pods of a RosProxy may name its real master; hosts in lower case."""
-    master, service = rosproxy.spec.master, rosproxy.spec.master.service
+    master = rosproxy.spec.master
+    service = rosproxy.spec.master.service
     if service is None:
         named = parse_slave_uri(master.uri)
         hosts = {named.host, master.address} - {""} if named else set[str]()

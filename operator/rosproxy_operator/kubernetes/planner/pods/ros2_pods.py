@@ -70,7 +70,8 @@ def _problems(
     ):
         text = f"sets ROS_STATIC_PEERS={_shown(peers)} itself, without its proxy"
         yield "NotWired", f"{text}: take the variable out of its template, or add {address} to it"
-    domain, number = get("ROS_DOMAIN_ID"), rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
+    domain = get("ROS_DOMAIN_ID")
+    number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     if domain not in (None, VALUE_AT_RUNTIME) and str(domain).strip() not in (str(number), ""):
         text = (
             f"sets ROS_DOMAIN_ID={_shown(str(domain))}, "

@@ -93,7 +93,8 @@ def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
 
 def selects(rosproxy: RosProxy, pod: Pod) -> bool:
     """Whether a RosProxy that is not being deleted selects a pod, perhaps along with others."""
-    label, selector = pod.labels.get(INJECT), rosproxy.spec.pod_selector
+    label = pod.labels.get(INJECT)
+    selector = rosproxy.spec.pod_selector
     same_namespace = rosproxy.id.namespace == pod.id.namespace
     if not same_namespace or rosproxy.deleting or label in LABEL_OFF_VALUES or _is_ours(pod.labels):
         return False

@@ -36,7 +36,8 @@ _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"me
 
 def ear_pod(site: ProxySite, ear: HostPort, proxy_address: str, settings: ClusterSettings) -> Json:
     """The pod of an ear that listens at ``ear``, for the proxy at ``proxy_address``."""
-    rosproxy, ros2 = site.rosproxy, site.rosproxy.spec.ros2
+    rosproxy = site.rosproxy
+    ros2 = site.rosproxy.spec.ros2
     annotations = {NODE: site.node.name}
     meta = metadata(rosproxy, ear_id(rosproxy.id, site.node.name), annotations, EAR)
     target = HostPort(proxy_address, site.ports.first)
@@ -81,7 +82,8 @@ def reconcile_ears(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Acti
     )
     for node_name in sorted({*ears_by_node, *(place.node for place in places)}):
         place = ProxyPlace(rosproxy.id, node_name)
-        ears, node = ears_by_node.get(node_name, ()), context.observed.nodes.get(node_name)
+        ears = ears_by_node.get(node_name, ())
+        node = context.observed.nodes.get(node_name)
         if node is None or not node.ready:
             continue  # the garbage collector takes the pods of nodes that are gone
         if place not in places or not rosproxy.spec.multicast:
@@ -105,7 +107,8 @@ def ear_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Cluste
 def _ensure_ear(
     context: ClusterContext, place: ProxyPlace, ears: tuple[EarPod, ...]
 ) -> Iterator[Action]:
-    current, wanted = context.view.current.get(place), place in context.view.wanted
+    current = context.view.current.get(place)
+    wanted = place in context.view.wanted
     site = site_of(context, place) if wanted else None
     address = current.pod.ip if current is not None and not current.pod.ended else ""
     if current is None or not isinstance(site, ProxySite) or site.ear is None or not address:
@@ -113,7 +116,8 @@ def _ensure_ear(
     if current.fingerprint != proxy_fingerprint(site, context.settings):
         return
     body = ear_pod(site, site.ear, address, context.settings)
-    expected, id = fingerprint_of(body), ear_id(place.of, place.node)
+    expected = fingerprint_of(body)
+    id = ear_id(place.of, place.node)
     outdated = [ear for ear in ears if ear.fingerprint != expected or ear.pod.ended]
     yield from _delete_ears(context, outdated, "made anew: its proxy or its settings have changed")
     if not ears and context.retries.is_due(Task(place.of, "create", id)):

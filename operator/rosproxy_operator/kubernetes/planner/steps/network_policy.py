@@ -110,7 +110,8 @@ def _keep(
     context: ClusterContext, rosproxy: RosProxy, body: Json, current: ProxyPolicy | None
 ) -> Iterator[Action]:
     """Make a policy that is not there, or mend the one that is."""
-    name, ask = name_of(body["metadata"]), context.retries.is_due
+    name = name_of(body["metadata"])
+    ask = context.retries.is_due
     if current is None:
         if ask(Task(rosproxy.id, "create policy", name)):
             yield CreatePolicy(rosproxy.id, body)

@@ -127,7 +127,8 @@ def site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
 
 
 def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
-    rosproxy, node = context.view.rosproxies[place.of], context.observed.nodes[place.node]
+    rosproxy = context.view.rosproxies[place.of]
+    node = context.observed.nodes[place.node]
     if not node.ready:
         text = "is not ready: nothing is changed there until it is: kubectl describe node"
         return Obstacle("NodeNotReady", f"{text} {node.name}")
@@ -148,7 +149,8 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
         return Obstacle("NameTaken", f"a pod called {name} {text}")
     publish = master.publish if place in context.ranges.published else 0
     token = token_of(context.observed.key, name, node.name)
-    ports, published = context.ranges.given[place], replace(master, publish=publish)
+    ports = context.ranges.given[place]
+    published = replace(master, publish=publish)
     token_hash = hash_token(token) if token else ""
     return ProxySite(
         rosproxy,
@@ -167,7 +169,8 @@ def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
 
     The other proxies are found at the first port of their range.
     """
-    rosproxy, nodes = context.view.rosproxies[place.of], context.observed.nodes
+    rosproxy = context.view.rosproxies[place.of]
+    nodes = context.observed.nodes
     if rosproxy.spec.ros2 is None:
         return ()
     peers = set(rosproxy.spec.ros2.peers)
@@ -245,7 +248,8 @@ def _is_starting(context: ClusterContext, place: ProxyPlace) -> bool:
 
 def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> Iterator[Action]:
     """The next actions for a proxy on a node; ``busy`` if another proxy is to come first."""
-    node, proxies = context.observed.nodes.get(place.node), context.view.proxies.get(place, ())
+    node = context.observed.nodes.get(place.node)
+    proxies = context.view.proxies.get(place, ())
     if place in context.view.wanted:
         site = site_of(context, place)
         if isinstance(site, Obstacle):
@@ -266,7 +270,8 @@ def _ensure(
     context: ClusterContext, place: ProxyPlace, site: ProxySite, busy: bool
 ) -> Iterator[Action]:
     """The next action for a proxy that is wanted, and can be had as the site says."""
-    name, current = proxy_id(place.of, place.node), context.view.current.get(place)
+    name = proxy_id(place.of, place.node)
+    current = context.view.current.get(place)
     misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
     if misplaced:
         for proxy in misplaced:

@@ -78,7 +78,8 @@ def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
 
     Several insertions at one place keep the order in which they are given.
     """
-    pieces, position = [], 0
+    pieces = []
+    position = 0
     for edit in sorted(edits, key=lambda edit: (edit.start, edit.end)):
         pieces += [body[position : edit.start], edit.text]
         position = edit.end
@@ -181,8 +182,11 @@ class _Parser:
     """One pass of expat over a document, collecting values and their byte offsets."""
 
     def __init__(self, body: bytes, limits: Limits) -> None:
-        self.body, self._limits = body, limits
-        self.root, self.method, self.fault = "", "", False
+        self.body = body
+        self._limits = limits
+        self.root = ""
+        self.method = ""
+        self.fault = False
         self.values: list[Value] = []
         self._encoding = "utf-8"
         self._path: list[str] = []

@@ -105,7 +105,8 @@ def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
 def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
     """Read one value into ``top``, with at most ``depth`` lists in each other; where it ends."""
     # `scanner` is not documented: a match of its has to begin where the one before has ended.
-    stack, match = [top], _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
+    stack = [top]
+    match = _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
     while (token := match()) and len(stack) <= depth:
         group = token.lastindex
         if group == _STRING:
@@ -132,7 +133,9 @@ def _is_plain(body: bytes, limits: Limits) -> bool:
 
 
 def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list[Value] | None:
-    tokens, params, position = _TOKEN.finditer(body, start), list[Value](), start
+    tokens = _TOKEN.finditer(body, start)
+    params = list[Value]()
+    position = start
     try:
         for token in tokens:
             if token.lastindex != _PARAM:
@@ -158,11 +161,14 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
         return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
     if depth < 4:  # an item would be too deep; expat tells whether there is one
         raise _NotPlain
-    items, members = list[Value](), list[str]()
+    items = list[Value]()
+    members = list[str]()
     if group == _ARRAY:
-        kind, end = "array", _array(body, tokens, depth - 3, items)
+        kind = "array"
+        end = _array(body, tokens, depth - 3, items)
     elif group == _STRUCT:
-        kind, end = "struct", _struct(body, tokens, depth - 3, items, members)
+        kind = "struct"
+        end = _struct(body, tokens, depth - 3, items, members)
     else:
         raise _NotPlain
     inner = inside, end - _END_OF_VALUE

@@ -78,7 +78,8 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
 
     Each insert is (index in the finished array, value); indices rise.
     """
-    edits, items = [], array.items
+    edits = []
+    items = array.items
     for done, (index, raw) in enumerate(inserts):
         successor = index - done
         offset = items[successor].outer[0] if successor < len(items) else items[-1].outer[1]
@@ -89,7 +90,8 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
 def _inner_call(item: Value) -> Call | None:
     if len(set(item.members)) < len(item.members):  # Python takes the last of a name
         raise XmlRpcError(INVALID_PARAMS, f"a call of {MULTICALL} has a member twice")
-    method, params = item.member("methodName"), item.member("params")
+    method = item.member("methodName")
+    params = item.member("params")
     name = method.string() if method else None
     if name == MULTICALL:
         raise XmlRpcError(INVALID_PARAMS, f"{MULTICALL} inside {MULTICALL}")

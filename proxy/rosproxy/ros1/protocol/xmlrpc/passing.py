@@ -84,7 +84,8 @@ _FIELD_DEPTH = 10
 """The depth of a member's name and value."""
 _CONTENT_DEPTH = 11
 """The depth of what a member's value holds."""
-_METHOD, _PARAMS = ["name:methodName", "value"], ["name:params", "value", "array"]
+_METHOD = ["name:methodName", "value"]
+_PARAMS = ["name:params", "value", "array"]
 
 
 def method_of(head: bytes) -> str | None:
@@ -94,12 +95,13 @@ def method_of(head: bytes) -> str | None:
 
 
 def first_strings(head: bytes, count: int) -> list[str | None]:
-    """The first parameters of a call whose document begins so, as far as each is a string.
+    """The first ``count`` parameters of a call whose document begins so, if they are strings.
 
-    None for one that can't be told for sure, and fewer from there on.
+    None stands for the first one that can't be told for sure, and for all that follow.
     """
     match = _HEAD.match(head, 0, HEAD)
-    position, strings = match.end() if match else 0, list[str | None]()
+    position = match.end() if match else 0
+    strings = list[str | None]()
     opening = _PARAMS_BEGIN.match(head, position) if match else None
     position = opening.end() if opening else 0
     for _ in range(count if opening else 0):
@@ -108,7 +110,7 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
             break
         strings.append(text_of(param[1] if param[1] is not None else param[2], "utf-8"))
         position = param.end()
-    return strings
+    return [*strings, *[None] * (count - len(strings))]
 
 
 def status_of(head: bytes) -> int | None:

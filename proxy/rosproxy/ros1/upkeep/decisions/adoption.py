@@ -49,7 +49,8 @@ def find_direct(
     graph: Graph, arrived: Iterable[Container], addressing: Addressing
 ) -> list[DirectNode]:
     """The nodes of a master whose URI may mean one of the containers that have arrived."""
-    direct_nodes, containers = [], list(arrived)
+    direct_nodes = []
+    containers = list(arrived)
     for name, uri in graph.uris.items():
         slave = parse_slave_uri(uri)
         if slave is None or addressing.advertises(slave):

@@ -129,7 +129,8 @@ def moved_location(endpoint: Endpoint, address: str) -> NodeLocation:
     Neighbours are sent through the proxy from now on, even if the node's host name leads there:
     to a URI that they know already, rospy doesn't connect again.
     """
-    host, previous = endpoint.node.host, endpoint.location
+    host = endpoint.node.host
+    previous = endpoint.location
     stale = is_address(host) and not is_loopback(host) and host != address
     return NodeLocation(address, named=False, confirmed=previous.confirmed, stale=stale)
 

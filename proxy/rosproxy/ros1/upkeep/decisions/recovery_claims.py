@@ -61,12 +61,14 @@ def find_claims(
 
     Second, by URI, what the master has by advertised URIs of which nothing is remembered.
     """
-    claims_by_uri, forgotten = dict[str, Claim](), dict[str, list[Registration]]()
+    claims_by_uri = dict[str, Claim]()
+    forgotten = dict[str, list[Registration]]()
     for node, uri in graph.uris.items():
         port = addressing.lease_of(uri)
         if port is None:
             continue
-        lease, registrations = memory.get(port), graph.registrations.get(node, [])
+        lease = memory.get(port)
+        registrations = graph.registrations.get(node, [])
         inside = parse_inside_path(uri) or (lease.node if lease else None)
         if inside is None:
             forgotten.setdefault(uri, []).extend(registrations)
@@ -79,7 +81,8 @@ def find_claims(
 
 def contested_claims(candidates: Sequence[Claim]) -> list[Claim]:
     """The claims that share their port or their inside address with another."""
-    ports, slaves = Counter(c.port for c in candidates), Counter(c.slave for c in candidates)
+    ports = Counter(c.port for c in candidates)
+    slaves = Counter(c.slave for c in candidates)
     return [claim for claim in candidates if ports[claim.port] > 1 or slaves[claim.slave] > 1]
 
 
