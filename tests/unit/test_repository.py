@@ -17,8 +17,6 @@ SOURCES = sorted(
 REFERENCE = ROOT / "docs/reference"
 MADE = {".venv", "build", "node_modules"}
 PAGES = sorted(page for page in ROOT.rglob("*.md") if not MADE & set(page.relative_to(ROOT).parts))
-MAX_FILE_LINES = 600
-"""A file is as long as its subject: at this length it may have two."""
 MAX_FUNCTION_LINES = 45
 MAX_MEDIAN_LINES = 10
 
@@ -43,11 +41,6 @@ def run_options() -> list[click.Option]:
 
     command = main.commands["run"]
     return [option for option in command.params if isinstance(option, click.Option)]
-
-
-def test_files_are_short() -> None:
-    lengths = {path.relative_to(ROOT): len(path.read_text().splitlines()) for path in SOURCES}
-    assert not {path: length for path, length in lengths.items() if length > MAX_FILE_LINES}
 
 
 def test_functions_are_short() -> None:
