@@ -299,19 +299,21 @@ class Settings:
             note="separated by spaces",
         ),
     ] = ()
-    ros2_ear: Annotated[
+    ros2_lan_relay: Annotated[
         HostPort | None,
         Option(
-            "ROS 2: where [`rosproxy ear`](../guide/ros2.md#the-lan) listens, for a single domain.",
+            "ROS 2: where [`rosproxy lan-relay`](../guide/ros2.md#the-lan) listens, for a single "
+            "domain.",
             kinds.HOST_PORT,
             default="none",
         ),
     ] = None
-    ros2_ear_secret: Annotated[
+    ros2_lan_relay_secret: Annotated[
         str | None,
         Option(
-            "The secret that `rosproxy ear` has as `--secret`: both programs prove by it what they "
-            "send each other. Better given as a variable: a command line can be seen by all.",
+            "The secret that `rosproxy lan-relay` has as `--secret`: both programs prove by it "
+            "what they send each other. Better given as a variable: a command line can be seen by "
+            "all.",
             kinds.TOKEN,
             default="none",
         ),
@@ -356,11 +358,12 @@ class Settings:
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
         # An announcement need not tell its domain: what has one port has one domain.
         cure = "start a proxy for each domain"
-        if self.ros2_ear and count > 1:
-            raise SettingError("--ros2-ear", f"an ear is for one domain: {cure}")
-        if self.ros2_ear and not self.ros2_ear_secret:
-            text = "missing; give this and rosproxy ear --secret one output of openssl rand -hex 16"
-            raise SettingError("--ros2-ear-secret", f"{text} (ROSPROXY_ROS2_EAR_SECRET)")
+        if self.ros2_lan_relay and count > 1:
+            raise SettingError("--ros2-lan-relay", f"a LAN relay is for one domain: {cure}")
+        if self.ros2_lan_relay and not self.ros2_lan_relay_secret:
+            text = "missing; give this option and rosproxy lan-relay --secret the same secret"
+            fix = "openssl rand -hex 16 makes one (ROSPROXY_ROS2_LAN_RELAY_SECRET)"
+            raise SettingError("--ros2-lan-relay-secret", f"{text}: {fix}")
         for peer in self.ros2_peer:
             if peer.port and count > 1:
                 text = f"{peer} has a port, which is for one domain: {cure}"

@@ -30,7 +30,7 @@ GOOD = bytes([1, 15, 1]) + bytes(9)
 ROBOT = bytes([1, 15, 2]) + bytes(9)
 THIEF = bytes([1, 15, 7]) + bytes(9)
 EVIL = NODES[1]
-EAR = NODES[19]
+LAN_RELAY = NODES[19]
 SECRET = "0123456789abcdef"
 PORTS = 64
 ANNOUNCED = APART, WELL_KNOWN
@@ -86,8 +86,8 @@ def abused(start_abused, _apart, first) -> Abused:
         admin_bind=f"{APART}:{free_ports(1)}",
         port_range=f"{first}-{first + PORTS - 1}",
         ros2_peer=f"{STRANGERS[0]}:{WELL_KNOWN}",
-        ros2_ear=f"{EAR}:{WELL_KNOWN}",
-        ros2_ear_secret=SECRET,
+        ros2_lan_relay=f"{LAN_RELAY}:{WELL_KNOWN}",
+        ros2_lan_relay_secret=SECRET,
         data_plane="copy",
     )
 
@@ -200,7 +200,7 @@ async def test_a_prefix_of_inside_goes_to_the_participant_that_had_it(abused, go
     """A host on the LAN that used the prefix kept the participant from being served."""
     before = await serve_and_restart(abused, good, robot)
     proof = RelayProof(SECRET, time.time)
-    with closing(udp(EAR)) as relay, closing(Participant(GOOD, STRANGERS[3], 9000)) as liar:
+    with closing(udp(LAN_RELAY)) as relay, closing(Participant(GOOD, STRANGERS[3], 9000)) as liar:
 
         def forge() -> None:
             heard = wrapped(liar.address, spdp(GOOD, liar.address, 9000, padding=PADDING))

@@ -49,7 +49,7 @@ ROBOT = bytes([1, 15, 2]) + bytes(9)
 LAPTOP = bytes([1, 15, 4]) + bytes(9)
 NEWCOMER = bytes([1, 15, 5]) + bytes(9)
 EVIL = NODES[1]
-EAR = NODES[19]
+LAN_RELAY = NODES[19]
 VICTIM = STRANGERS[9]
 SECRET = "0123456789abcdef"
 """What the proxy and its LAN relay share."""
@@ -89,8 +89,8 @@ def abused(start_abused, _apart, first) -> Abused:
         admin_bind=f"{APART}:{free_ports(1)}",
         port_range=f"{first}-{first + PORTS - 1}",
         ros2_peer=f"{STRANGERS[0]}:{WELL_KNOWN}",
-        ros2_ear=f"{EAR}:{WELL_KNOWN}",
-        ros2_ear_secret=SECRET,
+        ros2_lan_relay=f"{LAN_RELAY}:{WELL_KNOWN}",
+        ros2_lan_relay_secret=SECRET,
     )
 
 
@@ -262,7 +262,7 @@ def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
     with closing(Counted(VICTIM)) as counted, abused.watched():
         came = got = 0
         for datagram in heard:
-            forge(EAR, (APART, first), carried(VICTIM, datagram))
+            forge(LAN_RELAY, (APART, first), carried(VICTIM, datagram))
             came += len(datagram)
             (stand_in, _) = good.hears(datagram[8:20], lambda: None)
             for _ in range(100):
@@ -282,21 +282,21 @@ def test_a_process_at_the_relays_address_is_not_the_relay(abused, good, robot, f
     host = NODES[5]
     claims = [(host, 9999), (APART, first), (APART_HOST, first + 3), ("127.0.0.1", 9999)]
     said = [spdp(prefix(number), *claim) for number, claim in enumerate(claims)]
-    said.append(spdp(prefix(9), EAR, 9999))
+    said.append(spdp(prefix(9), LAN_RELAY, 9999))
     unproven = [wrapped(claim[0], told) for claim, told in zip(claims, said, strict=False)]
     forged = [
         carried(claim[0], told, "another secret") for claim, told in zip(claims, said, strict=False)
     ]
     with closing(Counted(host)) as counted, abused.watched():
         datagrams = [*said, *unproven, *forged, carried(VICTIM, said[0])[:27]]
-        with Flood([(EAR, (APART, first), d) for d in datagrams], is_forged=False) as flood:
+        with Flood([(LAN_RELAY, (APART, first), d) for d in datagrams], is_forged=False) as flood:
             flood.wait(AMONG // 2)
             served(good, robot, b"amid")
         assert {"not_a_peer", "relay_proof"} <= abused.refused()
         assert not {"claimed_address", "own_port"} & abused.refused()
         # Nor does the relay itself lead there, if a machine on the LAN forges its source.
         for number, claim in enumerate(claims):
-            forge(EAR, (APART, first), carried(claim[0], spdp(prefix(20 + number), *claim)))
+            forge(LAN_RELAY, (APART, first), carried(claim[0], spdp(prefix(20 + number), *claim)))
         served(good, robot, b"after")
         assert {"claimed_address", "own_port"} <= abused.refused()
         assert counted.bytes_from([APART, APART_HOST]) == 0
@@ -305,10 +305,10 @@ def test_a_process_at_the_relays_address_is_not_the_relay(abused, good, robot, f
 
 
 @pytest.fixture
-def ear(abused, first) -> Iterator[Popen[str]]:
-    """The ear, on the LAN of the strangers."""
-    command = [sys.executable, "-m", "rosproxy", "ear", "--lan", STRANGERS[1]]
-    command += ["--bind", f"{EAR}:{WELL_KNOWN}", "--proxy", f"{APART}:{first}"]
+def lan_relay(abused, first) -> Iterator[Popen[str]]:
+    """The LAN relay, on the LAN of the strangers."""
+    command = [sys.executable, "-m", "rosproxy", "lan-relay", "--lan", STRANGERS[1]]
+    command += ["--bind", f"{LAN_RELAY}:{WELL_KNOWN}", "--proxy", f"{APART}:{first}"]
     command += ["--secret", SECRET]
     with Popen(command, stderr=PIPE, text=True, env=clean_environment()) as made:
         assert made.stderr
@@ -318,7 +318,7 @@ def ear(abused, first) -> Iterator[Popen[str]]:
         assert "Traceback" not in made.stderr.read()
 
 
-async def test_somebody_floods_the_lan(abused, good, ear):
+async def test_somebody_floods_the_lan(abused, good, lan_relay):
     """Others are heard meanwhile, and the LAN hears of inside."""
     said = [message(prefix=prefix(1)), *heavy(1), *(spdp(prefix(n), EVIL) for n in range(30))]
     laptop = Participant(ROBOT, STRANGERS[2], WELL_KNOWN)
@@ -346,10 +346,10 @@ async def test_somebody_floods_the_lan(abused, good, ear):
         await until(is_known, "a participant on the LAN is met")
         await until(is_announced, "the LAN hears of the one inside")
         flood.wait(AMONG)
-    assert ear.poll() is None
+    assert lan_relay.poll() is None
 
 
-async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot, ear):
+async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot, lan_relay):
     """1,200 announcements with leases of 300 s took all places for these 300 s."""
     served(good, robot, b"before")
     sources = [f"198.18.{3 + number // 250}.{number % 250 + 1}" for number in range(1200)]
@@ -383,7 +383,9 @@ async def test_forged_sources_on_the_lan_take_nobodys_place(abused, good, robot,
         assert {LAPTOP.hex("."), ROBOT.hex(".")} <= known
 
 
-async def test_forged_sources_on_the_lan_take_no_more_than_their_share(abused, good, robot, ear):
+async def test_forged_sources_on_the_lan_take_no_more_than_their_share(
+    abused, good, robot, lan_relay
+):
     """The relay handed the proxy all that it could read, and lost honest announcements."""
     served(good, robot, b"before")
     said = [
@@ -420,4 +422,4 @@ async def test_forged_sources_on_the_lan_take_no_more_than_their_share(abused, g
         units = UNPROVEN_BURST + UNPROVEN_PER_SECOND * (time.monotonic() - began)
         most = units / cost(len(said[0][2]))
         assert refused_count() - before <= most + 2 * honest_count
-    assert ear.poll() is None
+    assert lan_relay.poll() is None

@@ -35,9 +35,9 @@ class Proxy:
         return f"{self.name}-ports"
 
     @property
-    def ear(self) -> str:
+    def lan_relay(self) -> str:
         """The container that hears the LAN for it, if it is for ROS 2."""
-        return f"{self.name}-ear"
+        return f"{self.name}-lan-relay"
 
     @property
     def id(self) -> str:
@@ -123,7 +123,7 @@ def the_proxy(seconds: float = 30) -> Proxy:
 
 def remove_proxies() -> None:
     """Remove all proxies and the uplink."""
-    roles = ("redirect", "flush", "ear", "proxy", "ports")
+    roles = ("redirect", "flush", "lan-relay", "proxy", "ports")
     names = [name for role in roles for name in managed(role)]
     if names:
         docker("rm", "--force", *names, check=False, seconds=120)

@@ -125,14 +125,16 @@ def ports_are_kept(proxy: Proxy) -> bool:
 
 
 def all_run(proxy: Proxy) -> bool:
-    """Whether a proxy, its sandbox and its ear run."""
-    ear = inspect(proxy.ear, check=False)
-    return proxy.running and bool(ear) and bool(ear["State"]["Running"])
+    """Whether a proxy, its sandbox and its LAN relay run."""
+    lan_relay = inspect(proxy.lan_relay, check=False)
+    return proxy.running and bool(lan_relay) and bool(lan_relay["State"]["Running"])
 
 
 def runs(proxy: Proxy) -> list[tuple[str, str]]:
     """Which containers there are, and since when each runs."""
-    inspections = (inspect(name, check=False) for name in (proxy.name, proxy.sandbox, proxy.ear))
+    inspections = (
+        inspect(name, check=False) for name in (proxy.name, proxy.sandbox, proxy.lan_relay)
+    )
     return [
         (inspection["Id"], inspection["State"]["StartedAt"])
         for inspection in inspections

@@ -61,35 +61,35 @@ def test_restarted_container_is_heard_again(
     library: str, controller: Controller, net: Inside, named: Robot
 ) -> None:
     node = talker(net, net.network(), named, library)
-    ear = named.node("ear", library, "sub", "--topic", "/out")
+    listener = named.node("listener", library, "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
 
         docker("restart", "--time", "0", node.name)
 
-        ear.wait_for("inside", since=time.time())
+        listener.wait_for("inside", since=time.time())
     finally:
-        named.end("ear")
+        named.end("listener")
 
 
 def test_paused_container_keeps_its_registrations(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
     node = talker(net, net.network(), named)
-    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    listener = named.node("listener", "roscpp", "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
         uri = named.uri(node.node)
 
         pause(node.name)
-        wait_until(lambda: silent_for(ear.got()[-1].at, 4), 60, "nothing is heard any more")
+        wait_until(lambda: silent_for(listener.got()[-1].at, 4), 60, "nothing is heard any more")
         assert named.uri(node.node) == uri
         docker("unpause", node.name)
 
-        ear.wait_for("inside", since=time.time())
+        listener.wait_for("inside", since=time.time())
         assert named.uri(node.node) == uri
     finally:
-        named.end("ear")
+        named.end("listener")
 
 
 def silent_for(last: float, seconds: float) -> bool:
@@ -98,19 +98,19 @@ def silent_for(last: float, seconds: float) -> bool:
 
 def test_renamed_container_goes_on(controller: Controller, net: Inside, named: Robot) -> None:
     node = talker(net, net.network(), named)
-    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    listener = named.node("listener", "roscpp", "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
         before = time.time()
 
         docker("rename", node.name, node.name + "-renamed")
 
-        ear.wait_for("inside", count=60, since=before)
-        assert ear.lost("inside", before) == 0
+        listener.wait_for("inside", count=60, since=before)
+        assert listener.lost("inside", before) == 0
         names = {row["name"] for row in controller.status()["containers"]}
         assert node.name + "-renamed" in names
     finally:
-        named.end("ear")
+        named.end("listener")
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -121,9 +121,9 @@ def test_container_moves_to_another_network(
     new = net.network()
     node = talker(net, old, named, library)
     proxy = the_proxy()
-    ear = named.node("ear", library, "sub", "--topic", "/out")
+    listener = named.node("listener", library, "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
         # rospy's one thread that accepts connections reads each one's header, without a time-out:
         # a connection cut before its header came leaves the node deaf for good.
         wait_until(lambda: proxy.flowing() == {"/out", "/rosout"}, 60, "both topics flow")
@@ -132,9 +132,9 @@ def test_container_moves_to_another_network(
         docker("network", "connect", new, node.name)
 
         wait_until(lambda: proxy.networks == {new}, 60, lambda: str(proxy.networks))
-        ear.wait_for("inside", since=time.time())
+        listener.wait_for("inside", since=time.time())
     finally:
-        named.end("ear")
+        named.end("listener")
 
 
 def test_nodes_of_two_networks_hear_each_other(
@@ -158,18 +158,18 @@ def test_container_of_two_networks(controller: Controller, net: Inside, named: R
     node = net.node(first, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create")
     docker("network", "connect", second, node.name)
     docker("start", node.name)
-    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    listener = named.node("listener", "roscpp", "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
         proxy = the_proxy()
         assert proxy.networks == {first, second}
 
         docker("network", "disconnect", proxy_free_network(node, proxy, first, second), node.name)
 
         wait_until(lambda: len(proxy.networks) == 1, 60, lambda: str(proxy.networks))
-        ear.wait_for("inside", since=time.time())
+        listener.wait_for("inside", since=time.time())
     finally:
-        named.end("ear")
+        named.end("listener")
 
 
 def proxy_free_network(node: Container, proxy: Proxy, *networks: str) -> str:

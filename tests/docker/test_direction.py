@@ -68,13 +68,15 @@ def test_udpros_of_the_robot_reaches_a_container_that_asks_for_it(
     network = net.network("--internal")
     words = ("--topic", "/quick", "--udp", "1")
     back = ("--topic", "/back", "--rate", "20", "--word", "back")
-    named.node("mouth", "roscpp", "pub", "--topic", "/quick", "--rate", "20", "--word", "quick")
+    named.node(
+        "robot_talker", "roscpp", "pub", "--topic", "/quick", "--rate", "20", "--word", "quick"
+    )
     listener = net.node(network, "roscpp", "sub", *words, labels=(ENABLE, "rosproxy.udp=true"))
     net.node(network, "roscpp", "pub", *back)
-    ear = named.node("ear", "roscpp", "sub", "--topic", "/back", "--udp", "1")
+    robot_listener = named.node("robot_listener", "roscpp", "sub", "--topic", "/back", "--udp", "1")
     try:
         listener.log.wait_for("quick", count=10)
-        ear.wait_for("back", count=10)
+        robot_listener.wait_for("back", count=10)
         document = json.loads(docker("exec", the_proxy().name, "rosproxy", "status", "--json"))
         assert {row["topic"] for row in document["udpros"]} == {"/quick", "/back"}
 
@@ -82,8 +84,8 @@ def test_udpros_of_the_robot_reaches_a_container_that_asks_for_it(
         docker("rm", "--force", the_proxy().name)
 
         listener.log.wait_for("quick", count=10, since=recovered(lost))
-        ear.wait_for("back", count=10, since=recovered(lost))
+        robot_listener.wait_for("back", count=10, since=recovered(lost))
     finally:
-        named.end("mouth")
-        named.end("ear")
+        named.end("robot_talker")
+        named.end("robot_listener")
     assert "Traceback" not in controller.logs()

@@ -55,7 +55,7 @@ def controller(
 
 
 @pytest.fixture(scope="module")
-def ears(
+def listeners(
     engine: PrivateEngine, robot: Robot, controller: Process, ros_image: str
 ) -> Iterator[dict[str, Log]]:
     """What the robot hears of two nodes inside, in either language."""
@@ -68,7 +68,7 @@ def ears(
             inside.node(network, library, "pub", "--topic", f"/{library}", "--word", "inside",
                         options=RESTART)  # fmt: skip
         yield {
-            library: robot.node(f"ear_{library}", library, "sub", "--topic", f"/{library}")
+            library: robot.node(f"listener_{library}", library, "sub", "--topic", f"/{library}")
             for library in LIBRARIES
         }
 
@@ -79,14 +79,14 @@ def test_everything_comes_back_with_the_engine(
     then: tuple[str, ...],
     engine: PrivateEngine,
     controller: Process,
-    ears: dict[str, Log],
+    listeners: dict[str, Log],
 ) -> None:
     """The engine ends the containers, at the latest when it is back, and starts them again.
 
     Their addresses may be others.
     """
-    for ear in ears.values():
-        ear.wait_for("inside")
+    for listener in listeners.values():
+        listener.wait_for("inside")
     ports = the_proxy().ports
     process = controller.process
 
@@ -96,8 +96,8 @@ def test_everything_comes_back_with_the_engine(
     engine.start(*then)
     began = time.time()
 
-    for library, ear in ears.items():
-        heard = ear.wait_for("inside", since=began, seconds=60)
+    for library, listener in listeners.items():
+        heard = listener.wait_for("inside", since=began, seconds=60)
         print(
             f"{how.name}, {library}: heard {heard - began:.1f} s after the engine was there again"
         )
@@ -107,7 +107,7 @@ def test_everything_comes_back_with_the_engine(
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_nobody_notices_an_engine_with_live_restore(
-    how: signal.Signals, engine: PrivateEngine, controller: Process, ears: dict[str, Log]
+    how: signal.Signals, engine: PrivateEngine, controller: Process, listeners: dict[str, Log]
 ) -> None:
     """Containers go on without the engine, and so does the proxy."""
     began = time.time()
@@ -117,16 +117,20 @@ def test_nobody_notices_an_engine_with_live_restore(
     time_without = time.time()
     engine.start(*LIVE)
 
-    for ear in ears.values():
-        ear.wait_for("inside", since=time.time())
-        assert ear.lost("inside", began) == 0
-        assert ear.longest_gap("inside", began, time.time()) < UNNOTICED
+    for listener in listeners.values():
+        listener.wait_for("inside", since=time.time())
+        assert listener.lost("inside", began) == 0
+        assert listener.longest_gap("inside", began, time.time()) < UNNOTICED
     print(f"{how.name}: {time.time() - time_without:.1f} s without the engine")
     assert the_proxy().id == number
 
 
 def test_controller_works_on_after_all_that(
-    engine: PrivateEngine, controller: Process, ears: dict[str, Log], robot: Robot, ros_image: str
+    engine: PrivateEngine,
+    controller: Process,
+    listeners: dict[str, Log],
+    robot: Robot,
+    ros_image: str,
 ) -> None:
     inside = Inside(ros_image, robot.master_uri)
 

@@ -171,9 +171,9 @@ def test_example_with_ros_2(
     project = Example(ROS2, {**variables, **images, "ROS2_IMAGE": ros2_image}, extra)
     try:
         with running(project):
-            ear = lan.node("jazzy", "sub", "/chatter")
+            listener = lan.node("jazzy", "sub", "/chatter")
             lan.node("jazzy", "pub", "/command", "--word", "hello")
-            wait_for_line(ear.log, "^got hello from inside ")
+            wait_for_line(listener.log, "^got hello from inside ")
             wait_until(
                 lambda: project.compose("logs", "listener").count("hello ") >= 3, 30,
                 lambda: project.compose("logs", "listener"),

@@ -23,18 +23,18 @@ def test_label_alone_is_heard_and_hears(
     hearing = net.node(network, library, "sub", "--topic", "/in")
     outside = {"robot": named, "laptop": other_machine}
     for name, machine in outside.items():
-        machine.node("mouth_" + name, library, "pub", "--topic", "/in", "--word", name)
-    ears = [machine.node("ear_" + name, library, "sub", "--topic", "/out")
+        machine.node("talker_" + name, library, "pub", "--topic", "/in", "--word", name)
+    listeners = [machine.node("listener_" + name, library, "sub", "--topic", "/out")
             for name, machine in outside.items()]  # fmt: skip
     try:
-        for ear in ears:
-            ear.wait_for("inside")
+        for listener in listeners:
+            listener.wait_for("inside")
         for name in outside:
             hearing.log.wait_for(name)
     finally:
         for name, machine in outside.items():
-            machine.end("ear_" + name)
-            machine.end("mouth_" + name)
+            machine.end("listener_" + name)
+            machine.end("talker_" + name)
 
 
 @pytest.mark.parametrize("library", LIBRARIES)

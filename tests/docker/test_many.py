@@ -17,7 +17,7 @@ def test_twenty_containers_at_once(
     start_controller("--ports", str(COUNT + 4))
     network = net.network()
     texts = [f"number{number}" for number in range(COUNT)]
-    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    listener = named.node("listener", "roscpp", "sub", "--topic", "/out")
     nodes = [
         net.node(network, ("rospy", "roscpp")[number % 2], "pub", "--topic", "/out", "--rate", "2",
                  "--word", text, verb="create")
@@ -26,7 +26,7 @@ def test_twenty_containers_at_once(
     started = time.time()
     docker("start", *(node.name for node in nodes), seconds=120)
     try:
-        heard = [ear.wait_for(text, seconds=60) for text in texts]
+        heard = [listener.wait_for(text, seconds=60) for text in texts]
 
         print(f"{COUNT} containers: the first heard after {min(heard) - started:.1f} s, "
               f"the last after {max(heard) - started:.1f} s")  # fmt: skip
@@ -37,4 +37,4 @@ def test_twenty_containers_at_once(
         gone = wait_until(lambda: not any(named.uri(node.node) for node in nodes), 25, "all gone")
         print(f"{COUNT} containers killed: unregistered after {gone:.1f} s")
     finally:
-        named.end("ear")
+        named.end("listener")

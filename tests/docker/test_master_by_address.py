@@ -25,16 +25,18 @@ def test_the_label_alone_is_enough(
     options = ["--network-alias", "talker"]
     if known_by:
         options += ["--env", f"{known_by}={variables[known_by]}"]
-    ear = robot.node("ear", library, "sub", "--topic", "/out")
-    robot.node("mouth", library, "pub", "--topic", "/in", "--word", "robot")
+    robot_listener = robot.node("robot_listener", library, "sub", "--topic", "/out")
+    robot.node("robot_talker", library, "pub", "--topic", "/in", "--word", "robot")
     robot.node("server", library, "serve", "--service", "/there")
     began = time.time()
     try:
         node = near.node(
             network, library, "pub", "--topic", "/out", "--word", "inside", options=tuple(options)
         )
-        ear.wait_for("inside")
-        print(f"{library}: heard {ear.got('inside')[0].at - began:.1f} s after docker run")
+        robot_listener.wait_for("inside")
+        print(
+            f"{library}: heard {robot_listener.got('inside')[0].at - began:.1f} s after docker run"
+        )
         server = near.node(network, library, "serve", "--service", "/ask")
         listener = near.node(network, library, "sub", "--topic", "/in")
         listener.log.wait_for("robot")
@@ -50,7 +52,7 @@ def test_the_label_alone_is_enough(
             assert inspect(container.name)["RestartCount"] == 0
             redirected(container, network)
     finally:
-        for name in ("ear", "mouth", "server", "caller"):
+        for name in ("robot_listener", "robot_talker", "server", "caller"):
             robot.end(name)
 
 
@@ -102,17 +104,17 @@ def test_networks_joined_later_and_left(controller: Controller, near: Inside, ro
     first = near.network()
     second = near.network()
     node = addressed_talker(near, first, robot)
-    ear = robot.node("ear", "roscpp", "sub", "--topic", "/out")
+    robot_listener = robot.node("robot_listener", "roscpp", "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        robot_listener.wait_for("inside")
         docker("network", "connect", second, node.name)
         wait_until(lambda: the_proxy().networks == {first, second}, 60, "both are joined")
         docker("network", "disconnect", first, node.name)
 
         redirected(node, second)
-        ear.wait_for("inside", since=time.time())
+        robot_listener.wait_for("inside", since=time.time())
     finally:
-        robot.end("ear")
+        robot.end("robot_listener")
 
 
 def test_containers_that_share_a_network(

@@ -36,18 +36,18 @@ def test_two_masters_on_one_network(
                        uri=robot.master_uri)
         for name, robot in robots.items()
     }  # fmt: skip
-    ears = {name: robot.node("ear", "rospy", "sub", "--topic", "/out")
+    listeners = {name: robot.node("listener", "rospy", "sub", "--topic", "/out")
             for name, robot in robots.items()}  # fmt: skip
     try:
-        for name, ear in ears.items():
-            ear.wait_for(name)
-            assert {got.text for got in ear.got()} == {name}
+        for name, listener in listeners.items():
+            listener.wait_for(name)
+            assert {got.text for got in listener.got()} == {name}
             assert robots[name].knows_proxied(nodes[name].node)
         first, second = proxies()
         assert not set(first.ports) & set(second.ports)
     finally:
         for robot in robots.values():
-            robot.end("ear")
+            robot.end("listener")
 
 
 def test_two_masters_of_one_host(
@@ -104,7 +104,7 @@ def test_masters_host_gets_another_address(
             moved = replace(robot, address=address)
 
             wait_until(lambda: moved.knows_proxied(later.node), 40, controller.logs)
-            moved.node("ear", "rospy", "sub", "--topic", "/out").wait_for("inside")
+            moved.node("listener", "rospy", "sub", "--topic", "/out").wait_for("inside")
             assert the_proxy().id == number
         finally:
             controller.stop()
@@ -148,8 +148,8 @@ def test_a_master_given_by_address_gets_another_one(
                     lambda: moved.knows_proxied(container.node),  # noqa: B023
                     60, controller.logs,
                 )  # fmt: skip
-            moved.node("ear", "rospy", "sub", "--topic", "/out").wait_for("inside")
-            moved.node("ear2", "rospy", "sub", "--topic", "/plain").wait_for("new")
+            moved.node("listener", "rospy", "sub", "--topic", "/out").wait_for("inside")
+            moved.node("listener2", "rospy", "sub", "--topic", "/plain").wait_for("new")
         finally:
             controller.stop()
             remove_proxies()

@@ -61,7 +61,7 @@ def test_dashboard_and_alerts(
 ) -> None:  # fmt: skip
     """One run: all is well; then one thing after the other breaks; each panel has had data."""
     network = cell.network()
-    ear = lan.node("jazzy", "sub", "/out")
+    listener = lan.node("jazzy", "sub", "/out")
     labels = (ENABLE, f"rosproxy.advertise-host={HERE}", "rosproxy.ports=16")
     inside2.node(inside2.made.network(), "jazzy", "pub", "/out", "--word", "inside", labels=labels)
     with traffic(cell, patrol, network, "rospy", labels=LABELS):
@@ -69,7 +69,7 @@ def test_dashboard_and_alerts(
         cell.node(network, "roscpp", "pub", "--topic", "/secret", labels=hidden)
         box = cell.idle(network, labels=LABELS)
         start_node(box, "victim")
-        ear.log.wait_for("inside")
+        listener.log.wait_for("inside")
         proxy = ros1_proxy()
         everybody = {("rosproxy", target.name) for target in (proxy, *ros2_proxies())}
         everybody |= {("rosproxy-operator", "rosproxy-operator")}

@@ -35,6 +35,6 @@ def test_a_label_hides_a_topic_from_outside(
 
     hider.remove()
     net.node(*publish, name=hider.name)
-    named.node("ear_hidden", "roscpp", "sub", "--topic", topic).wait_for("inside")
-    named.end("ear_hidden")
+    named.node("listener_hidden", "roscpp", "sub", "--topic", topic).wait_for("inside")
+    named.end("listener_hidden")
     assert named.publishers(topic) == {f"/{hider.node}"}

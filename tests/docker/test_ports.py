@@ -133,8 +133,8 @@ def test_range_taken_by_another_while_the_proxy_was_down(
     docker("restart", "--time", "0", node.name)
     # roscpp takes what the reply to its subscription says, also if it is older than an update.
     wait_until(lambda: named.uri(node.node) not in ("", left), 60, node.log.read)
-    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    listener = named.node("listener", "roscpp", "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
     finally:
-        named.end("ear")
+        named.end("listener")

@@ -49,11 +49,11 @@ def test_nodes_that_were_quicker_are_adopted(
     for container in (node, server):
         wait_until(lambda: robot.uri(container.node) != "", 60, container.log.read)  # noqa: B023
         assert not robot.knows_proxied(container.node)
-    ear = robot.node("ear", library, "sub", "--topic", "/out")
+    listener = robot.node("listener", library, "sub", "--topic", "/out")
     try:
         process()
 
-        ear.wait_for("inside")
+        listener.wait_for("inside")
         robot.node("caller", library, "call", "--service", "/ask", "--count", "3").wait_for(
             "ask", verb="reply"
         )
@@ -62,7 +62,7 @@ def test_nodes_that_were_quicker_are_adopted(
             assert inspect(container.name)["RestartCount"] == 0
             assert "shutdown" not in container.log.read()
     finally:
-        for name in ("ear", "caller"):
+        for name in ("listener", "caller"):
             robot.end(name)
 
 
@@ -72,9 +72,9 @@ def test_after_whatever_is_lost_it_is_there_again(
     network = near.network()
     running = process()
     node = addressed_talker(near, network, robot, "rospy")
-    ear = robot.node("ear", "rospy", "sub", "--topic", "/out")
+    listener = robot.node("listener", "rospy", "sub", "--topic", "/out")
     try:
-        ear.wait_for("inside")
+        listener.wait_for("inside")
         for command in (
             ("restart", "--time", "0", node.name),
             ("kill", the_proxy().name),
@@ -83,7 +83,7 @@ def test_after_whatever_is_lost_it_is_there_again(
         ):
             since = time.time()
             docker(*command, seconds=120)
-            ear.wait_for("inside", since=since)
+            listener.wait_for("inside", since=since)
             redirected(node, network)
         running.kill()
         docker("restart", "--time", "0", node.name)
@@ -91,10 +91,10 @@ def test_after_whatever_is_lost_it_is_there_again(
         assert not rules(node)
         running.start()
         redirected(node, network)
-        ear.wait_for("inside", since=time.time())
+        listener.wait_for("inside", since=time.time())
         wait_until(lambda: len(managed("redirect")) == 1, 30, lambda: str(managed("redirect")))
     finally:
-        robot.end("ear")
+        robot.end("listener")
 
 
 def test_the_proxys_address_changes(

@@ -43,7 +43,7 @@ def _nodes_end(lan: Outside) -> Iterator[None]:
 
 @pytest.mark.parametrize(("vendor_inside", "vendor_outside"), PAIRS)
 def test_topics(vendor_inside: str, vendor_outside: str, lan: Outside, inside2: Inside2) -> None:
-    ear = lan.node(vendor_outside, "sub", "/out")
+    lan_listener = lan.node(vendor_outside, "sub", "/out")
     lan.node(vendor_outside, "pub", "/back", "--word", "outside")
     network = inside2.made.network()
     started = time.time()
@@ -51,7 +51,7 @@ def test_topics(vendor_inside: str, vendor_outside: str, lan: Outside, inside2: 
     inside2.node(network, vendor_inside, "pub", "/out", "--word", "inside")
     listener = inside2.node(network, vendor_inside, "sub", "/back")
 
-    outward = ear.log.wait_for("inside")
+    outward = lan_listener.log.wait_for("inside")
     inward = listener.log.wait_for("outside")
     print(f"{vendor_inside} inside, {vendor_outside} outside: the first message outside "
           f"{outward - started:.1f} s after docker run, inside "
@@ -61,15 +61,15 @@ def test_topics(vendor_inside: str, vendor_outside: str, lan: Outside, inside2: 
 @pytest.mark.parametrize("vendor", ["jazzy", "cyclone"])
 def test_one_more_where_a_proxy_is(vendor: str, lan: Outside, inside2: Inside2) -> None:
     """On a network that the proxy is on, and on one that it has to join."""
-    ear = lan.node("jazzy", "sub", "/out")
+    listener = lan.node("jazzy", "sub", "/out")
     network = inside2.made.network()
     inside2.node(network, "jazzy", "pub", "/out", "--word", "first")
-    ear.log.wait_for("first")
+    listener.log.wait_for("first")
 
     for place, text in ((network, "near"), (inside2.made.network(), "far")):
         started = time.time()
         node = inside2.node(place, vendor, "pub", "/out", "--word", text)
-        heard = ear.log.wait_for(text)
+        heard = listener.log.wait_for(text)
         sent = datetime.fromisoformat(
             docker("logs", "--timestamps", node.name).split()[0]
         ).timestamp()
@@ -108,11 +108,11 @@ def test_domains_are_apart(lan: Outside, inside2: Inside2) -> None:
     network = inside2.made.network()
     inside2.node(network, "jazzy", "pub", "/out", options=("--env", "ROS_DOMAIN_ID=7"))
     heard = inside2.node(network, "jazzy", "pub", "/out", "--word", "zero")
-    ear = lan.node("jazzy", "sub", "/out")
+    listener = lan.node("jazzy", "sub", "/out")
 
-    ear.log.wait_for("zero", count=10)
+    listener.log.wait_for("zero", count=10)
 
-    assert ear.log.got("hello") == []
+    assert listener.log.got("hello") == []
     wait_until(
         lambda: sorted(domain(proxy).domain for proxy in ros2_proxies()) == [0, 7],
         30, "a proxy for each domain, which answers",
@@ -129,7 +129,7 @@ def test_a_container_that_is_gone_takes_its_participants_with_it(
     neighbour = inside2.node(network, "jazzy", "pub", "/other", "--word", "neighbour")
     node = inside2.node(network, "jazzy", "pub", "/out")
     watcher = lan.node("jazzy", "names", "/any")
-    ear = lan.node("jazzy", "sub", "/other")
+    listener = lan.node("jazzy", "sub", "/other")
     wait_for_line(watcher.log, rf"^nodes .*\b{node.node}\b")
     wait_for_line(watcher.log, rf"^nodes .*\b{neighbour.node}\b")
     proxy = the_proxy()
@@ -143,7 +143,7 @@ def test_a_container_that_is_gone_takes_its_participants_with_it(
     seconds = wait_until(gone, 8, watcher.log.read)
     print(f"docker {end}: outside has forgotten the node after {seconds:.1f} s")
     wait_until(lambda: len(domain(proxy).inside) == 1, 5, lambda: str(domain(proxy).inside))
-    ear.log.wait_for("neighbour", since=time.time())
+    listener.log.wait_for("neighbour", since=time.time())
 
 
 def test_a_neighbour_without_a_label_is_not_let_in(lan: Outside, inside2: Inside2) -> None:
@@ -151,10 +151,10 @@ def test_a_neighbour_without_a_label_is_not_let_in(lan: Outside, inside2: Inside
     secret = inside2.node(network, "jazzy", "pub", "/secret", labels=())
     wait_for_line(secret.log, "^sent ")
     inside2.node(network, "jazzy", "pub", "/out", "--word", "inside")
-    ear = lan.node("jazzy", "sub", "/out")
+    listener = lan.node("jazzy", "sub", "/out")
     spy = lan.node("jazzy", "sub", "/secret")
 
-    ear.log.wait_for("inside", count=50)
+    listener.log.wait_for("inside", count=50)
 
     assert spy.log.got() == []
     assert len(ports(the_proxy())) == 1
@@ -167,15 +167,15 @@ def test_a_network_that_its_proxy_has_left_is_heard_again(lan: Outside, inside2:
     inside2.node(other, "jazzy", "pub", "/other", "--word", "neighbour")
     first = inside2.node(network, "jazzy", "pub", "/out", "--word", "first")
     neighbour = lan.node("jazzy", "sub", "/other")
-    ear = lan.node("jazzy", "sub", "/out")
-    ear.log.wait_for("first")
+    listener = lan.node("jazzy", "sub", "/out")
+    listener.log.wait_for("first")
     proxy = the_proxy()
 
     first.remove()
     wait_until(lambda: network not in proxy.networks, 30, "the proxy has left the network")
     inside2.node(network, "jazzy", "pub", "/out", "--word", "second")
 
-    ear.log.wait_for("second")
+    listener.log.wait_for("second")
     neighbour.log.wait_for("neighbour", since=time.time())
     assert "Traceback" not in logs(proxy.name)
 
@@ -198,12 +198,12 @@ def test_a_container_with_both_versions_has_two_proxies(
     assert controller.command("plan") == "Nothing to do."
 
 
-def test_the_ear_has_the_hosts_network_and_no_other_right(inside2: Inside2) -> None:
+def test_the_lan_relay_has_the_hosts_network_and_no_other_right(inside2: Inside2) -> None:
     inside2.node(inside2.made.network(), "jazzy", "pub", "/out")
     proxy = the_proxy()
-    wait_until(lambda: bool(inspect(proxy.ear, check=False)), 30, "the ear is there")
+    wait_until(lambda: bool(inspect(proxy.lan_relay, check=False)), 30, "the LAN relay is there")
 
-    inspection = inspect(proxy.ear)
+    inspection = inspect(proxy.lan_relay)
 
     assert inspection["Config"]["User"] == "10001:10001"
     host = inspection["HostConfig"]

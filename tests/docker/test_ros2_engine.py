@@ -85,7 +85,7 @@ def test_everything_comes_back_with_the_engine(
 def test_nobody_notices_an_engine_with_live_restore(
     how: signal.Signals, engine: PrivateEngine, flow: Flow
 ) -> None:
-    """Containers go on without the engine, and so do proxy and ear."""
+    """Containers go on without the engine, and so do proxy and LAN relay."""
     proxy = the_proxy()
     before = runs(proxy)
     began = time.time()

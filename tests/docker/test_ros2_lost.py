@@ -32,9 +32,9 @@ LOSSES: dict[str, Callable[[Proxy], object]] = {
     "crash": lambda proxy: crash(proxy.name),
     "docker kill …-ports": lambda proxy: docker("kill", proxy.sandbox),
     "docker rm --force …-ports": lambda proxy: docker("rm", "--force", proxy.sandbox),
-    "docker kill …-ear": lambda proxy: docker("kill", proxy.ear),
-    "docker rm --force …-ear": lambda proxy: docker("rm", "--force", proxy.ear),
-    "ear crashes": lambda proxy: crash(proxy.ear),
+    "docker kill …-lan-relay": lambda proxy: docker("kill", proxy.lan_relay),
+    "docker rm --force …-lan-relay": lambda proxy: docker("rm", "--force", proxy.lan_relay),
+    "LAN relay crashes": lambda proxy: crash(proxy.lan_relay),
 }
 
 
@@ -61,11 +61,11 @@ def test_what_is_lost_comes_back(how: str, flow: Flow) -> None:
     assert proxy.ports == port_range
 
 
-def test_an_outside_node_that_comes_after_the_ear_was_lost_is_heard(
+def test_an_outside_node_that_comes_after_the_lan_relay_was_lost_is_heard(
     flow: Flow, lan: Outside
 ) -> None:
     proxy = the_proxy()
-    docker("rm", "--force", proxy.ear)
+    docker("rm", "--force", proxy.lan_relay)
     wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
 
     late = lan.node("jazzy", "sub", "/out")
@@ -81,23 +81,25 @@ def test_controller_killed(flow: Flow, controller: Controller) -> None:
     try:
         flow.wait(since=time.time())
         print(f"controller killed: {flow.gaps(killed)}")
-        docker("rm", "--force", proxy.name, proxy.ear)
+        docker("rm", "--force", proxy.name, proxy.lan_relay)
     finally:
         controller.start()
     wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
     flow.wait(since=time.time())
 
 
-def test_proxy_and_ear_crash_while_no_controller_runs(flow: Flow, controller: Controller) -> None:
+def test_proxy_and_lan_relay_crash_while_no_controller_runs(
+    flow: Flow, controller: Controller
+) -> None:
     """The engine starts both again, and they need nobody else."""
     proxy = the_proxy()
     controller.kill()
     try:
         lost = time.time()
         crash(proxy.name)
-        crash(proxy.ear)
+        crash(proxy.lan_relay)
         wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
         flow.wait(since=time.time())
-        print(f"proxy and ear crash without a controller: {flow.gaps(lost)}")
+        print(f"proxy and LAN relay crash without a controller: {flow.gaps(lost)}")
     finally:
         controller.start()

@@ -55,7 +55,7 @@ def test_on_another_range_participants_meet_anew(
         time.sleep(6)  # the operator looks every five seconds
         pause(controller.container)
         lost = time.time()
-        docker("kill", proxy.name, proxy.ear, proxy.sandbox)
+        docker("kill", proxy.name, proxy.lan_relay, proxy.sandbox)
         taken = ("--publish", f"{before[4]}:80/udp")
         inside2.made.idle(inside2.made.network(), labels=(), options=taken)
 
@@ -83,7 +83,7 @@ def test_range_taken_by_another_while_neither_proxy_nor_operator_was_there(
         proxy = the_proxy()
         before = proxy.ports
         controller.kill()
-        docker("kill", proxy.name, proxy.ear, proxy.sandbox)
+        docker("kill", proxy.name, proxy.lan_relay, proxy.sandbox)
         taken = ("--publish", f"{before[4]}:80/udp")
         inside2.made.idle(inside2.made.network(), labels=(), options=taken)
 
@@ -105,7 +105,7 @@ def test_range_taken_by_another_while_neither_proxy_nor_operator_was_there(
 def test_range_grows_in_place(
     start_controller: Callable[..., Controller], lan: Outside, inside2: Inside2
 ) -> None:
-    """The port that was the ear's is published then, and the ear gets another one."""
+    """The port that was the LAN relay's is published then, and the LAN relay gets another one."""
     start_controller(*OPTIONS)
     try:
         flow = Flow(lan, inside2)
@@ -131,7 +131,7 @@ def test_range_grows_in_place(
         flow.wait(since=time.time())
         print(f"range extended: {flow.gaps(changed)}")
         assert proxy.ports[0] == before[0]
-        assert domain(proxy).ear.endswith(f":{proxy.ports[-1]}")
+        assert domain(proxy).lan_relay.endswith(f":{proxy.ports[-1]}")
     finally:
         lan.end()
 
@@ -144,14 +144,14 @@ def test_peers_without_multicast(
         flow = Flow(lan, inside2)
         proxy = the_proxy()
         assert domain(proxy).peers == (THERE,)
-        assert not inspect(proxy.ear, check=False)
+        assert not inspect(proxy.lan_relay, check=False)
         flow.wait(since=time.time())
-        assert "domain 0, no ear" in controller.command("status", check=False)
+        assert "domain 0, no LAN relay" in controller.command("status", check=False)
     finally:
         lan.end()
 
 
-def test_a_new_image_replaces_proxy_and_ear(
+def test_a_new_image_replaces_proxy_and_lan_relay(
     start_controller: Callable[..., Controller], moving_image: str, lan: Outside, inside2: Inside2
 ) -> None:
     start_controller("--proxy-image", moving_image, *OPTIONS)
@@ -181,7 +181,7 @@ def test_a_new_image_replaces_proxy_and_ear(
 
 def ids(proxy: Proxy) -> set[str]:
     """Those of the containers of the proxy's image; empty ones where there is none."""
-    return {inspect(name, check=False).get("Id", "") for name in (proxy.name, proxy.ear)}
+    return {inspect(name, check=False).get("Id", "") for name in (proxy.name, proxy.lan_relay)}
 
 
 def test_on_an_internal_network_the_proxy_is_the_way_out(

@@ -58,11 +58,11 @@ def test_a_stock_compose_file_and_a_label(
     project: Path, controller: Controller, robot: Robot
 ) -> None:
     heard = {
-        word: robot.node(f"ear_{word}", library, "sub", "--topic", f"/from_{word}")
+        word: robot.node(f"listener_{word}", library, "sub", "--topic", f"/from_{word}")
         for word, library in (("py", "roscpp"), ("cpp", "rospy"), ("beside", "rospy"))
     }
     for word, library in (("py", "roscpp"), ("cpp", "rospy")):
-        robot.node(f"mouth_{word}", library, "pub", "--topic", f"/to_{word}", "--word", "robot")
+        robot.node(f"talker_{word}", library, "pub", "--topic", f"/to_{word}", "--word", "robot")
     try:
         compose(project, *FILES, "up", "--detach", variables={})
 
@@ -73,5 +73,5 @@ def test_a_stock_compose_file_and_a_label(
         assert all(robot.knows_proxied(name) for name in NODES)
         assert controller.problems() == ""
     finally:
-        for name in ("ear_py", "ear_cpp", "ear_beside", "mouth_py", "mouth_cpp"):
+        for name in ("listener_py", "listener_cpp", "listener_beside", "talker_py", "talker_cpp"):
             robot.end(name)

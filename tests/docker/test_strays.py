@@ -42,16 +42,16 @@ def test_nodes_that_were_there_first_are_adopted(
     listener = net.node(network, library, "sub", "--topic", "/in", options=dns_options)
     for container in (node, server, listener):
         wait_until(lambda: is_stray(named, container), 60, container.log.read)  # noqa: B023
-    ear = named.node("ear", library, "sub", "--topic", "/out")
-    named.node("mouth", library, "pub", "--topic", "/in", "--word", "robot")
+    robot_listener = named.node("robot_listener", library, "sub", "--topic", "/out")
+    named.node("robot_talker", library, "pub", "--topic", "/in", "--word", "robot")
     try:
-        wait_until(lambda: "ready" in ear.read(), 60, ear.read)
-        assert not ear.got()
+        wait_until(lambda: "ready" in robot_listener.read(), 60, robot_listener.read)
+        assert not robot_listener.got()
         began = time.time()
 
         start_controller()
 
-        heard = ear.wait_for("inside") - began
+        heard = robot_listener.wait_for("inside") - began
         print(f"{library}: heard {heard:.1f} s after the controller was started")
         caller = named.node("caller", library, "call", "--service", "/ask", "--count", "3")
         caller.wait_for("ask", verb="reply")
@@ -63,8 +63,8 @@ def test_nodes_that_were_there_first_are_adopted(
         docker("stop", node.name)
         wait_until(lambda: not named.uri(node.node), 5, "it is gone from the master")
     finally:
-        named.end("ear")
-        named.end("mouth")
+        named.end("robot_listener")
+        named.end("robot_talker")
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -74,7 +74,7 @@ def test_node_that_starts_faster_than_its_proxy(
 ) -> None:  # fmt: skip
     start_controller()
     network = net.network()
-    ear = named.node("ear", library, "sub", "--topic", "/out")
+    robot_listener = named.node("robot_listener", library, "sub", "--topic", "/out")
     try:
         for text in ("first", "second", "third"):
             began = time.time()
@@ -82,8 +82,8 @@ def test_node_that_starts_faster_than_its_proxy(
             net.node(
                 network, library, "pub", "--topic", "/out", "--word", text, options=dns_options
             )
-            heard = ear.wait_for(text) - began
+            heard = robot_listener.wait_for(text) - began
             print(f"{library}: heard {heard:.1f} s after docker run, "
                   f"{'with' if has_proxy else 'without'} a proxy")  # fmt: skip
     finally:
-        named.end("ear")
+        named.end("robot_listener")

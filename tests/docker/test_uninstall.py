@@ -31,7 +31,7 @@ def test_nothing_is_left_once_the_operator_has_ended(
     node = addressed_talker(near, network, robot)
     redirected(node, network)
     inside2.node(inside2.made.network(), "jazzy", "pub", "/two")
-    roles = {"proxy", "ports", "ear", "redirect"}
+    roles = {"proxy", "ports", "lan-relay", "redirect"}
 
     def made() -> set[str]:
         return {c["Labels"]["io.rosproxy.role"] for c in containers(MANAGED)}

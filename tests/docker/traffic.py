@@ -77,7 +77,7 @@ def traffic(
                       labels=labels)  # fmt: skip
     listener = net.node(network, library, "sub", "--topic", back, labels=labels)
     server = net.node(network, library, "serve", "--service", service, labels=labels)
-    names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
+    names = [f"{role}_{mark}" for role in ("listener", "talker", "caller")]
     outward = robot.node(names[0], library, "sub", "--topic", out)
     robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
     called = robot.node(names[2], library, "call", "--service", service, "--rate", "5",

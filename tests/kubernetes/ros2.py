@@ -87,9 +87,9 @@ def node(
     return net.pod(*words, name=name, env=told, **more)
 
 
-def ears(of: RosProxy) -> list[Json]:
-    """The pods of a RosProxy's ears."""
-    bodies = api.objects("pods", of.namespace, "app.kubernetes.io/component=ear")
+def lan_relays(of: RosProxy) -> list[Json]:
+    """The pods of a RosProxy's LAN relays."""
+    bodies = api.objects("pods", of.namespace, "app.kubernetes.io/component=LAN relay")
     return [body for body in bodies if "deletionTimestamp" not in body["metadata"]]
 
 

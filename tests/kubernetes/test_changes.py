@@ -20,7 +20,9 @@ def test_another_master(net: Namespace, robot: Robot) -> None:
     topic = f"/{unique('moved').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     old = talker(net, topic)
-    robot.node("ear_before", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=START)
+    robot.node("listener_before", "rospy", "sub", "--topic", topic).wait_for(
+        "inside", seconds=START
+    )
     before = made.the_proxy()
     with robot_with_master() as other:
         made.change(master={"uri": other.master_uri})
@@ -28,8 +30,8 @@ def test_another_master(net: Namespace, robot: Robot) -> None:
         wait_until(lambda: made.the_proxy().uid_then != before.uid_then, 40, made.tell)
         wait_until(lambda: not robot.uri(old), 25, lambda: str(robot.nodes()))
         name = talker(net, topic, "roscpp")
-        ear = other.node("ear_after", "roscpp", "sub", "--topic", topic)
-        ear.wait_for("inside", seconds=60)
+        listener = other.node("listener_after", "roscpp", "sub", "--topic", topic)
+        listener.wait_for("inside", seconds=60)
         assert other.knows_proxied(name)
 
 
@@ -73,7 +75,7 @@ def test_deleted_rosproxy_leaves_only_the_users_pods(net: Namespace, robot: Robo
     topic = f"/{unique('left').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     name = talker(net, topic)
-    robot.node("ear_left", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=START)
+    robot.node("listener_left", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=START)
     pods = {body["metadata"]["uid"] for body in net.pods(INJECT)}
 
     made.remove()

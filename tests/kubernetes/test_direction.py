@@ -88,11 +88,11 @@ def test_without_it_they_hear_nobody_and_doctor_says_what_to_do(
     for node in NODES:
         net.idle(on=node.name)
     with kept_in(made):
-        robot.node("mouth_shut", "roscpp", "pub", "--topic", "/shut", "--word", "outside")
+        robot.node("robot_talker_shut", "roscpp", "pub", "--topic", "/shut", "--word", "outside")
         deaf = net.node("roscpp", "sub", "--topic", "/shut", on="node1")
         net.node("roscpp", "pub", "--topic", "/heard", "--word", "inside", on="node1")
-        ear = robot.node("ear_shut", "roscpp", "sub", "--topic", "/heard")
-        ear.wait_for("inside", seconds=START)
+        robot_listener = robot.node("robot_listener_shut", "roscpp", "sub", "--topic", "/heard")
+        robot_listener.wait_for("inside", seconds=START)
         told = made.the_proxy().run("rosproxy", "doctor", "/shut", check=False)
         assert "spec.direction: Both" in " ".join(told.split()), told
         assert not deaf.log.got("outside")
@@ -108,12 +108,14 @@ def test_udpros_crosses_the_boundary_both_ways(net: Namespace, robot: Robot) -> 
     for node in NODES:
         net.idle(on=node.name)
     with kept_in(made):
-        robot.node("mouth", "roscpp", "pub", "--topic", "/quick_by_udp", "--word", "quick")
+        robot.node("robot_talker", "roscpp", "pub", "--topic", "/quick_by_udp", "--word", "quick")
         listener = net.node("roscpp", "sub", "--topic", "/quick_by_udp", "--udp", "1", on="node1")
         net.node("roscpp", "pub", "--topic", "/back_by_udp", "--word", "back", on="node2")
-        ear = robot.node("ear", "roscpp", "sub", "--topic", "/back_by_udp", "--udp", "1")
+        robot_listener = robot.node(
+            "robot_listener", "roscpp", "sub", "--topic", "/back_by_udp", "--udp", "1"
+        )
         listener.log.wait_for("quick", 10, seconds=START)
-        ear.wait_for("back", 10, seconds=START)
+        robot_listener.wait_for("back", 10, seconds=START)
         lost = time.time()
         made.the_proxy("node1").crash()
         listener.log.wait_for("quick", 10, since=lost + 1.5, seconds=60)

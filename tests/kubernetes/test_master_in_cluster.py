@@ -62,16 +62,16 @@ def test_topics_and_services_with_the_robot(
 ) -> None:
     mark = unique(library).replace("-", "_")
     talker = inside.net.node(library, "pub", "--topic", f"/out_{mark}", "--word", "inside", on=on)
-    ear = inside.net.node(library, "sub", "--topic", f"/in_{mark}", on=on)
+    listener = inside.net.node(library, "sub", "--topic", f"/in_{mark}", on=on)
     inside.net.node(library, "serve", "--service", f"/serve_{mark}", on=on)
     here = {"master_uri": inside.master_uri}
-    heard = robot.node(f"ear_{mark}", library, "sub", "--topic", f"/out_{mark}", **here)
-    robot.node(f"mouth_{mark}", library, "pub", "--topic", f"/in_{mark}", "--word", "out", **here)
+    heard = robot.node(f"listener_{mark}", library, "sub", "--topic", f"/out_{mark}", **here)
+    robot.node(f"talker_{mark}", library, "pub", "--topic", f"/in_{mark}", "--word", "out", **here)
     called = ("call", "--service", f"/serve_{mark}", "--count", "3", "--patience", str(START))
     replies = robot.node(f"caller_{mark}", library, *called, **here)
 
     heard.wait_for("inside", seconds=START)
-    ear.log.wait_for("out", seconds=START)
+    listener.log.wait_for("out", seconds=START)
     replies.wait_for("ask", 3, seconds=START, verb="reply")
     address = {"node1": "10.88.0.11", "node2": "10.88.0.12"}[on]
     assert nodes_at(inside.master_uri)[f"/{talker.node}"].startswith(f"http://{address}:")

@@ -39,12 +39,12 @@ def test_how_long_the_first_message_takes(
         net.idle(on="node1")
         made.the_proxy()
     name = new_topic()
-    ear = robot.node(f"ear{name[1:]}", "roscpp", "sub", "--topic", name)
+    listener = robot.node(f"listener{name[1:]}", "roscpp", "sub", "--topic", name)
     created = time.time()
     pod = talker(net, library, name)
     pod.wait_ready()
     ready = time.time()
-    heard = ear.wait_for("inside", seconds=START)
+    heard = listener.wait_for("inside", seconds=START)
     proxy = "there" if has_proxy else "not there"
     note(f"first message, {library}, proxy {proxy}: {heard - ready:.1f} s after the pod is Ready, "
          f"{heard - created:.1f} s after it is created")  # fmt: skip
@@ -56,9 +56,9 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
 ) -> None:
     """Deleted without grace: its node can't say good-bye."""
     name = new_topic()
-    ear = robot.node(f"ear{name[1:]}", library, "sub", "--topic", name)
+    listener = robot.node(f"listener{name[1:]}", library, "sub", "--topic", name)
     pod = talker(net, library, name)
-    ear.wait_for("inside", seconds=START)
+    listener.wait_for("inside", seconds=START)
 
     pod.remove(grace=0)
     gone = wait_until(lambda: not robot.uri(pod.node), 25, lambda: str(robot.nodes()))
@@ -66,7 +66,7 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
 
     again = time.time()
     new = talker(net, library, name, name=pod.name)
-    ear.wait_for("inside", since=again, seconds=60)
+    listener.wait_for("inside", since=again, seconds=60)
     assert new.node == pod.node
 
 
@@ -84,12 +84,12 @@ def test_pod_that_ends_by_itself(made: RosProxy, net: Namespace, robot: Robot) -
 def test_container_that_restarts_in_its_pod(made: RosProxy, net: Namespace, robot: Robot) -> None:
     """The same address, another process: its node comes back by itself."""
     name = new_topic()
-    ear = robot.node(f"ear{name[1:]}", "rospy", "sub", "--topic", name)
+    listener = robot.node(f"listener{name[1:]}", "rospy", "sub", "--topic", name)
     pod = talker(net, "roscpp", name)
-    ear.wait_for("inside", seconds=START)
+    listener.wait_for("inside", seconds=START)
     killed = time.time()
     pod.crash()
-    ear.wait_for("inside", since=killed + 0.5, seconds=60)
+    listener.wait_for("inside", since=killed + 0.5, seconds=60)
     assert robot.knows_proxied(pod.node, "node1")
 
 
@@ -97,9 +97,9 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
     """Drain leaves the proxy until the last pod is gone, and does not wait for it for ever."""
     name = new_topic()
     made.change(graceSeconds=2)
-    ear = robot.node(f"ear{name[1:]}", "rospy", "sub", "--topic", name)
+    listener = robot.node(f"listener{name[1:]}", "rospy", "sub", "--topic", name)
     pod = talker(net, "rospy", name, on="node2")
-    ear.wait_for("inside", seconds=START)
+    listener.wait_for("inside", seconds=START)
     try:
         kubectl("cordon", "node2")
         assert made.the_proxy("node2").ready
@@ -111,4 +111,4 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
         kubectl("uncordon", "node2")
     release.wait_operator()  # it may have been on that node
     talker(net, "rospy", name, on="node2")
-    ear.wait_for("inside", since=time.time(), seconds=60)
+    listener.wait_for("inside", since=time.time(), seconds=60)

@@ -21,11 +21,11 @@ def test_a_policy_hides_a_topic_and_changes_without_a_new_pod(net: Namespace, ro
     proxy = made.the_proxy()
 
     made.change(policy={"rules": []})
-    robot.node("ear_hidden", "roscpp", "sub", "--topic", topic).wait_for("inside")
+    robot.node("listener_hidden", "roscpp", "sub", "--topic", topic).wait_for("inside")
     assert robot.publishers(topic) == {f"/{talker.node}"}
 
     made.change(policy={"rules": rules})
     wait_until(lambda: not robot.publishers(topic), 20, made.tell)
-    robot.end("ear_hidden")
+    robot.end("listener_hidden")
     again = made.the_proxy()
     assert (again.uid, again.restarts) == (proxy.uid, 0)

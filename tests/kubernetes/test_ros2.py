@@ -17,7 +17,7 @@ from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace, Pod, namespace
 from tests.kubernetes.ros2 import (
     Robot2,
-    ears,
+    lan_relays,
     leased,
     node,
     ports_are_kept,
@@ -97,8 +97,8 @@ def _fill(made: World, robot2: Robot2) -> None:
         ("kilted", "node1", "one"), ("jazzy", "node2", "one"), ("jazzy", "node1", "two"),
         ("jazzy", "node1", "cyclone"),
     ):  # fmt: skip
-        ear = pod(vendor, "sub", f"/{topic}", on=on)
-        made.heard[f"{vendor} on {on} hears /{topic}"] = (ear, topic)
+        listener = pod(vendor, "sub", f"/{topic}", on=on)
+        made.heard[f"{vendor} on {on} hears /{topic}"] = (listener, topic)
     pod("jazzy", "serve", "/add", on="node1")
     robot("kilted", "serve", "/robot_add")
     made.replies["the robot calls a pod"] = robot("jazzy", "call", "/add")
@@ -154,23 +154,23 @@ def test_what_users_are_told(world: World) -> None:
     port = of.service["spec"]["ports"][0]
     assert pod.environment["ROS_STATIC_PEERS"] == status["staticPeers"]
     assert (port["protocol"], port["port"]) == ("UDP", 7410)
-    assert len(ears(of)) == len(NODES)
+    assert len(lan_relays(of)) == len(NODES)
 
 
 def test_seconds_to_the_first_message(world: World, robot2: Robot2) -> None:
     """Of a pod that comes where its proxy is, to a robot that waits for it."""
-    ear = robot2.node("jazzy", "sub", "/late", name="ear")
+    listener = robot2.node("jazzy", "sub", "/late", name="listener")
     world.heard["the robot hears /one"][0].wait_for("one", since=time.time())
     late = node(world.net, "jazzy", "pub", "/late", "--word", "late", on="node1")
     late.wait_ready()
     ready = time.time()
     wait_for_line(late.log, "^sent 0$", count=1)
     sent = time.time()
-    first = ear.wait_for("late")
+    first = listener.wait_for("late")
     note(f"ROS 2: the first message outside {first - ready:.1f} s after its pod was seen Ready, "
          f"{first - sent:.1f} s after it was seen to be sent")  # fmt: skip
     late.remove()
-    robot2.end("ear")
+    robot2.end("listener")
 
 
 def test_a_pod_that_is_gone_takes_its_participant_with_it(world: World, robot2: Robot2) -> None:
@@ -191,8 +191,8 @@ def test_a_pod_that_is_gone_takes_its_participant_with_it(world: World, robot2: 
     note(f"ROS 2: outside has forgotten a pod's node {took:.1f} s after the pod was gone")
 
 
-def _ear_of(of: RosProxy) -> Pod:
-    (name,) = (e["metadata"]["name"] for e in ears(of) if e["spec"]["nodeName"] == "node1")
+def _lan_relay_of(of: RosProxy) -> Pod:
+    (name,) = (e["metadata"]["name"] for e in lan_relays(of) if e["spec"]["nodeName"] == "node1")
     return Pod(of.namespace, name)
 
 
@@ -202,8 +202,8 @@ LOSSES: dict[str, Callable[[RosProxy, Proxy], object]] = {
     "proxy's pod deleted": lambda _of, proxy: proxy.remove(),
     "proxy's pod deleted by force": lambda _of, proxy: proxy.remove(grace=0),
     "API server killed": lambda _of, _proxy: cluster("restart-apiserver"),
-    "ear crashes": lambda of, _proxy: _ear_of(of).crash(),
-    "ear's pod deleted": lambda of, _proxy: _ear_of(of).remove(),
+    "LAN relay crashes": lambda of, _proxy: _lan_relay_of(of).crash(),
+    "LAN relay's pod deleted": lambda of, _proxy: _lan_relay_of(of).remove(),
 }
 
 
@@ -221,8 +221,8 @@ def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None
 
     now = of.the_proxy("node1", seconds=60)
     wait_until(lambda: leased(now) == before, 60, lambda: f"{leased(now)} is not {before}")
-    wait_until(lambda: len(ears(of)) == len(NODES), 60, of.tell)
-    _ear_of(of).wait_ready(60)
+    wait_until(lambda: len(lan_relays(of)) == len(NODES), 60, of.tell)
+    _lan_relay_of(of).wait_ready(60)
     release.wait_operator()
     end = time.time()
     for log, text in flows.values():
@@ -329,7 +329,7 @@ def test_two_rosproxies_two_domains_without_multicast(robot2: Robot2) -> None:
             for number in (5, 6)
         ]  # fmt: skip
         wait_for_service(net)
-        robot_ears = {n: robot2.node("jazzy", "sub", "/word", domain=n) for n in (5, 6)}
+        robot_listeners = {n: robot2.node("jazzy", "sub", "/word", domain=n) for n in (5, 6)}
         for number in (5, 6):
             robot2.node("kilted", "pub", "/back", "--word", f"robot{number}", domain=number)
         pods = {}
@@ -338,10 +338,10 @@ def test_two_rosproxies_two_domains_without_multicast(robot2: Robot2) -> None:
             node(net, "jazzy", "pub", "/word", "--word", f"pod{number}", on="node1", labels=label)
             pods[number] = node(net, "jazzy", "sub", "/back", on="node1", labels=label)
         for number in (5, 6):
-            robot_ears[number].wait_for(f"pod{number}", count=10, seconds=START)
+            robot_listeners[number].wait_for(f"pod{number}", count=10, seconds=START)
             pods[number].log.wait_for(f"robot{number}", count=10, seconds=START)
             other = 11 - number
-            assert robot_ears[number].got(f"pod{other}") == []
+            assert robot_listeners[number].got(f"pod{other}") == []
             assert pods[number].log.got(f"robot{other}") == []
             assert pods[number].environment["ROS_DOMAIN_ID"] == str(number)
         ranges = [of.the_proxy("node1").ports for of in rosproxies]

@@ -25,7 +25,7 @@ class World:
     rosproxy: RosProxy
     talkers: dict[tuple[str, str], Pod] = field(default_factory=dict)
     servers: dict[tuple[str, str], Pod] = field(default_factory=dict)
-    ears: dict[tuple[str, str], Pod] = field(default_factory=dict)
+    listeners: dict[tuple[str, str], Pod] = field(default_factory=dict)
     callers: dict[tuple[str, str], Pod] = field(default_factory=dict)
     heard: dict[tuple[str, str], Log] = field(default_factory=dict)
     replies: dict[tuple[str, str], Log] = field(default_factory=dict)
@@ -54,9 +54,9 @@ def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> 
     )
     made.servers[place] = net.node(library, "serve", "--service", f"/serve_{mark}", on=on)
     # What the pods of the other node publish, and the robot.
-    made.ears[place] = net.node(library, "sub", "--topic", f"/for_{mark}", on=on)
-    made.heard[place] = robot.node(f"ear_{mark}", library, "sub", "--topic", f"/from_{mark}")
-    robot.node(f"mouth_{mark}", library, "pub", "--topic", f"/for_{mark}", "--word", "robot")
+    made.listeners[place] = net.node(library, "sub", "--topic", f"/for_{mark}", on=on)
+    made.heard[place] = robot.node(f"listener_{mark}", library, "sub", "--topic", f"/from_{mark}")
+    robot.node(f"talker_{mark}", library, "pub", "--topic", f"/for_{mark}", "--word", "robot")
     net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "far", on=other)
     net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "near", on=on)
     patience = ("--count", "200", "--rate", "5", "--patience", str(START))
@@ -78,7 +78,7 @@ def test_robot_hears_a_pod(library: str, on: str, world: World) -> None:
 @pytest.mark.parametrize(("library", "on"), PLACES)
 def test_pod_hears(speaker: str, library: str, on: str, world: World) -> None:
     """The robot, a pod of the other node, a pod of its own node."""
-    world.ears[library, on].log.wait_for(speaker, seconds=START)
+    world.listeners[library, on].log.wait_for(speaker, seconds=START)
 
 
 @pytest.mark.parametrize(("library", "on"), PLACES)
@@ -107,4 +107,4 @@ def test_rosnode_of_the_robot_sees_all(world: World, robot: Robot) -> None:
     assert "xmlrpc reply from" in robot.run("rosnode", "ping", "-c", "1", f"/{pod.node}")
     info = robot.run("rosnode", "info", f"/{pod.node}")
     assert "/from_roscpp_node1 [std_msgs/String]" in info
-    assert "ear_roscpp_node1" in info
+    assert "listener_roscpp_node1" in info

@@ -32,7 +32,9 @@ def test_nothing_is_left(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=4)
     wait_for_service(net)
     pod = net.node("rospy", "pub", "--topic", "/last", "--word", "inside", on="node1")
-    robot.node("ear_last", "rospy", "sub", "--topic", "/last").wait_for("inside", seconds=START)
+    robot.node("listener_last", "rospy", "sub", "--topic", "/last").wait_for(
+        "inside", seconds=START
+    )
     assert made.proxies
 
     release.uninstall()

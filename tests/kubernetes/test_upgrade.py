@@ -92,8 +92,8 @@ def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
     uri = f"http://{made.service['spec']['clusterIP']}:11311"
     talker = net.node("rospy", "pub", "--topic", "/by_hand", "--word", "inside", on="node1",
                       env={"ROS_MASTER_URI": uri})  # fmt: skip
-    ear = robot.node("ear_by_hand", "rospy", "sub", "--topic", "/by_hand")
-    ear.wait_for("inside", seconds=START)
+    listener = robot.node("listener_by_hand", "rospy", "sub", "--topic", "/by_hand")
+    listener.wait_for("inside", seconds=START)
     assert robot.knows_proxied(talker.node, "node1")
     release.upgrade()
     release.wait_operator()

@@ -69,7 +69,7 @@ def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Itera
     talker = net.node(library, "pub", "--topic", out, "--word", "inside", on=on)
     listener = net.node(library, "sub", "--topic", back, on=on)
     server = net.node(library, "serve", "--service", service, on=on)
-    names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
+    names = [f"{role}_{mark}" for role in ("listener", "talker", "caller")]
     outward = robot.node(names[0], library, "sub", "--topic", out)
     robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
     call = ("call", "--service", service, "--rate", "5", "--count", "100000",

@@ -77,7 +77,7 @@ def test_what_the_kernel_forwards_is_not_interrupted_by_a_restart(
     lab = lab_with_plane
     topic = f"/{lab_with_plane.unique('topic')}"
     lab.node("roscpp", "c1", "pub", topic=topic, rate=50)
-    name = lab.unique("ear")
+    name = lab.unique("listener")
     receiver = lab.node(library, "out", "sub", name=name, topic=topic)
     receiver.wait_for_count("^got ", 5)
     before = connection(lab, name, topic)

@@ -82,12 +82,12 @@ def other_topology(
 
 @pytest.fixture
 def lab(request: pytest.FixtureRequest, topology: Topology, tmp_path: Path) -> Iterator[Lab]:
-    """A proxy that has just started; a module may set its OPTIONS, and have an EAR."""
+    """A proxy that has just started; a module may set its OPTIONS, and have a LAN_RELAY."""
     lab = Lab(topology, tmp_path)
     lab.options = getattr(request.module, "OPTIONS", lab.options)
     with lab.used():
-        if getattr(request.module, "EAR", False):
-            lab.start_ear()
+        if getattr(request.module, "LAN_RELAY", False):
+            lab.start_lan_relay()
         if getattr(request.module, "PROXY", True):
             lab.start_proxy()
         yield lab

@@ -1,4 +1,4 @@
-"""What a test drives: machines, a proxy, an ear, and the participants that it starts."""
+"""What a test drives: machines, a proxy, a LAN relay, and the participants that it starts."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ ENVIRONMENTS = (
 NODES = Path(__file__).parent / "nodes"
 PROGRAMS = {"jazzy": "node.py", "kilted": "node.py", "cyclone": "participant.py"}
 """The program that stands for a node, by the implementation of DDS that it has."""
-EAR_PORT = 47090
-EAR_SECRET = "0123456789abcdef"
+LAN_RELAY_PORT = 47090
+LAN_RELAY_SECRET = "0123456789abcdef"
 ADMIN_PORT = 11312
 
 
@@ -53,7 +53,7 @@ class Lab:
         self.gateway = "172.30.1.1"
         self.options: tuple[str, ...] = ("--ros2-peer", topology.plan.robot)
         self.proxy: Process | None = None
-        self.ear: Process | None = None
+        self.lan_relay: Process | None = None
         self.nodes: list[Process] = []
         self._numbers = itertools.count(1)
 
@@ -71,13 +71,13 @@ class Lab:
         self.proxy = self._spawn("rosproxy", self.proxy_role, argv, self._own_environment())
         self.proxy.wait_for("listening: ")
 
-    def start_ear(self) -> None:
-        """Start the ear on the host."""
-        argv = [sys.executable, "-m", "rosproxy", "ear", "--lan", self.place("host").address]
-        argv += ["--bind", str(HostPort(self.gateway, EAR_PORT))]
+    def start_lan_relay(self) -> None:
+        """Start the LAN relay on the host."""
+        argv = [sys.executable, "-m", "rosproxy", "lan-relay", "--lan", self.place("host").address]
+        argv += ["--bind", str(HostPort(self.gateway, LAN_RELAY_PORT))]
         argv += ["--proxy", str(HostPort(self.place("px").address, PORTS.first))]
-        self.ear = self._spawn("ear", "host", argv, self._own_environment())
-        self.ear.wait_for("ready: ")
+        self.lan_relay = self._spawn("lan-relay", "host", argv, self._own_environment())
+        self.lan_relay.wait_for("ready: ")
 
     def restart_proxy(self) -> None:
         """Kill it and start it again."""
@@ -188,7 +188,7 @@ class Lab:
 
     def stop(self) -> None:
         """End everything."""
-        stop_all([process for process in (self.proxy, self.ear) if process])
+        stop_all([process for process in (self.proxy, self.lan_relay) if process])
 
     @contextmanager
     def used(self) -> Iterator[None]:
@@ -201,20 +201,23 @@ class Lab:
             self.stop()
 
     def check(self) -> None:
-        """Raises AssertionError if the proxy or the ear has ended, or has failed inside."""
-        for process in (self.proxy, self.ear):
+        """Raises AssertionError if the proxy or the LAN relay has ended, or has failed inside."""
+        for process in (self.proxy, self.lan_relay):
             if process is not None:
                 assert process.returncode is None, process.output()
                 assert "Traceback" not in process.output(), process.output()
 
     def transcripts(self) -> list[tuple[str, str]]:
         """What everybody has printed."""
-        processes = [*self.nodes, *(process for process in (self.proxy, self.ear) if process)]
+        processes = [*self.nodes, *(process for process in (self.proxy, self.lan_relay) if process)]
         return [(process.title, process.output()[-3000:]) for process in processes]
 
     def _own_environment(self) -> dict[str, str]:
         env = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONUNBUFFERED": "1"}
-        env |= {"ROSPROXY_ROS2_EAR_SECRET": EAR_SECRET, "ROSPROXY_EAR_SECRET": EAR_SECRET}
+        env |= {
+            "ROSPROXY_ROS2_LAN_RELAY_SECRET": LAN_RELAY_SECRET,
+            "ROSPROXY_LAN_RELAY_SECRET": LAN_RELAY_SECRET,
+        }
         return env | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
     def _spawn(self, title: str, role: str, argv: list[str], env: Mapping[str, str]) -> Process:

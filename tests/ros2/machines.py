@@ -1,6 +1,6 @@
 """The machines of this layer: those of the real-ROS layer, with a /dev/shm of each one's own.
 
-    out (robot) -- host (NAT, published ports, the ear) -- bridge -- px (the proxy), c1, c2
+    out (robot) -- host (NAT, published ports, the LAN relay) -- bridge -- px (the proxy), c1, c2
 
 Participants compare machines to choose shared memory: two containers may look like one machine and
 yet have nothing in common. Here all do look like one.

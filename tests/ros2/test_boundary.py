@@ -11,8 +11,8 @@ import pytest
 from tests.ros2.lab import Lab
 
 PROXY = False
-EAR = True
-OPTIONS = ("--ros2-ear", "172.30.1.1:47090")
+LAN_RELAY = True
+OPTIONS = ("--ros2-lan-relay", "172.30.1.1:47090")
 OFFERS = {"rclpy": "pub,serve,act,hold", "cyclone": "pub"}
 USES = {"rclpy": "sub,call,pursue,tune,names", "cyclone": "sub"}
 GOT = {

@@ -9,7 +9,7 @@ import pytest
 from tests.ros.processes import Process, wait_until
 from tests.ros2.lab import PROGRAMS, Lab
 
-EAR = True
+LAN_RELAY = True
 WATCHED = 60.0
 """Seconds in which nothing may be told."""
 LIVES = 15
@@ -20,7 +20,12 @@ def _both_ways_out(lab: Lab) -> None:
     """The robot is a peer and on the LAN that the relay hears."""
     assert lab.proxy is not None
     lab.proxy.stop()
-    lab.options = ("--ros2-peer", lab.topology.plan.robot, "--ros2-ear", f"{lab.gateway}:47090")
+    lab.options = (
+        "--ros2-peer",
+        lab.topology.plan.robot,
+        "--ros2-lan-relay",
+        f"{lab.gateway}:47090",
+    )
     lab.start_proxy()
 
 

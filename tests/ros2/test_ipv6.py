@@ -1,7 +1,7 @@
 """IPv6 alone: each implementation announces itself there to a group of its own.
 
 So Fast DDS and Cyclone DDS do not hear each other by multicast; through the proxy, which hears
-both, and on the LAN by the ear, they do.
+both, and on the LAN by the LAN relay, they do.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 from tests.ros.processes import Process, wait_until
 from tests.ros.topology import Topology, remove_leftovers
 from tests.ros2.ipv6 import DUAL, GATEWAY6, PLAN6, Topology6
-from tests.ros2.lab import EAR_PORT, Lab, is_whole, numbers
+from tests.ros2.lab import LAN_RELAY_PORT, Lab, is_whole, numbers
 from tests.ros2.machines import wait_for_links, with_shared_memory
 
 FAST_DDS = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv6"}
@@ -37,7 +37,7 @@ ways = pytest.mark.parametrize(
     ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
 )
 PEER = ("--bind", "::", "--ros2-peer", "robot")
-EAR = ("--bind", "::", "--ros2-ear", f"[{GATEWAY6}]:{EAR_PORT}")
+LAN_RELAY = ("--bind", "::", "--ros2-lan-relay", f"[{GATEWAY6}]:{LAN_RELAY_PORT}")
 
 
 @pytest.fixture(scope="module", params=[PLAN6, DUAL], ids=["ipv6", "dual"])
@@ -66,10 +66,10 @@ def lab(topology: Topology, tmp_path: Path) -> Iterator[Lab]:
 
 
 def proxy(lab: Lab, *options: str) -> None:
-    """Start the proxy, and the ear if it is to hear one."""
+    """Start the proxy, and the LAN relay if it is to hear one."""
     lab.options = options
-    if options == EAR:
-        lab.start_ear()
+    if options == LAN_RELAY:
+        lab.start_lan_relay()
     lab.start_proxy()
 
 
@@ -97,7 +97,7 @@ def test_without_the_proxy_implementations_do_not_meet(lab: Lab) -> None:
 @ways
 @pairings
 def test_topics(lab: Lab, source_vendor: str, sink_vendor: str, source: str, sink: str) -> None:
-    proxy(lab, *EAR)
+    proxy(lab, *LAN_RELAY)
     node(lab, source_vendor, source, "pub", topic="/chatter")
     node(lab, sink_vendor, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
 
@@ -120,7 +120,7 @@ def test_where_inside_has_no_way_out(lab: Lab, source: str, sink: str) -> None:
 
 @ways
 def test_the_proxy_may_be_killed(lab: Lab, source: str, sink: str) -> None:
-    proxy(lab, *EAR)
+    proxy(lab, *LAN_RELAY)
     node(lab, "jazzy", source, "pub", topic="/chatter", period=0.02, depth=1000)
     reader = node(lab, "jazzy", sink, "sub", topic="/chatter", depth=1000)
     reader.wait_for_count("^got hello ", 5)

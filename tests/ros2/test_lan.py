@@ -1,4 +1,4 @@
-"""No peer is known by name: the ear carries announcements between the LAN and the proxy.
+"""No peer is known by name: the LAN relay carries announcements between the LAN and the proxy.
 
 So Cyclone DDS is found outside as well: unless told otherwise it has no well-known ports.
 """
@@ -10,8 +10,8 @@ import pytest
 from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab
 
-OPTIONS = ("--ros2-ear", "172.30.1.1:47090")
-EAR = True
+OPTIONS = ("--ros2-lan-relay", "172.30.1.1:47090")
+LAN_RELAY = True
 PAIRS = [
     ("jazzy", "jazzy"),
     ("kilted", "kilted"),
@@ -63,13 +63,13 @@ def test_participants_prove_that_they_receive(lab: Lab, vendor: str) -> None:
     wait_until("all have answered", lambda: lab.unproven() == {"inside": 0, "outside": 0})
 
 
-def test_the_ear_may_be_killed(lab: Lab) -> None:
+def test_the_lan_relay_may_be_killed(lab: Lab) -> None:
     lab.node("jazzy", "c1", "pub", topic="/chatter")
     reader = lab.node("jazzy", "out", "sub", topic="/chatter")
     reader.wait_for_count("^got hello ", 5)
-    assert lab.ear is not None
-    lab.ear.kill()
-    lab.start_ear()
+    assert lab.lan_relay is not None
+    lab.lan_relay.kill()
+    lab.start_lan_relay()
     later = lab.node("jazzy", "out", "sub", topic="/chatter")
     for subscriber in (reader, later):
         subscriber.wait_for_count("^got hello ", 5, since=subscriber.mark())

@@ -153,12 +153,12 @@ def test_a_token_and_a_hash_do_not_go_together() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
-        ("ros2_ear", "172.17.0.1:7500", "an ear is for one domain"),
+        ("ros2_lan_relay", "172.17.0.1:7500", "a LAN relay is for one domain"),
         ("ros2_peer", ("robot", "other:11400"), "other:11400 has a port, which is for one domain"),
     ],
 )
 def test_what_has_one_port_is_for_one_domain(name: str, value: object, complaint: str) -> None:
-    given = {**GIVEN, "ros": ("2",), "ros2_ear_secret": "0123456789abcdef", name: value}
+    given = {**GIVEN, "ros": ("2",), "ros2_lan_relay_secret": "0123456789abcdef", name: value}
     parse_settings({**given, "ros2_domain": (1,)})
     with pytest.raises(SettingError, match=complaint) as caught:
         parse_settings({**given, "ros2_domain": (0, 1)})
@@ -167,13 +167,15 @@ def test_what_has_one_port_is_for_one_domain(name: str, value: object, complaint
 
 def test_a_lan_relay_needs_a_secret() -> None:
     """Its address is also that of other programs; the error says what to give."""
-    given = {**GIVEN, "ros": ("2",), "ros2_ear": "172.17.0.1:7500"}
-    expected = "--ros2-ear-secret: missing; give this and rosproxy ear --secret one output of"
+    given = {**GIVEN, "ros": ("2",), "ros2_lan_relay": "172.17.0.1:7500"}
+    expected = (
+        "--ros2-lan-relay-secret: missing; give this option and rosproxy lan-relay --secret the"
+    )
     with pytest.raises(SettingError, match=expected):
         parse_settings(given)
     secret = "0123456789abcdef"
-    settings = parse_settings({**given, "ros2_ear_secret": secret})
-    assert settings.ros2_ear_secret == secret
+    settings = parse_settings({**given, "ros2_lan_relay_secret": secret})
+    assert settings.ros2_lan_relay_secret == secret
     assert secret not in repr(settings)
 
 

@@ -1,4 +1,4 @@
-"""What both engines know of ROS 2: versions, domains, peers, well-known ports and the ear."""
+"""What both engines know of ROS 2: versions, domains, peers, well-known ports and the LAN relay."""
 
 import hashlib
 import hmac
@@ -13,13 +13,13 @@ LAST_DOMAIN = 232
 MOST_PEERS = 32
 """Hosts that one label or field may name: each announcement goes to 32 ports of each."""
 LEAST_PORTS = LEAST_PER_DOMAIN + 1
-"""Ports of a proxy for ROS 2 with an ear: what the proxy has at least, and one for the ear."""
+"""Ports of a proxy for ROS 2 with a LAN relay: what the proxy has at least, and the relay's one."""
 ROS1_DISTROS = frozenset(
     {"fuerte", "groovy", "hydro", "indigo", "jade", "kinetic", "lunar", "melodic", "noetic"}
 )
 """There will be no more of them, so any other is one of ROS 2."""
-EAR_COMMAND = ("rosproxy", "ear")
-"""What the proxy's image does as an ear."""
+LAN_RELAY_COMMAND = ("rosproxy", "lan-relay")
+"""What the proxy's image does as a LAN relay."""
 
 
 def discovery_port(domain: int) -> int:
@@ -52,14 +52,14 @@ def relay_secret(key: bytes, proxy: str) -> str:
     return hmac.new(key, f"LAN relay of {proxy}".encode(), hashlib.sha256).hexdigest()
 
 
-def ear_variables(
+def lan_relay_variables(
     domain: int, lan: str, bind: HostPort, proxy: HostPort, secret: str
 ) -> dict[str, str]:
-    """What an ear is told; see `rosproxy.ros2.servers.multicast_ear.EarSettings`."""
+    """What a LAN relay is told; see `rosproxy.ros2.servers.lan_relay.LanRelaySettings`."""
     return {
-        "ROSPROXY_EAR_DOMAIN": str(domain),
-        "ROSPROXY_EAR_LAN": lan,
-        "ROSPROXY_EAR_BIND": str(bind),
-        "ROSPROXY_EAR_PROXY": str(proxy),
-        "ROSPROXY_EAR_SECRET": secret,
+        "ROSPROXY_LAN_RELAY_DOMAIN": str(domain),
+        "ROSPROXY_LAN_RELAY_LAN": lan,
+        "ROSPROXY_LAN_RELAY_BIND": str(bind),
+        "ROSPROXY_LAN_RELAY_PROXY": str(proxy),
+        "ROSPROXY_LAN_RELAY_SECRET": secret,
     }

@@ -24,8 +24,8 @@ from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
-    CreateEar,
     CreateFlush,
+    CreateLanRelay,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -48,7 +48,7 @@ from rosproxy_operator.docker.planner.specs import (
     SECRET,
     Creation,
     container_config,
-    ear_config,
+    lan_relay_config,
     master,
     proxy_name,
     read_own,
@@ -285,7 +285,7 @@ class DockerApplier:
         match action:
             case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
                 self._call_network(action, snapshot)
-            case CreateSandbox() | Create() | CreateEar() | CreateRedirect() | CreateFlush():
+            case CreateSandbox() | Create() | CreateLanRelay() | CreateRedirect() | CreateFlush():
                 self._create(action.name, self._config(action, snapshot), snapshot.state.image_id)
             case Start(name):
                 do("start", name)
@@ -331,8 +331,8 @@ class DockerApplier:
     def _config(self, action: Creation, snapshot: DockerSnapshot) -> Json:
         if isinstance(action, CreateSandbox):
             return sandbox_config(action, self._settings)
-        if isinstance(action, CreateEar):
-            return ear_config(action, self._settings, snapshot.state.secret)
+        if isinstance(action, CreateLanRelay):
+            return lan_relay_config(action, self._settings, snapshot.state.secret)
         if isinstance(action, CreateRedirect):
             return redirect_config(action, self._settings)
         if isinstance(action, CreateFlush):

@@ -18,7 +18,7 @@ from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Member, OwnContainer
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.redirect import redirect_record_name
-from rosproxy_operator.docker.planner.specs import ear_name, proxy_name, sandbox_name
+from rosproxy_operator.docker.planner.specs import lan_relay_name, proxy_name, sandbox_name
 from rosproxy_operator.docker.settings import PlanSettings
 
 ProxyStatuses = Mapping[str, ProxyStatus]
@@ -87,16 +87,18 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
     if sandbox_state != "running":
         subject = f"the container {sandbox_name(key)}, which holds its ports and networks"
         problems.insert(0, f"{subject}, is {sandbox_state}")
-    ear = _best(observed.ears_of(key), ear_name(key))
-    if ear and ear.container.state != "running":
-        problems.append(f"the container {ear_name(key)}, its ear, is {ear.container.state}")
+    lan_relay = _best(observed.lan_relays_of(key), lan_relay_name(key))
+    if lan_relay and lan_relay.container.state != "running":
+        problems.append(
+            f"the container {lan_relay_name(key)}, its LAN relay, is {lan_relay.container.state}"
+        )
     domain = status.domains[0] if status and status.domains else None
     return {
         "name": proxy_name(key),
         "ros": "2" if key.is_ros2 else "1",
         "domain": key.domain,
         "peers": list(domain.peers) if domain else [],
-        "ear": ear.container.state if ear else None,
+        "lan_relay": lan_relay.container.state if lan_relay else None,
         "master_uri": key.master_uri,
         "master_address": (status.master.address if status else None) or "",
         "master_up": status.master.up if status and not key.is_ros2 else None,

@@ -219,8 +219,8 @@ class PlanSettings:
     ros2_lan: Annotated[
         str,
         Option(
-            "ROS 2: this host's IPv4 address on the LAN whose multicast the [ears]"
-            "(../guide/docker.md#ros-2) hear; `none`: no ears.",
+            "ROS 2: this host's IPv4 address on the LAN whose multicast the [LAN relays]"
+            "(../guide/docker.md#ros-2) hear; `none`: no LAN relays.",
             option_values.LAN,
             default="the advertised address, else that towards hosts far away",
         ),

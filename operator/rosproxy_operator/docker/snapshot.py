@@ -25,9 +25,9 @@ from rosproxy_operator.docker.planner.labels.members import LabelReading, master
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Container,
-    EarContainer,
     FlushContainer,
     HostState,
+    LanRelayContainer,
     Network,
     OwnContainer,
     Proxy,
@@ -37,8 +37,8 @@ from rosproxy_operator.docker.planner.model import (
 from rosproxy_operator.docker.planner.own_containers import forgery_reason, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     FORMER_TOKEN,
-    ROLE_EAR,
     ROLE_FLUSH,
+    ROLE_LAN_RELAY,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
@@ -61,7 +61,7 @@ A proxy gets no name that a container has, and only inspections tell the aliases
 _KINDS: Mapping[str, type[OwnContainer]] = {
     ROLE_SANDBOX: Sandbox,
     ROLE_PROXY: Proxy,
-    ROLE_EAR: EarContainer,
+    ROLE_LAN_RELAY: LanRelayContainer,
     ROLE_REDIRECT: RedirectContainer,
     ROLE_FLUSH: FlushContainer,
 }
@@ -287,7 +287,7 @@ class DockerObserver:
             state = replace(
                 state,
                 listening=foreign_ports(busy, (), listening),
-                listening_udp=foreign_ports(busy, state.ears, bound),
+                listening_udp=foreign_ports(busy, state.lan_relays, bound),
                 far=host.far_address(),
             )
         secret = self._settings.secret or engine_json.uplink_secret(net_rows, self._settings.uplink)
@@ -355,7 +355,7 @@ class DockerObserver:
             proxies=tuple(own_by_role[ROLE_PROXY]),
             ephemeral=host.ephemeral_ports(),
             sandboxes=tuple(own_by_role[ROLE_SANDBOX]),
-            ears=tuple(own_by_role[ROLE_EAR]),
+            lan_relays=tuple(own_by_role[ROLE_LAN_RELAY]),
             redirects=tuple(own_by_role[ROLE_REDIRECT]),
             flushes=tuple(own_by_role[ROLE_FLUSH]),
             busy=frozenset(busy),
@@ -391,15 +391,15 @@ def _addresses(rows: Iterable[Json]) -> frozenset[str]:
 
 
 def foreign_ports(
-    starting: Iterable[Sandbox], ears: Iterable[EarContainer], listening: frozenset[int]
+    starting: Iterable[Sandbox], lan_relays: Iterable[LanRelayContainer], listening: frozenset[int]
 ) -> frozenset[int]:
     """Which of the host's ports on which something listens may belong to other programs.
 
     Not those of a sandbox that is just being started: the engine takes them one by one before it
-    says that it runs. Nor those of the ears.
+    says that it runs. Nor those of the LAN relays.
     """
     own = {port for sandbox in starting for port in sandbox.range.ports()}
-    return listening - own - {ear.range.last for ear in ears}
+    return listening - own - {lan_relay.range.last for lan_relay in lan_relays}
 
 
 def address_in(state: HostState, name: str, uplink: str) -> str:

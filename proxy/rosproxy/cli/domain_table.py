@@ -35,8 +35,10 @@ def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
 
 def _summary(domain: document.DomainStatus) -> str:
     targets = [f"peers {listed(map(clean, domain.peers))}"] if domain.peers else []
-    targets += [f"ear {clean(domain.ear)}"] if domain.ear else []
-    announced_to = "; ".join(targets) or "neither peers nor an ear: inside is announced to nobody"
+    targets += [f"LAN relay {clean(domain.lan_relay)}"] if domain.lan_relay else []
+    announced_to = (
+        "; ".join(targets) or "neither peers nor a LAN relay: inside is announced to nobody"
+    )
     ports = f"{domain.ports_used} ports used, {domain.ports_free} free"
     lost = f"; {domain.dropped} datagrams refused, {domain.lost} lost"
     trouble = lost if domain.dropped or domain.lost else ""

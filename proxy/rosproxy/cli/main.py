@@ -1,4 +1,4 @@
-"""The command line: ``rosproxy run`` and ``ear``; what asks a running proxy is in `questions`.
+"""The commands ``rosproxy run`` and ``rosproxy lan-relay``; `questions` has the other commands.
 
 Commands import what they need when they run, so that a health check starts fast.
 """
@@ -70,7 +70,7 @@ def _check(settings: Any, deep: bool) -> None:
         print_findings(deep_check(settings), as_json=False)
 
 
-@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY_EAR", "show_default": True})
+@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY_LAN_RELAY", "show_default": True})
 @click.option(
     "--domain", type=options.click_type(kinds.DOMAIN), default=0, help="The domain of DDS."
 )
@@ -84,7 +84,7 @@ def _check(settings: Any, deep: bool) -> None:
     "--bind",
     type=options.click_type(kinds.HOST_PORT),
     required=True,
-    help="Address and port that the proxy reaches, its --ros2-ear.",
+    help="Address and port that the proxy reaches, its --ros2-lan-relay.",
 )
 @click.option(
     "--proxy",
@@ -96,23 +96,23 @@ def _check(settings: Any, deep: bool) -> None:
     "--secret",
     type=options.click_type(kinds.TOKEN),
     required=True,
-    help="The secret that the proxy has as --ros2-ear-secret. Better given as a variable.",
+    help="The secret that the proxy has as --ros2-lan-relay-secret. Better given as a variable.",
 )
 @options.log_options
 @options.config_option
-def ear(log_format: str, log_level: str, **given: Any) -> None:
+def lan_relay(log_format: str, log_level: str, **given: Any) -> None:
     """Carry announcements of ROS 2 between a LAN and the proxy; runs in the host's network.
 
     Nothing else: what users send goes through the ports that the host publishes.
     """
-    from rosproxy.app.ear_program import run_ear
-    from rosproxy.ros2.servers.multicast_ear import EarSettings
+    from rosproxy.app.lan_relay_program import run_lan_relay
+    from rosproxy.ros2.servers.lan_relay import LanRelaySettings
     from rosproxy.telemetry import logs
 
     with options.setting_errors():
         logs.set_up(log_format, log_level)
         options.unknown_variables(main)
-        run_ear(EarSettings(**given))
+        run_lan_relay(LanRelaySettings(**given))
 
 
 for command in (questions.status, questions.health, questions.doctor):

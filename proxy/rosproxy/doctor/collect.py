@@ -83,8 +83,8 @@ def _all_here(status: ProxyStatus) -> bool:
     """Whether a proxy for ROS 2 alone has nobody outside but peers on loopback."""
     peers = [peer for domain in status.domains for peer in domain.peers]
     hosts = [target.host if (target := parse_host_port(peer)) else peer for peer in peers]
-    ears = [domain.ear for domain in status.domains if domain.ear]
-    return not status.settings.for_ros1 and not ears and all(map(is_loopback, hosts))
+    lan_relays = [domain.lan_relay for domain in status.domains if domain.lan_relay]
+    return not status.settings.for_ros1 and not lan_relays and all(map(is_loopback, hosts))
 
 
 async def collect_running(

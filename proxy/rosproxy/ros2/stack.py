@@ -37,7 +37,7 @@ from rosproxy.net.interfaces import (
 )
 from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
 from rosproxy.ros2.discovery.port_keeper import keeper_key
 from rosproxy.ros2.domain_plane import DomainPlane
@@ -117,7 +117,7 @@ class Ros2:
         settings = self._settings
         taken = list[int]()
         # Each process of the proxy is given the same secret, and containers know neither.
-        key = keeper_key(settings.token_hash or settings.ros2_ear_secret)
+        key = keeper_key(settings.token_hash or settings.ros2_lan_relay_secret)
         for number, ports in zip(settings.domains, self._domain_ports(), strict=True):
             domain_settings = DomainSettings(
                 number=number,
@@ -405,8 +405,10 @@ def networks_inside(
     return inside or tuple(own_networks)
 
 
-def _relay(settings: Settings) -> LanRelay | None:
+def _relay(settings: Settings) -> LanRelayLink | None:
     """The LAN relay of the settings, which have a secret where they have a relay."""
-    if settings.ros2_ear is None or settings.ros2_ear_secret is None:
+    if settings.ros2_lan_relay is None or settings.ros2_lan_relay_secret is None:
         return None
-    return LanRelay(settings.ros2_ear, RelayProof(settings.ros2_ear_secret, time.time))
+    return LanRelayLink(
+        settings.ros2_lan_relay, RelayProof(settings.ros2_lan_relay_secret, time.time)
+    )

@@ -149,7 +149,7 @@ class Ros2State(Collector):
             domain=settings.number,
             discovery=str(HostPort(settings.host, discovery)),
             peers=tuple(peer.host if not peer.port else str(peer) for peer in settings.peers),
-            ear=str(settings.relay.address) if settings.relay else "",
+            lan_relay=str(settings.relay.address) if settings.relay else "",
             direction="both" if settings.both_ways else "out",
             ports_used=len(domain.inside.leases),
             ports_free=domain.ports.pool.free,

@@ -176,7 +176,7 @@ def test_a_variable_that_is_anothers(name: str, value: str):
     assert unknown({name: value}, KNOWN) == []
 
 
-@pytest.mark.parametrize("words", [("run",), ("ear",), ("doctor",)])
+@pytest.mark.parametrize("words", [("run",), ("lan-relay",), ("doctor",)])
 async def test_help_names_the_variable_of_each_option(words: tuple[str, ...]):
     from rosproxy.cli.main import main
     from rosproxy.cli.options import variables_of

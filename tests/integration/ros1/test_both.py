@@ -286,15 +286,15 @@ async def test_udpros_from_outside_comes_in_through_the_range(
     node = await make_node("/node")
     await node.subscribe(proxy.master)
     at = host_and_port(await look_up(proxy, robot))
-    with bind(NODE, 0) as ear, bind(MASTER, 0) as mouth:
-        port = ear.getsockname()[1]
+    with bind(NODE, 0) as listener, bind(MASTER, 0) as talker:
+        port = listener.getsockname()[1]
         offer = udp_offer("/chatter", "node", port)
         await rpc(at, "requestTopic", "/node", "/chatter", [offer], source=NODE)
         ((_, _, host, told, _),) = offers_heard(robot)
         assert (host, told in proxy.settings.ports.listen) == (HOST, True)
-        mouth.sendto(b"message", (HOST, told))
+        talker.sendto(b"message", (HOST, told))
         async with asyncio.timeout(5):
-            assert await asyncio.get_running_loop().sock_recv(ear, 100) == b"message"
+            assert await asyncio.get_running_loop().sock_recv(listener, 100) == b"message"
         (row,) = proxy.app.status()["udpros"]
         assert (row["topic"], row["port"], row["bytes"]) == ("/chatter", told, 7)
         await node.stop()
@@ -307,14 +307,16 @@ async def test_udpros_goes_out_through_a_port_inside(
     proxy: Proxy, node: FakeNode, master: FakeMaster
 ) -> None:
     await node.publish(proxy.master)
-    with bind(OUTSIDE, 0) as ear, bind(NODE, 0) as mouth:
-        offer = udp_offer("/chatter", OUTSIDE, ear.getsockname()[1])
-        await rpc(proxy.lease(node), "requestTopic", "/ear", "/chatter", [offer], source=OUTSIDE)
+    with bind(OUTSIDE, 0) as listener, bind(NODE, 0) as talker:
+        offer = udp_offer("/chatter", OUTSIDE, listener.getsockname()[1])
+        await rpc(
+            proxy.lease(node), "requestTopic", "/listener", "/chatter", [offer], source=OUTSIDE
+        )
         ((_, _, host, told, _),) = offers_heard(node)
         assert host != OUTSIDE
-        mouth.sendto(b"message", (host, told))
+        talker.sendto(b"message", (host, told))
         async with asyncio.timeout(5):
-            assert await asyncio.get_running_loop().sock_recv(ear, 100) == b"message"
+            assert await asyncio.get_running_loop().sock_recv(listener, 100) == b"message"
 
 
 @pytest.mark.parametrize(
@@ -343,7 +345,7 @@ async def test_who_asks_for_many_takes_no_udpros_from_others(
     for source, ports in ((OUTSIDE, [40000]), (MASTER, range(40001, 40010))):
         for port in ports:
             offer = udp_offer("/chatter", source, port)
-            await rpc(at, "requestTopic", "/ear", "/chatter", [offer], source=source)
+            await rpc(at, "requestTopic", "/listener", "/chatter", [offer], source=source)
     peers = [row["peer"] for row in proxy.app.status()["udpros"]]
     assert sorted(peers) == [MASTER] * 3 + [OUTSIDE]
 

@@ -48,7 +48,7 @@ async def talker(make_node: Any, proxy: Proxy) -> FakeNode:
     return node
 
 
-async def make_ear(
+async def make_listener(
     make_node: Any, master: FakeMaster, name: str, address: str = OUTSIDE, topic: str = "/chatter"
 ) -> FakeNode:
     """A node that the master has as a subscriber, outside unless told otherwise."""
@@ -83,7 +83,7 @@ async def told(node: FakeNode, *uris: str) -> None:
 
 
 async def test_who_has_no_connection_is_told_at_each_look(proxy, talker, master, make_node):
-    lost = await make_ear(make_node, master, "/lost")
+    lost = await make_listener(make_node, master, "/lost")
     await proxy.restart()
     await served(proxy, talker)
     uri = proxy.uri(talker)
@@ -94,8 +94,8 @@ async def test_who_has_no_connection_is_told_at_each_look(proxy, talker, master,
 
 
 async def test_who_has_a_connection_is_left_alone(proxy, talker, master, make_node):
-    lost = await make_ear(make_node, master, "/lost")
-    kept = await make_ear(make_node, master, "/kept", "127.0.1.8")
+    lost = await make_listener(make_node, master, "/lost")
+    kept = await make_listener(make_node, master, "/kept", "127.0.1.8")
     await proxy.restart()
     await served(proxy, talker)
     uri = proxy.uri(talker)
@@ -112,47 +112,47 @@ async def test_only_the_publisher_without_connection_is_withdrawn(proxy, talker,
     await other.publish(proxy.master)
     far = "http://127.0.1.7:4000/"
     await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
-    ear = await make_ear(make_node, master, "/ear")
+    listener = await make_listener(make_node, master, "/listener")
     await proxy.restart()
     await served(proxy, talker, other)
     uris = {proxy.uri(talker), proxy.uri(other), far}
-    await told(ear, *uris)
-    async with listening(proxy, talker, "/ear"):
-        ear.calls.clear()
+    await told(listener, *uris)
+    async with listening(proxy, talker, "/listener"):
+        listener.calls.clear()
         without = {proxy.uri(talker), far}
 
         def looks() -> int:
             """At how many looks it was told; the first may still be news of the restart."""
-            told = [{*some} for some in ear.updates()]
+            told = [{*some} for some in listener.updates()]
             return sum(pair == (without, uris) for pair in pairwise(told))
 
         await until(lambda: looks() >= len(LOOKS), "it is told at each look")
-        assert all(proxy.uri(talker) in uris for uris in ear.updates())
+        assert all(proxy.uri(talker) in uris for uris in listener.updates())
 
 
 async def test_who_is_served_by_udpros_is_left_alone(proxy, talker, master, make_node):
-    ear = await make_ear(make_node, master, "/ear")
-    row = [0, "/ear", "o", "UDPROS", "/chatter", True, "UDPROS connection"]
+    listener = await make_listener(make_node, master, "/listener")
+    row = [0, "/listener", "o", "UDPROS", "/chatter", True, "UDPROS connection"]
     talker.answers["getBusInfo"] = answer([1, "bus info", [row]])
     await proxy.restart()
     await served(proxy, talker)
-    await told(ear, proxy.uri(talker))
-    ear.calls.clear()
+    await told(listener, proxy.uri(talker))
+    listener.calls.clear()
     await looks(master, AFTERWARDS)
-    assert [] not in ear.updates()
+    assert [] not in listener.updates()
 
 
 @pytest.mark.parametrize("hang", [True, False], ids=["hangs", "says nothing of use"])
 async def test_a_publisher_that_does_not_tell_its_connections_hinders_nobody(
     proxy, talker, master, make_node, hang
 ):
-    ear = await make_ear(make_node, master, "/ear")
+    listener = await make_listener(make_node, master, "/listener")
     talker.answers["getBusInfo"] = End.HANG if hang else answer([0, "not implemented", 0])
     await proxy.restart()
     await served(proxy, talker)
-    await told(ear, proxy.uri(talker))
-    ear.calls.clear()
-    await until(lambda: [] in ear.updates(), "it is told at a look")
+    await told(listener, proxy.uri(talker))
+    listener.calls.clear()
+    await until(lambda: [] in listener.updates(), "it is told at a look")
 
 
 async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, master, make_node):
@@ -165,24 +165,24 @@ async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, maste
 
 
 async def test_a_subscriber_that_is_gone_hinders_nobody(proxy, talker, master, make_node):
-    gone = await make_ear(make_node, master, "/gone")
-    ear = await make_ear(make_node, master, "/ear", "127.0.1.8")
+    gone = await make_listener(make_node, master, "/gone")
+    listener = await make_listener(make_node, master, "/listener", "127.0.1.8")
     await gone.stop()
     await proxy.restart()
     await served(proxy, talker)
-    await told(ear, proxy.uri(talker))
-    ear.calls.clear()
-    await until(lambda: [] in ear.updates(), "it is told at a look")
-    await told(ear, proxy.uri(talker))
+    await told(listener, proxy.uri(talker))
+    listener.calls.clear()
+    await until(lambda: [] in listener.updates(), "it is told at a look")
+    await told(listener, proxy.uri(talker))
 
 
 async def test_who_lost_a_node_that_did_not_answer_for_a_time_is_told(
     proxy, talker, master, make_node
 ):
-    ear = await make_ear(make_node, master, "/ear")
+    listener = await make_listener(make_node, master, "/listener")
     lease = proxy.lease(talker)
     await talker.slave.stop()
     await until(lambda: refuses(lease), "its port refuses")
     await talker.slave.start(talker.address, talker.slave.address[1])
-    await until(lambda: [] in ear.updates(), "it is told at a look")
-    await told(ear, proxy.uri(talker))
+    await until(lambda: [] in listener.updates(), "it is told at a look")
+    await told(listener, proxy.uri(talker))

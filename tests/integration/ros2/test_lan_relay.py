@@ -19,14 +19,14 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import lan_sources
 from rosproxy.ros2.discovery.discovery_rates import Standing
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelay
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
-from rosproxy.ros2.servers.multicast_ear import Ear, EarSettings
+from rosproxy.ros2.servers.lan_relay import LanRelay, LanRelaySettings
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp
@@ -54,7 +54,7 @@ class Boundary:
         self.bind = HostPort(RELAY, free_ports(1))
         self.reasons = list[str]()
         self.server: DomainServer | None = None
-        self.relay: Ear | None = None
+        self.relay: LanRelay | None = None
 
     def start_proxy(self, secret: str = SECRET) -> DomainServer:
         if self.server:
@@ -67,7 +67,7 @@ class Boundary:
             note=lambda reason, *_: self.reasons.append(reason),
             judge=lambda *_: True,
             is_inside=lambda address: address == INSIDE,
-            relay=LanRelay(self.bind, RelayProof(secret, time.time)),
+            relay=LanRelayLink(self.bind, RelayProof(secret, time.time)),
         )
         times = chain([0.0], count(REMEMBERED + 1))  # each datagram comes a second later
         self.server = DomainServer(
@@ -80,11 +80,11 @@ class Boundary:
         assert self.server.start() == [], "other programs have ports of the range"
         return self.server
 
-    def start_relay(self, secret: str = SECRET) -> Ear:
+    def start_relay(self, secret: str = SECRET) -> LanRelay:
         if self.relay:
             self.relay.close()
         discovery = HostPort(PROXY, self.ports.first)
-        self.relay = Ear(EarSettings(DOMAIN, LAN, self.bind, discovery, secret))
+        self.relay = LanRelay(LanRelaySettings(DOMAIN, LAN, self.bind, discovery, secret))
         self.relay.start()
         return self.relay
 
@@ -173,7 +173,7 @@ async def test_a_process_at_the_relays_address_is_refused(boundary: Boundary) ->
         process.sendto(spdp(B, RELAY), discovery)
         await until(lambda: "not_a_peer" in boundary.reasons, "so is what has none")
     assert not server.domain.outside.by_prefix
-    assert not server.domain.rediscovery.ear_heard
+    assert not server.domain.rediscovery.lan_relay_heard
 
 
 async def test_a_process_at_the_proxys_address_announces_nothing(

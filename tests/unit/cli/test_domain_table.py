@@ -36,7 +36,7 @@ OUTSIDE = ParticipantStatus(
 DOMAIN = DomainStatus(
     domain=7,
     discovery="10.0.0.1:11400",
-    ear="172.30.0.1:7500",
+    lan_relay="172.30.0.1:7500",
     ports_used=1,
     ports_free=62,
     dropped=4,
@@ -61,7 +61,7 @@ def test_a_domain_and_its_participants_are_shown() -> None:
     text = shown(DOMAIN)
     for expected in (
         "ROS 2, domain 7, networks 172.30.0.0/16",
-        "domain 7: ear 172.30.0.1:7500; found at 10.0.0.1:11400; 1 ports used, 62 free",
+        "domain 7: LAN relay 172.30.0.1:7500; found at 10.0.0.1:11400; 1 ports used, 62 free",
         "4 datagrams refused",
         "11401 to 172.30.0.5:7410",
         "/chatter",
@@ -78,7 +78,7 @@ def test_a_domain_and_its_participants_are_shown() -> None:
 def test_what_the_kernel_forwards_is_told() -> None:
     by_kernel = DataPlaneStatus("auto", "kernel")
     text = shown(replace(DOMAIN, data_plane=by_kernel))
-    assert "user data forwarded by the kernel" in text
+    assert "user data forwarded by the kernel" in " ".join(text.split())
     assert "7 datagrams, 900 B as IP packets, to 11402; 11403 not used: no " in text
     assert "2.4 kB" in text
     assert "\x1b" not in text
@@ -90,5 +90,5 @@ def test_what_the_kernel_forwards_is_told() -> None:
 
 def test_who_is_told_nobody_is_told_so() -> None:
     text = shown(DomainStatus(domain=0))
-    assert "neither peers nor an ear: inside is announced to nobody" in text
+    assert "neither peers nor a LAN relay: inside is announced to nobody" in text
     assert "No participant has been heard yet." in text

@@ -64,7 +64,7 @@ def test_who_tells_nobody_is_told_what_to_give() -> None:
 
 def test_who_hears_nobody_is_told_where_to_look() -> None:
     told = diagnose_domain(
-        DomainStatus(domain=7, ear="172.30.0.1:7500", discovery="10.0.0.1:11400")
+        DomainStatus(domain=7, lan_relay="172.30.0.1:7500", discovery="10.0.0.1:11400")
     )
     assert "ROS_DOMAIN_ID=7" in told["inside", "domain 7"][1]
     assert "10.0.0.1:11400" in told["outside", "domain 7"][1]

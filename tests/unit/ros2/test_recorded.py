@@ -126,7 +126,7 @@ def _network_configurations(told: list[DiscoveryMessage]) -> list[int | None]:
 
 @OF_EACH
 def test_two_that_meet_through_the_proxy(vendor: str) -> None:
-    domain = make_domain(peers=(SUBSCRIBER,), ear=None)
+    domain = make_domain(peers=(SUBSCRIBER,), lan_relay=None)
     sent = list[Outgoing]()
     inside = set[tuple[EndpointKind, str]]()
     outside = set[tuple[EndpointKind, str]]()

@@ -77,8 +77,8 @@ class Create(_CreateContainer, frozen=True):
     """Create the container in which a proxy runs, in the namespace of the one named ``sandbox``.
 
     ``replaces`` names the one in whose place it comes, if any. ``policy`` are the layers of its
-    containers' labels. Of ROS 2: ``peers`` are told of its participants, and ``ear`` is where its
-    ear listens, on the uplink's gateway.
+    containers' labels. Of ROS 2: ``peers`` are told of its participants, and ``lan_relay`` is where
+    its LAN relay listens, on the uplink's gateway.
     """
 
     sandbox: str
@@ -90,7 +90,7 @@ class Create(_CreateContainer, frozen=True):
     udp: bool = False
     policy: tuple[PolicyLayer, ...] = ()
     peers: tuple[str, ...] = ()
-    ear: HostPort | None = None
+    lan_relay: HostPort | None = None
 
     def _details(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
@@ -101,11 +101,11 @@ class Create(_CreateContainer, frozen=True):
         )
 
 
-class CreateEar(_CreateContainer, frozen=True):
-    """Create the ear of a proxy for ROS 2, in the host's network.
+class CreateLanRelay(_CreateContainer, frozen=True):
+    """Create the LAN relay of a proxy for ROS 2, in the host's network.
 
-    ``lan`` is this host's address on the LAN, ``bind`` where the ear hears the proxy, ``proxy``
-    where the proxy hears the ear.
+    ``lan`` is this host's address on the LAN, ``bind`` where the LAN relay hears the proxy,
+    ``proxy`` where the proxy hears the LAN relay.
     """
 
     lan: str

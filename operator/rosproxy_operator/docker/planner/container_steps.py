@@ -21,7 +21,7 @@ from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
-    CreateEar,
+    CreateLanRelay,
     CreateSandbox,
     Disconnect,
     Remove,
@@ -87,8 +87,8 @@ class PlanContext:
         return label_layers(self.desired.members, by_id, self.desired.networks)
 
     @property
-    def ear(self) -> HostPort | None:
-        """Where the proxy's ear listens; None if it is to have none."""
+    def lan_relay(self) -> HostPort | None:
+        """Where the proxy's LAN relay listens; None if it is to have none."""
         if not self.desired.key.is_ros2 or self.settings.ros2_lan == NOWHERE:
             return None
         gateway = self.observed.gateway(self.settings.uplink)
@@ -142,7 +142,7 @@ def removal_steps(
 ) -> Iterator[Action]:
     """Remove everything of a key; ``again`` also what the engine is removing already."""
     # A proxy that retires reaches the LAN by its relay, and all of outside by its sandbox.
-    ordered = (*observed.proxies_of(key), *observed.ears_of(key), *observed.sandboxes_of(key))
+    ordered = (*observed.proxies_of(key), *observed.lan_relays_of(key), *observed.sandboxes_of(key))
     for own in ordered:
         if own.container.state == "paused" and not isinstance(own, Sandbox):
             yield Unpause(own.container.name)
@@ -318,7 +318,7 @@ def _process_steps(
         udp=context.desired.udp,
         policy=context.label_policy,
         peers=context.desired.peers,
-        ear=context.ear,
+        lan_relay=context.lan_relay,
     )
     observed = context.observed
     expected = proxy_fingerprint(action, context.settings, observed.image_id, observed.secret)
@@ -380,7 +380,7 @@ def former_name(old: Container | None, name: str, taken: Collection[str]) -> str
 
 def creation_steps(
     selection: Selection,
-    action: CreateSandbox | Create | CreateEar,
+    action: CreateSandbox | Create | CreateLanRelay,
     former: str,
     ended: Iterable[Action] = (),
 ) -> Iterator[Action]:

@@ -145,8 +145,8 @@ class Proxy(OwnContainer):
     """A proxy runs in it, in the namespace of its sandbox, the `network_container`."""
 
 
-class EarContainer(OwnContainer):
-    """The ear of a proxy for ROS 2 runs in it, in the host's network."""
+class LanRelayContainer(OwnContainer):
+    """The LAN relay of a proxy for ROS 2 runs in it, in the host's network."""
 
 
 class RedirectContainer(OwnContainer):
@@ -207,7 +207,7 @@ class HostState:
     advertise: Mapping[str, str] = field(default_factory=dict)
     far: str = ""
     sandboxes: tuple[Sandbox, ...] = ()
-    ears: tuple[EarContainer, ...] = ()
+    lan_relays: tuple[LanRelayContainer, ...] = ()
     redirects: tuple[RedirectContainer, ...] = ()
     flushes: tuple[FlushContainer, ...] = ()
     masters: Mapping[str, str] = field(default_factory=dict)
@@ -219,7 +219,7 @@ class HostState:
     @property
     def own(self) -> tuple[OwnContainer, ...]:
         """All that is the operator's own."""
-        return (*self.sandboxes, *self.proxies, *self.ears)
+        return (*self.sandboxes, *self.proxies, *self.lan_relays)
 
     @property
     def keys(self) -> frozenset[Key]:
@@ -238,9 +238,9 @@ class HostState:
         """The gateway of a network; empty if it has none or is not there."""
         return next((n.gateway for n in self.networks if n.name == name), "")
 
-    def ears_of(self, key: Key) -> tuple[EarContainer, ...]:
-        """The ears of a key."""
-        return tuple(e for e in self.ears if e.key == key)
+    def lan_relays_of(self, key: Key) -> tuple[LanRelayContainer, ...]:
+        """The LAN relays of a key."""
+        return tuple(e for e in self.lan_relays if e.key == key)
 
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy is; None if it is there no more."""

@@ -21,23 +21,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosproxy_operator.common.ros2 import EAR_COMMAND
+from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND
 from rosproxy_operator.docker.planner.specs import (
+    FORMER_LAN_RELAY,
     HELPER_USER,
     NFT,
     PROXY_COMMAND,
-    ROLE_EAR,
     ROLE_FLUSH,
+    ROLE_LAN_RELAY,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
     SANDBOX_COMMAND,
     USER,
     OwnLabels,
-    ear_name,
     flush_command,
     flush_name,
     is_kernel_host,
+    lan_relay_name,
     proxy_name,
     published_ports,
     redirect_name,
@@ -56,9 +57,10 @@ _OWN_IPC = (None, "", "private", "shareable")
 _COMMANDS = {
     ROLE_SANDBOX: SANDBOX_COMMAND,
     ROLE_PROXY: PROXY_COMMAND,
-    ROLE_EAR: EAR_COMMAND,
+    ROLE_LAN_RELAY: LAN_RELAY_COMMAND,
     ROLE_REDIRECT: (NFT,),
 }
+_FORMER_COMMAND = ("rosproxy", FORMER_LAN_RELAY)
 _HELPERS = (ROLE_REDIRECT, ROLE_FLUSH)
 _SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
 
@@ -79,7 +81,10 @@ class CreationFacts:
 
 def has_own_name(own: OwnLabels, name: str) -> bool:
     """Whether a name is one that a container with these labels can have."""
-    return re.fullmatch(re.escape(_name(own)) + _TEMPORARY, name) is not None
+    names = [_name(own)]
+    if own.role == ROLE_LAN_RELAY:
+        names.append(f"{proxy_name(own.key)}-{FORMER_LAN_RELAY}")
+    return any(re.fullmatch(re.escape(each) + _TEMPORARY, name) for each in names)
 
 
 def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: str) -> str:
@@ -99,12 +104,13 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
     of_image = own.role == ROLE_PROXY and making.image == image_id
     # What a redirect runs ends with its rules: they are in its fingerprint, and so in its name.
     actual = making.command[:1] if own.role == ROLE_REDIRECT else making.command
-    if actual != command and not of_image:
+    is_former = own.role == ROLE_LAN_RELAY and actual == _FORMER_COMMAND
+    if actual != command and not of_image and not is_former:
         return f"its command is not {' '.join(command)}"
     odd = {
         ROLE_SANDBOX: _odd_sandbox(own, making.host),
         ROLE_PROXY: _odd_proxy(making.host),
-        ROLE_EAR: _odd_ear(making.host),
+        ROLE_LAN_RELAY: _odd_lan_relay(making.host),
         ROLE_REDIRECT: _odd_redirect(making.host),
         ROLE_FLUSH: _odd_flush(making.host),
     }
@@ -114,7 +120,7 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
 def _name(own: OwnLabels) -> str:
     if own.role == ROLE_REDIRECT:
         return redirect_name(own.key, own.fingerprint)
-    names = {ROLE_SANDBOX: sandbox_name, ROLE_EAR: ear_name, ROLE_FLUSH: flush_name}
+    names = {ROLE_SANDBOX: sandbox_name, ROLE_LAN_RELAY: lan_relay_name, ROLE_FLUSH: flush_name}
     return names.get(own.role, proxy_name)(own.key)
 
 
@@ -155,8 +161,8 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
         yield "Sysctls"
 
 
-def _odd_ear(host: Mapping[str, Any]) -> Iterator[str]:
-    """An ear is in the host's network, and has no other right."""
+def _odd_lan_relay(host: Mapping[str, Any]) -> Iterator[str]:
+    """A LAN relay is in the host's network, and has no other right."""
     yield from _odd(host)
     if host.get("CapAdd"):
         yield "CapAdd"

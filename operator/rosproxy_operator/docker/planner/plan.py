@@ -20,11 +20,11 @@ from rosproxy_operator.docker.planner.container_steps import (
     wanted_steps,
 )
 from rosproxy_operator.docker.planner.desired import desire
-from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
 from rosproxy_operator.docker.planner.flush import flush_steps
 from rosproxy_operator.docker.planner.label_peers import with_bounded_peers
 from rosproxy_operator.docker.planner.label_policy import with_bounded_rules
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
+from rosproxy_operator.docker.planner.lan_relay import missing_lan_relay, with_lan_relay
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.redirect import redirect_steps
 from rosproxy_operator.docker.planner.specs import master, proxy_name, unresolved_master
@@ -59,9 +59,9 @@ class DockerPlan:
     """What to do, group after group, and what to remember.
 
     ``deferred`` are groups that have to wait until the address of their master is known: without
-    it a proxy would find itself by its master's name; or until the uplink is there, where an ear
-    listens. ``again_in`` is in how many seconds to look again even if nothing happens; None: no
-    need.
+    it a proxy would find itself by its master's name; or until the uplink is there, where a LAN
+    relay listens. ``again_in`` is in how many seconds to look again even if nothing happens; None:
+    no need.
     """
 
     groups: tuple[Group, ...]
@@ -110,7 +110,7 @@ def plan(
         if ports := memory.planned.get(wanted.key):  # else its problem is reported already
             context = PlanContext(observed, settings, wanted, ports, naming, creatable)
             steps = wanted_steps(context)
-            planned[wanted.key] = steps if steps is None else with_ear(context, steps)
+            planned[wanted.key] = steps if steps is None else with_lan_relay(context, steps)
     problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *naming.problems, *tight]
     problems += _unwell(observed, live)
     problems += _deaf(observed, settings, live)
@@ -218,14 +218,14 @@ def _waits(group: Group, observed: HostState, uplink: str) -> bool:
 
 
 def _lacks_address(key: Key, observed: HostState, uplink: str) -> bool:
-    if key.is_ros2:  # its ear is at the uplink's gateway
+    if key.is_ros2:  # its LAN relay is at the uplink's gateway
         return uplink not in {network.name for network in observed.networks}
     return observed.masters.get(master(key).host) == ""
 
 
 def _deaf(observed: HostState, settings: PlanSettings, live: Collection[Key]) -> Iterator[Problem]:
-    """Proxies for ROS 2 that lack an ear."""
-    problems = (missing_ear(key, observed, settings) for key in sorted(live) if key.is_ros2)
+    """Proxies for ROS 2 that lack a LAN relay."""
+    problems = (missing_lan_relay(key, observed, settings) for key in sorted(live) if key.is_ros2)
     yield from filter(None, problems)
 
 

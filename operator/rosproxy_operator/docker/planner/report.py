@@ -81,7 +81,9 @@ def _proxy_row(proxy: Status) -> tuple[str, ...]:
 def _graph(proxy: Status) -> str:
     """What a proxy's nodes have in common."""
     if proxy["ros"] == "2":
-        return f"domain {proxy['domain']}" + (", no ear" if proxy["ear"] is None else "")
+        return f"domain {proxy['domain']}" + (
+            ", no LAN relay" if proxy["lan_relay"] is None else ""
+        )
     return clean(proxy["master_uri"]) + (" DOWN" if proxy["master_up"] is False else "")
 
 

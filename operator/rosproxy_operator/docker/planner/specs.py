@@ -17,16 +17,16 @@ from rosproxy.setting_kinds import SettingError, hash_token, parse_range
 from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
 from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.common.ros2 import (
-    EAR_COMMAND,
+    LAN_RELAY_COMMAND,
     LAST_DOMAIN,
-    ear_variables,
+    lan_relay_variables,
     relay_secret,
     well_known_ports,
 )
 from rosproxy_operator.docker.planner.actions import (
     Create,
-    CreateEar,
     CreateFlush,
+    CreateLanRelay,
     CreateRedirect,
     CreateSandbox,
 )
@@ -37,7 +37,10 @@ MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
 ROLE_SANDBOX = "ports"
 ROLE_PROXY = "proxy"
-ROLE_EAR = "ear"
+ROLE_LAN_RELAY = "lan-relay"
+FORMER_LAN_RELAY = "ear"
+"""The role, command and end of the name of LAN relays that operators before 0.1.0 made. They are
+made anew."""
 ROLE_REDIRECT = "redirect"
 ROLE_FLUSH = "flush"
 MASTER_URI = "io.rosproxy.master-uri"
@@ -71,13 +74,13 @@ Given explicitly, as an engine may have no-new-privileges for its default.
 _ROLES = {
     CreateSandbox: ROLE_SANDBOX,
     Create: ROLE_PROXY,
-    CreateEar: ROLE_EAR,
+    CreateLanRelay: ROLE_LAN_RELAY,
     CreateRedirect: ROLE_REDIRECT,
     CreateFlush: ROLE_FLUSH,
 }
-EAR_MEMORY = 128 * 1024**2
-EAR_PIDS = 64
-"""Bytes and threads of an ear, which has 30 MiB and one."""
+LAN_RELAY_MEMORY = 128 * 1024**2
+LAN_RELAY_PIDS = 64
+"""Bytes and threads of a LAN relay, which has 30 MiB and one."""
 USER = "10001:10001"
 SANDBOX_COMMAND = ("sleep", "infinity")
 PROXY_COMMAND = ("rosproxy", "run")
@@ -130,9 +133,9 @@ def sandbox_name(key: Key) -> str:
     return f"{proxy_name(key)}-ports"
 
 
-def ear_name(key: Key) -> str:
-    """The name of the container in which a key's ear runs."""
-    return f"{proxy_name(key)}-ear"
+def lan_relay_name(key: Key) -> str:
+    """The name of the container in which a key's LAN relay runs."""
+    return f"{proxy_name(key)}-lan-relay"
 
 
 def redirect_name(key: Key, fingerprint: str) -> str:
@@ -147,7 +150,7 @@ def flush_name(key: Key) -> str:
 
 def is_proxy_name(name: str) -> bool:
     """Whether a name is one that a proxy's container has, also if it is not there now."""
-    return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports|-ear)?", name) is not None
+    return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports|-lan-relay)?", name) is not None
 
 
 def _identity(key: Key) -> str:
@@ -198,7 +201,7 @@ def reserved_ports(key: Key) -> frozenset[int]:
 
 
 def own_range(key: Key, ports: PortRange) -> PortRange:
-    """The proxy's own ports of those that are held for it: for ROS 2 the last one is its ear's."""
+    """The proxy's own ports of a range: for ROS 2 the last port of the range is the LAN relay's."""
     return PortRange(ports.first, ports.last - 1) if key.is_ros2 else ports
 
 
@@ -218,6 +221,8 @@ def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
     None if they are not those of one, or not whole.
     """
     role = labels.get(ROLE, "")
+    if role == FORMER_LAN_RELAY:
+        role = ROLE_LAN_RELAY
     if labels.get(MANAGED) != "true" or role not in _ROLES.values():
         return None
     key = _read_key(labels)
@@ -225,7 +230,7 @@ def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
         ports = parse_range(RANGE, labels.get(RANGE, ""))
     except SettingError:
         return None
-    if key is None or (role == ROLE_EAR and not key.is_ros2):
+    if key is None or (role == ROLE_LAN_RELAY and not key.is_ros2):
         return None
     return OwnLabels(role, key, ports, labels.get(FINGERPRINT, ""))
 
@@ -242,7 +247,7 @@ def _read_key(labels: Mapping[str, str]) -> Key | None:
     return Key("", host, int(domain)) if is_domain else None
 
 
-Creation = CreateSandbox | Create | CreateEar | CreateRedirect | CreateFlush
+Creation = CreateSandbox | Create | CreateLanRelay | CreateRedirect | CreateFlush
 """An action that creates a container."""
 
 
@@ -396,8 +401,10 @@ def _ros2_variables(action: Create, secret: str) -> dict[str, str]:
         "ROSPROXY_ROS": "2",
         "ROSPROXY_ROS2_DOMAINS": str(action.key.domain),
         "ROSPROXY_ROS2_PEERS": " ".join(action.peers),
-        "ROSPROXY_ROS2_EAR": str(action.ear or ""),
-        "ROSPROXY_ROS2_EAR_SECRET": _relay_secret(action.key, secret) if action.ear else "",
+        "ROSPROXY_ROS2_LAN_RELAY": str(action.lan_relay or ""),
+        "ROSPROXY_ROS2_LAN_RELAY_SECRET": _relay_secret(action.key, secret)
+        if action.lan_relay
+        else "",
     }
 
 
@@ -406,34 +413,38 @@ def _relay_secret(key: Key, secret: str) -> str:
     return relay_secret(secret.encode(), _identity(key))
 
 
-def ear_config(action: CreateEar, settings: PlanSettings, secret: str) -> dict[str, Any]:
-    """The body of the engine's ``POST /containers/create`` for an ear.
+def lan_relay_config(action: CreateLanRelay, settings: PlanSettings, secret: str) -> dict[str, Any]:
+    """The body of the engine's ``POST /containers/create`` for a LAN relay.
 
     It has the host's network and nothing else of the host's. ``secret`` is what its own is made of.
     """
     own = _relay_secret(action.key, secret)
-    variables = ear_variables(action.key.domain or 0, action.lan, action.bind, action.proxy, own)
+    variables = lan_relay_variables(
+        action.key.domain or 0, action.lan, action.bind, action.proxy, own
+    )
     return {
         "Image": settings.proxy_image,
         "User": USER,
         # The image's entry point is rosproxy already.
-        "Cmd": [*EAR_COMMAND[1:]],
+        "Cmd": [*LAN_RELAY_COMMAND[1:]],
         "Healthcheck": {"Test": ["NONE"]},
         "Env": [f"{name}={value}" for name, value in variables.items()],
         "Labels": own_labels(action),
         "HostConfig": {
             **COMMON,
             "Init": False,
-            "Memory": EAR_MEMORY,
-            "PidsLimit": EAR_PIDS,
+            "Memory": LAN_RELAY_MEMORY,
+            "PidsLimit": LAN_RELAY_PIDS,
             "NetworkMode": "host",
         },
     }
 
 
-def ear_fingerprint(action: CreateEar, settings: PlanSettings, image_id: str, secret: str) -> str:
-    """What an ear is made of, in 16 hex digits; its name is not in it."""
-    body = ear_config(replace(action, fingerprint=""), settings, secret)
+def lan_relay_fingerprint(
+    action: CreateLanRelay, settings: PlanSettings, image_id: str, secret: str
+) -> str:
+    """What a LAN relay is made of, in 16 hex digits; its name is not in it."""
+    body = lan_relay_config(replace(action, fingerprint=""), settings, secret)
     return digest({**body, "Image": image_id})
 
 

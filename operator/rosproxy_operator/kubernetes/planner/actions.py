@@ -64,14 +64,14 @@ class DeleteProxy(ObjectAction, frozen=True):
     retire: bool = False
 
 
-class CreateEar(ClusterAction, frozen=True):
-    """Create the pod of a proxy's ear. ``body`` is the whole object."""
+class CreateLanRelay(ClusterAction, frozen=True):
+    """Create the pod of a proxy's LAN relay. ``body`` is the whole object."""
 
     body: Json
 
 
-class DeleteEar(ObjectAction, frozen=True):
-    """Delete the pod of an ear."""
+class DeleteLanRelay(ObjectAction, frozen=True):
+    """Delete the pod of a LAN relay."""
 
     why: str
 
@@ -115,8 +115,8 @@ Action = (
     | DeletePolicy
     | CreateProxy
     | DeleteProxy
-    | CreateEar
-    | DeleteEar
+    | CreateLanRelay
+    | DeleteLanRelay
     | EvictPod
     | SetImage
     | PatchStatus

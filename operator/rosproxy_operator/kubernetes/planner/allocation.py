@@ -237,10 +237,15 @@ class _Allocation:
         return [*self._strangers(place), *proxy_pods]
 
     def _strangers(self, place: ProxyPlace) -> list[Pod]:
-        """Pods that are no proxies, among them the ears of other RosProxies."""
+        """Pods that are no proxies, among them the LAN relays of other RosProxies."""
         # That of the same RosProxy holds the last port of the range: see `ProxySite.own_ports`.
-        ears = (ear for ear in self.view.observed.ears if ear.node == self.node)
-        return [*self.strangers, *(ear.pod for ear in ears if ear.of != place.of)]
+        lan_relays = (
+            lan_relay for lan_relay in self.view.observed.lan_relays if lan_relay.node == self.node
+        )
+        return [
+            *self.strangers,
+            *(lan_relay.pod for lan_relay in lan_relays if lan_relay.of != place.of),
+        ]
 
     def _promised_to_others(self, place: ProxyPlace) -> Iterator[PortRange]:
         """The ports that other proxies on the node have been given so far."""

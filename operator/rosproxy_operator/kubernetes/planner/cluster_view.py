@@ -35,9 +35,9 @@ class View(msgspec.Struct, frozen=True):
     that they are meant for, all proxies that hold ports, of any RosProxy. ``wanted`` are the
     places where pods want a proxy, and those pods; ``places`` those where a proxy is wanted or
     exists, in order; ``selected_pods`` all pods that a RosProxy has taken, wherever they are.
-    ``other_pods_by_node`` are, by node, the pods that hold ports and are neither proxies nor ears,
-    ``other_pod_names`` the names of all such pods, with ports or not, ``names`` those of all
-    proxies. ``findings`` are those about pods.
+    ``other_pods_by_node`` are, by node, the pods that hold ports and are neither proxies nor LAN
+    relays, ``other_pod_names`` the names of all such pods, with ports or not, ``names`` those of
+    all proxies. ``findings`` are those about pods.
     """
 
     observed: ClusterSnapshot
@@ -77,7 +77,9 @@ def view(observed: ClusterSnapshot) -> View:
     proxies = group_by_key((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
     unusable = {r.uid for r in observed.unusable.values()}
     orphans = (p for p in observed.proxies if not _owned(p, rosproxies))
-    own_uids = {p.pod.uid for p in observed.proxies} | {ear.pod.uid for ear in observed.ears}
+    own_uids = {p.pod.uid for p in observed.proxies} | {
+        lan_relay.pod.uid for lan_relay in observed.lan_relays
+    }
     other_pods = {pod.uid: pod for pod in observed.pods if pod.uid not in own_uids}.values()
     taken, findings = _taken(observed, rosproxies)
     wanted, left_out = _wanted(observed, rosproxies, taken)

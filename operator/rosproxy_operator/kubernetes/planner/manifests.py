@@ -99,13 +99,13 @@ class ProxySite(msgspec.Struct, frozen=True):
 
     @property
     def own_ports(self) -> PortRange:
-        """The proxy's own ports of the range: with an ear the last one is the ear's."""
+        """The proxy's own ports of the range: with a LAN relay the last one is the LAN relay's."""
         ports = self.ports
         return PortRange(ports.first, ports.last - 1) if self.rosproxy.spec.multicast else ports
 
     @property
-    def ear(self) -> HostPort | None:
-        """Where on the node the proxy's ear is told of participants; None if it has no ear."""
+    def lan_relay(self) -> HostPort | None:
+        """Where on the node the proxy's LAN relay listens for it; None without a LAN relay."""
         lan = lan_address(self.node, self.advertise_host)
         multicast = self.rosproxy.spec.multicast and lan
         return HostPort(lan, self.ports.last) if multicast else None
@@ -383,8 +383,8 @@ def _ros2_variables(site: ProxySite) -> Mapping[str, str]:
         "ROSPROXY_ROS": "1 2" if spec.ros1 else "2",
         "ROSPROXY_ROS2_DOMAINS": str(spec.ros2.number),
         PEERS_VARIABLE: " ".join(site.peers),
-        "ROSPROXY_ROS2_EAR": str(site.ear or ""),
-        "ROSPROXY_ROS2_EAR_SECRET": site.relay_secret if site.ear else "",
+        "ROSPROXY_ROS2_LAN_RELAY": str(site.lan_relay or ""),
+        "ROSPROXY_ROS2_LAN_RELAY_SECRET": site.relay_secret if site.lan_relay else "",
     }
 
 

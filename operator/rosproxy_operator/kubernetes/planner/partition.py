@@ -67,7 +67,7 @@ def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
     for pod in observed.pods:
         if pod.uid in observed.selected:
             yield pod.id.namespace, pod.node
-    for own_pod in own_pods(observed.proxies, observed.ears):
+    for own_pod in own_pods(observed.proxies, observed.lan_relays):
         yield own_pod.of.namespace, own_pod.node
         yield own_pod.of.namespace, own_pod.pod.node
     for rosproxy in observed.rosproxies:
@@ -87,7 +87,9 @@ def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> Clust
         ),
         misspelt_pods=tuple(p for p in observed.misspelt_pods if p.id.namespace in namespaces),
         proxies=tuple(p for p in observed.proxies if p.of.namespace in namespaces),
-        ears=tuple(ear for ear in observed.ears if ear.of.namespace in namespaces),
+        lan_relays=tuple(
+            lan_relay for lan_relay in observed.lan_relays if lan_relay.of.namespace in namespaces
+        ),
         services={id: s for id, s in observed.services.items() if id.namespace in namespaces},
         policies={id: p for id, p in observed.policies.items() if id.namespace in namespaces},
     )

@@ -28,7 +28,10 @@ from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
-from rosproxy_operator.kubernetes.planner.steps.ear import ear_findings, reconcile_ears
+from rosproxy_operator.kubernetes.planner.steps.lan_relay import (
+    lan_relay_findings,
+    reconcile_lan_relays,
+)
 from rosproxy_operator.kubernetes.planner.steps.network_policy import (
     reconcile_orphaned_policies,
     reconcile_policies,
@@ -62,7 +65,7 @@ _STEPS = (
     reconcile_service,
     reconcile_policies,
     reconcile_proxies,
-    reconcile_ears,
+    reconcile_lan_relays,
     remake_unwired,
 )
 """What is done for each RosProxy, in this order."""
@@ -168,7 +171,9 @@ def stand_by(
 
 def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnNode]:
     """What a RosProxy has on each node that its status names: also where it had a proxy."""
-    ears = [ear for ear in context.observed.ears if ear.owner == rosproxy.uid]
+    lan_relays = [
+        lan_relay for lan_relay in context.observed.lan_relays if lan_relay.owner == rosproxy.uid
+    ]
     node_names = {
         *rosproxy.former_ranges,
         *(p.node for p in context.view.places.get(rosproxy.id, ())),
@@ -188,7 +193,7 @@ def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnN
             pods=context.view.wanted.get(place, ()),
             answer=context.observed.reports.get(current.pod.uid) if current else None,
             obstacle=site if isinstance(site, Obstacle) else None,
-            ear=next((ear for ear in ears if ear.node == node), None),
+            lan_relay=next((lan_relay for lan_relay in lan_relays if lan_relay.node == node), None),
         )
 
 
@@ -212,7 +217,7 @@ def _problems(
             None, (wiring_finding(pod, rosproxy, address) for pod in pods if rosproxy.spec.ros1)
         ),
         *(f for pod in pods for f in ros2_findings(pod, rosproxy, address)),
-        *ear_findings(context, rosproxy),
+        *lan_relay_findings(context, rosproxy),
         *misspellings(context.view, rosproxy),
     )
 

@@ -51,7 +51,7 @@ class ProxyPod(msgspec.Struct, frozen=True):
     restarts: int = 0
 
 
-class EarPod(msgspec.Struct, frozen=True):
+class LanRelayPod(msgspec.Struct, frozen=True):
     """A pod of the operator that hears the LAN for a proxy. Its fields are those of `ProxyPod`."""
 
     pod: Pod
@@ -65,9 +65,11 @@ class EarPod(msgspec.Struct, frozen=True):
     message: str = ""
 
 
-def own_pods(proxies: Iterable[ProxyPod], ears: Iterable[EarPod]) -> tuple[ProxyPod | EarPod, ...]:
+def own_pods(
+    proxies: Iterable[ProxyPod], lan_relays: Iterable[LanRelayPod]
+) -> tuple[ProxyPod | LanRelayPod, ...]:
     """The operator's pods of both kinds."""
-    return (*proxies, *ears)
+    return (*proxies, *lan_relays)
 
 
 class ProxyService(msgspec.Struct, frozen=True):
@@ -152,7 +154,7 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
     told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
     had. ``proxy`` is the pod that serves the node, None where there is none yet or any more;
-    ``ear`` its ear.
+    ``lan_relay`` its LAN relay.
     """
 
     name: str
@@ -162,31 +164,32 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     pods: tuple[Pod, ...] = ()
     answer: ProxyReport | None = None
     obstacle: Obstacle | None = None
-    ear: EarPod | None = None
+    lan_relay: LanRelayPod | None = None
 
 
 class ClusterSnapshot(msgspec.Struct, frozen=True):
     """A cluster at one moment, as far as it matters.
 
-    ``pods`` are those that a RosProxy selects; and on the nodes where those, proxies or ears run
-    all others of the namespaces that have such, and any that take ports there. ``masters`` gives,
-    for each Service that a RosProxy names as its master, its address and what is wrong; one of them
-    is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it, besides
-    its own. ``selected`` are the uids of the pods that a RosProxy selects; ``misspelt_pods`` are
-    those of the RosProxies' namespaces that have a misspelt label or annotation,
-    ``misspelt_services`` says what is wrong with those of ``masters``. ``policies`` are the
-    operator's own NetworkPolicies by their names; ``policies_error`` is why they can't be listed.
-    ``key`` is that from which the proxies' tokens are made. ``unusable`` are the RosProxies that
-    can't be read at all: what they have is left as it is. ``reports`` are what the proxies say of
-    themselves, by the uid of the pod; ``failures`` are, by RosProxy and object, what the API server
-    said of the actions that failed at the last try: neither is listed, the operator puts them here.
+    ``pods`` are those that a RosProxy selects; and on the nodes where those, proxies or LAN relays
+    run all others of the namespaces that have such, and any that take ports there. ``masters``
+    gives, for each Service that a RosProxy names as its master, its address and what is wrong; one
+    of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it,
+    besides its own. ``selected`` are the uids of the pods that a RosProxy selects;
+    ``misspelt_pods`` are those of the RosProxies' namespaces that have a misspelt label or
+    annotation, ``misspelt_services`` says what is wrong with those of ``masters``. ``policies`` are
+    the operator's own NetworkPolicies by their names; ``policies_error`` is why they can't be
+    listed. ``key`` is that from which the proxies' tokens are made. ``unusable`` are the RosProxies
+    that can't be read at all: what they have is left as it is. ``reports`` are what the proxies say
+    of themselves, by the uid of the pod; ``failures`` are, by RosProxy and object, what the API
+    server said of the actions that failed at the last try: neither is listed, the operator puts
+    them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
     nodes: Mapping[str, ClusterNode] = {}
     pods: tuple[Pod, ...] = ()
     proxies: tuple[ProxyPod, ...] = ()
-    ears: tuple[EarPod, ...] = ()
+    lan_relays: tuple[LanRelayPod, ...] = ()
     services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
     consents: Mapping[Name, frozenset[str]] = {}

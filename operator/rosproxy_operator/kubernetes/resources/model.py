@@ -121,7 +121,7 @@ class RosProxySpec(msgspec.Struct, frozen=True):
 
     @property
     def multicast(self) -> bool:
-        """Whether each proxy has an ear, at the last port of its range."""
+        """Whether each proxy has a LAN relay, at the last port of its range."""
         return self.ros2 is not None and self.ros2.multicast
 
     @property

@@ -41,10 +41,13 @@ NAME_LABEL = "app.kubernetes.io/name"
 COMPONENT_LABEL = "app.kubernetes.io/component"
 MANAGED_BY_LABEL = "app.kubernetes.io/managed-by"
 PROXY = "proxy"
-EAR = "ear"
+LAN_RELAY = "lan-relay"
 """What is made for a RosProxy, by the component label."""
+_FORMER_LAN_RELAY = "ear"
+"""The component of LAN relays that operators before 0.1.0 made; they are made anew."""
 _OWN = {NAME_LABEL: "rosproxy", MANAGED_BY_LABEL: "rosproxy-operator"}
-_EITHER = f"{COMPONENT_LABEL} in ({EAR},{PROXY})"
+_COMPONENTS = (_FORMER_LAN_RELAY, LAN_RELAY, PROXY)
+_EITHER = f"{COMPONENT_LABEL} in ({','.join(_COMPONENTS)})"
 OWN_SELECTOR = ",".join([*(f"{label}={value}" for label, value in _OWN.items()), _EITHER])
 """Label selector, in the API's words, of everything that the operator makes."""
 
@@ -71,12 +74,12 @@ def own_labels(rosproxy: str, component: str = PROXY) -> dict[str, str]:
 def is_own(labels: Mapping[str, str]) -> bool:
     """Whether labels are those that the operator gives to what it makes."""
     same = all(labels.get(label) == value for label, value in _OWN.items())
-    return same and labels.get(COMPONENT_LABEL) in (PROXY, EAR) and PROXY_OF in labels
+    return same and labels.get(COMPONENT_LABEL) in _COMPONENTS and PROXY_OF in labels
 
 
-def is_ear(labels: Mapping[str, str]) -> bool:
-    """Whether they are those of an ear."""
-    return is_own(labels) and labels[COMPONENT_LABEL] == EAR
+def is_lan_relay(labels: Mapping[str, str]) -> bool:
+    """Whether they are those of a LAN relay."""
+    return is_own(labels) and labels[COMPONENT_LABEL] != PROXY
 
 
 def service_id(rosproxy: Name) -> Name:
@@ -94,10 +97,10 @@ def proxy_id(rosproxy: Name, node: str) -> Name:
     return Name(rosproxy.namespace, "-".join(s for s in segments if s))
 
 
-def ear_id(rosproxy: Name, node: str) -> Name:
-    """The name of the pod in which the ear of a RosProxy's proxy on a node runs."""
+def lan_relay_id(rosproxy: Name, node: str) -> Name:
+    """The name of the pod in which the LAN relay of a RosProxy's proxy on a node runs."""
     proxy = proxy_id(rosproxy, node)
-    return Name(proxy.namespace, f"{proxy.name}-ear")
+    return Name(proxy.namespace, f"{proxy.name}-lan-relay")
 
 
 def policy_id(rosproxy: Name) -> Name:

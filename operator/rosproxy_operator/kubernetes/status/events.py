@@ -9,9 +9,9 @@ import msgspec
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
-    CreateEar,
+    CreateLanRelay,
     CreateProxy,
-    DeleteEar,
+    DeleteLanRelay,
     DeleteProxy,
     Emit,
     EvictPod,
@@ -41,7 +41,7 @@ COMPONENT = "rosproxy-operator"
 _LONGEST_NAME = 200
 _ENDED: Mapping[type, tuple[str, str]] = {
     DeleteProxy: ("ProxyDeleted", "deleted"),
-    DeleteEar: ("EarDeleted", "deleted"),
+    DeleteLanRelay: ("LanRelayDeleted", "deleted"),
     EvictPod: ("PodEvicted", "evicted"),
 }
 """Reason and verb of the Events about what goes."""
@@ -105,11 +105,13 @@ def _result(action: Action) -> tuple[str, str]:
             return "ProxyCreated", f"created pod {name} {place}"
         case SetImage(id=id, image=image):
             return "ImageSet", f"gave pod {id.name} the image {image}"
-        case DeleteProxy(id=id, why=why) | DeleteEar(id=id, why=why) | EvictPod(id=id, why=why):
+        case (
+            DeleteProxy(id=id, why=why) | DeleteLanRelay(id=id, why=why) | EvictPod(id=id, why=why)
+        ):
             reason, verb = _ENDED[type(action)]
             return reason, f"{verb} pod {id.name}: {why}"
-        case CreateEar(body={"metadata": {"name": name, "annotations": notes}}):
-            return "EarCreated", f"created pod {name} on node {notes[NODE]}"
+        case CreateLanRelay(body={"metadata": {"name": name, "annotations": notes}}):
+            return "LanRelayCreated", f"created pod {name} on node {notes[NODE]}"
         case _:
             return "", ""
 

@@ -9,7 +9,7 @@ from rosproxy.admin.setup_rules import RANGE
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.cluster import (
-    EarPod,
+    LanRelayPod,
     PodFailure,
     ProxyPod,
     ProxyReport,
@@ -57,8 +57,12 @@ def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[Cluster
     """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
     if state.obstacle is not None:
         yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
-    if state.ear is not None and state.ear.stuck is not None and not state.ear.pod.deleting:
-        yield _deaf(rosproxy, state.ear)
+    if (
+        state.lan_relay is not None
+        and state.lan_relay.stuck is not None
+        and not state.lan_relay.pod.deleting
+    ):
+        yield _deaf(rosproxy, state.lan_relay)
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting:
         return
@@ -114,14 +118,14 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
     return _finding(rosproxy, proxy_subject(proxy), texts[cause], reason)
 
 
-def _deaf(rosproxy: RosProxy, ear: EarPod) -> ClusterFinding:
-    id = ear.pod.id
+def _deaf(rosproxy: RosProxy, lan_relay: LanRelayPod) -> ClusterFinding:
+    id = lan_relay.pod.id
     text = (
-        f"it does not run ({ear.message}), so that the LAN is not heard: kubectl -n {id.namespace} "
-        f"describe pod {id.name}"
+        f"it does not run ({lan_relay.message}), so that the LAN is not heard: "
+        f"kubectl -n {id.namespace} describe pod {id.name}"
     )
-    subject = f"ear {id.name} on node {ear.node}"
-    return finding(rosproxy, "EarStuck", bounded(text, _LONGEST), subject=subject)
+    subject = f"LAN relay {id.name} on node {lan_relay.node}"
+    return finding(rosproxy, "LanRelayStuck", bounded(text, _LONGEST), subject=subject)
 
 
 def _answered(
@@ -204,7 +208,7 @@ def _security_remedy(low: str, rosproxy: RosProxy) -> str:
     kernel = rosproxy.spec.data_plane == "kernel"
     takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
     if rosproxy.spec.multicast:
-        takes += ", its ear hostNetwork"
+        takes += ", its LAN relay hostNetwork"
     return (
         f"a proxy takes {takes}, which needs Pod Security privileged: kubectl label namespace "
         f"{rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"

@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.api.api_client import ApiError, ApiNotFound, A
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
-    EarPod,
+    LanRelayPod,
     MasterService,
     ProxyPod,
     ProxyPolicy,
@@ -77,7 +77,7 @@ class ClusterStore:
         self._all_heard = asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
-        self._ears: dict[str, dict[str, EarPod]] = defaultdict(dict)
+        self._lan_relays: dict[str, dict[str, LanRelayPod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
         self._touched = StoreChanges()
@@ -165,12 +165,14 @@ class ClusterStore:
 
     def _with_pods(self, snapshot: ClusterSnapshot) -> ClusterSnapshot:
         proxies = [proxy for group in self._proxies.values() for proxy in group.values()]
-        ears = [ear for group in self._ears.values() for ear in group.values()]
-        namespaces = {*self._rosproxies, *self._proxies, *self._ears}
+        lan_relays = [
+            lan_relay for group in self._lan_relays.values() for lan_relay in group.values()
+        ]
+        namespaces = {*self._rosproxies, *self._proxies, *self._lan_relays}
         namespaces |= {id.namespace for id in snapshot.unusable}
         candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
         selected = [p for p in candidates if self._is_selected(p)]
-        own = own_pods(proxies, ears)
+        own = own_pods(proxies, lan_relays)
         nodes = {p.node for p in selected} | {node for p in own for node in (p.node, p.pod.node)}
         pods = {p.uid: p for p in candidates if p.node in nodes}
         pods |= {pod.uid: pod for pod in selected}
@@ -181,7 +183,7 @@ class ClusterStore:
             snapshot,
             pods=tuple(pods.values()),
             proxies=tuple(proxies),
-            ears=tuple(ears),
+            lan_relays=tuple(lan_relays),
             selected=frozenset(pod.uid for pod in selected if not pod.ended),
             misspelt_pods=tuple(pod for pod in candidates if pod.misspelt),
         )
@@ -235,7 +237,9 @@ class ClusterStore:
 
     def _as_foreign(self, record: Record | None) -> Record | None:
         """Turn pods of an operator that looks after other namespaces into ordinary pods."""
-        if isinstance(record, ProxyPod | EarPod) and not self._is_looked_after(record.of.namespace):
+        if isinstance(record, ProxyPod | LanRelayPod) and not self._is_looked_after(
+            record.of.namespace
+        ):
             return record.pod
         return record
 
@@ -244,8 +248,8 @@ class ClusterStore:
             _set(self._rosproxies, record.id.namespace, key, record if add else None)
         elif isinstance(record, ProxyPod):
             _set(self._proxies, record.of.namespace, key, record if add else None)
-        elif isinstance(record, EarPod):
-            _set(self._ears, record.of.namespace, key, record if add else None)
+        elif isinstance(record, LanRelayPod):
+            _set(self._lan_relays, record.of.namespace, key, record if add else None)
         elif isinstance(record, Pod):
             _set(self._pods, record.id.namespace, key, record if add else None)
             if record.every_port and record.node:
@@ -270,7 +274,7 @@ class ClusterStore:
                 return
             case _:
                 self._touched.namespaces.add(record.of.namespace)
-                if counterpart is None and isinstance(record, ProxyPod | EarPod):
+                if counterpart is None and isinstance(record, ProxyPod | LanRelayPod):
                     self._touched.nodes.add(record.node)  # others may wait for its ports
         self._wake()
 

@@ -62,10 +62,13 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
 
 def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
     subject = f"domain {domain.domain}"
-    if not domain.peers and not domain.ear:
+    if not domain.peers and not domain.lan_relay:
         text = "participants inside are announced to nobody outside"
         yield error(
-            "announcing", subject, text, "give --ros2-peer, or run rosproxy ear (--ros2-ear)"
+            "announcing",
+            subject,
+            text,
+            "give --ros2-peer, or run rosproxy lan-relay (--ros2-lan-relay)",
         )
     if not domain.inside and not is_settled:
         text = "no participant inside has been heard yet; the proxy has just started"
@@ -90,8 +93,8 @@ def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
     """Where outside nobody has been heard: at a peer, or anywhere."""
     fix = (
         "start one there with the same ROS_DOMAIN_ID; publish the range for UDP; Cyclone DDS takes "
-        "ports of its own where it has multicast, which no peer knows: run rosproxy ear "
-        f'(--ros2-ear), or give it <Peer address="{domain.discovery}"/> in its CYCLONEDDS_URI'
+        "ports of its own where it has multicast, which no peer knows: run rosproxy lan-relay "
+        f'(--ros2-lan-relay), or give it <Peer address="{domain.discovery}"/> in its CYCLONEDDS_URI'
     )
     if not domain.outside:
         text = f"no participant outside has been heard; announced at {domain.discovery}"

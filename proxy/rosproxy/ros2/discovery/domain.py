@@ -38,7 +38,7 @@ from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates, Standing, cost
 from rosproxy.ros2.discovery.domain_settings import (
     DomainSettings,
-    LanRelay,
+    LanRelayLink,
     Outgoing,
     Refused,
     sent_to,
@@ -204,7 +204,7 @@ class Domain:
             return source
         return heard_at
 
-    def _heard_by_relay(self, relay: LanRelay, datagram: bytes, now: float) -> list[Outgoing]:
+    def _heard_by_relay(self, relay: LanRelayLink, datagram: bytes, now: float) -> list[Outgoing]:
         """What the LAN relay has heard, if the proof is good and the claimed address can be."""
         try:
             content = relay.proof.opened(Direction.TO_PROXY, datagram)
@@ -212,7 +212,7 @@ class Domain:
             is_known = source_prefix(announcement) in self.inside.by_prefix
         except RtpsError as error:
             return self._drop("relay_proof", relay.address.host, str(error))
-        self.rediscovery.ear_heard = True
+        self.rediscovery.lan_relay_heard = True
         if fault := claim_fault(source, self.settings):
             # With IPv6 the relay may hear the inside network, too (groups.py, _IP_MULTICAST_ALL).
             return [] if is_known else self._drop("claimed_address", source, fault)

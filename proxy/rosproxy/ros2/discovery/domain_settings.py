@@ -75,7 +75,7 @@ def sent_to(target: HostPort | None, datagrams: Iterable[bytes]) -> list[Outgoin
 
 
 @dataclass(frozen=True, slots=True)
-class LanRelay:
+class LanRelayLink:
     """The LAN relay of a domain: where it listens, and the proof that it shares with the proxy."""
 
     address: HostPort
@@ -107,7 +107,7 @@ class DomainSettings:
     is_inside: Callable[[str], bool]
     both_ways: bool = False
     peers: tuple[HostPort, ...] = ()
-    relay: LanRelay | None = None
+    relay: LanRelayLink | None = None
     keeper_key: bytes = field(default=b"", repr=False)
     participants_at: Callable[[str], int] = lambda _: 0
     gateways: frozenset[str] = frozenset()

@@ -261,7 +261,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def may_announce(self, message: DiscoveryMessage, source: str, observer: bytes) -> bool:
         """Whether a participant outside may announce itself to the proxy directly.
 
-        One that names the ``observer`` has heard it: its prefix goes to peers and the ear alone.
+        One that names the ``observer`` has heard it: its prefix goes to peers and the LAN relay
+        alone.
         """
         is_met = self.find(message.prefix, source) is not None
         return is_met or destination(message.datagram) == observer or self.settings.is_peer(source)

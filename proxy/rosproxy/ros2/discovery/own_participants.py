@@ -50,7 +50,7 @@ class OwnParticipants:
         return self.observer.announcement(HostPort(near, self.settings.unicast_port))
 
     def announced_outside(self) -> list[Outgoing]:
-        """The observer's announcement for the ear and the peers."""
+        """The observer's announcement for the LAN relay and the peers."""
         return self.settings.to_outside(self.observer.announcement(*self._reached_from_outside()))
 
     def question_to_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:

@@ -8,10 +8,10 @@ kept *apart* for a moment: both are told that the other has ended, nothing of di
 only then are they introduced.
 
 This is for participants whose policy has changed, and for those that knew the proxy at another
-address, as `Returning` says. The latter wait until the ear has been heard, which starts after the
-proxy: before that, outside would not hear that they have ended. Participants are told again, with
-each announcement from outside, until they send something to where outside is found now: while so
-many meet, not every datagram arrives.
+address, as `Returning` says. The latter wait until the LAN relay has been heard, which starts after
+the proxy: before that, outside would not hear that they have ended. Participants are told again,
+with each announcement from outside, until they send something to where outside is found now: while
+so many meet, not every datagram arrives.
 
 Hundreds inside may have to meet hundreds outside, which takes many seconds. So farewells and
 introductions wait, and are made a few at a time (`next_datagrams`). Addresses inside take turns.
@@ -38,8 +38,8 @@ VERDICTS_AT_ONCE = 32
 """Verdicts that are judged again at a time. With 1,000 rules one takes 0.7 ms."""
 PAIRS_AT_ONCE = 32
 """Participants outside that participants inside are told of at a time. One takes 0.1 ms."""
-EAR_TIME = 30.0
-"""Seconds that the ear may take to be heard; the wait is in vain if nobody is on its LAN."""
+LAN_RELAY_TIME = 30.0
+"""Seconds that the LAN relay may take to be heard; the wait is in vain if nobody is on its LAN."""
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class Rediscovery:
     settings: DomainSettings
     inside: InsideParticipants
     outside: OutsideParticipants
-    ear_heard: bool = False
+    lan_relay_heard: bool = False
     _waiting: dict[str, deque[Iterator[list[Outgoing]]]] = field(default_factory=dict)
     """What is sent inwards, by the address of the participant inside."""
     _review: Iterator[InsideParticipant | None] = field(default_factory=lambda: iter(()))
@@ -162,5 +162,5 @@ class Rediscovery:
         return HostPort(self.settings.host_for(locator.host), locator.port)
 
     def _may_part(self, waits_from: float, now: float) -> bool:
-        no_ear = self.settings.relay is None
-        return no_ear or self.ear_heard or now - waits_from >= EAR_TIME
+        no_lan_relay = self.settings.relay is None
+        return no_lan_relay or self.lan_relay_heard or now - waits_from >= LAN_RELAY_TIME

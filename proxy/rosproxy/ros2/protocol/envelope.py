@@ -1,7 +1,8 @@
-"""The envelope that the ear puts around an announcement: the address that it came from.
+"""The envelope that the LAN relay puts around an announcement: the address that it came from.
 
 16 bytes before the datagram: the address, IPv4 as IPv4-in-IPv6. The proxy uses a participant
-outside only at the address that it sends from, which is lost when the ear passes a datagram on.
+outside only at the address that it sends from, which is lost when the LAN relay passes a datagram
+on.
 
 The other way, the proxy tells the relay which addresses have proved to receive: `LIST_MAGIC`, and
 16 bytes for each address. An announcement begins with the letters RTPS.

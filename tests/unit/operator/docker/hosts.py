@@ -12,13 +12,13 @@ from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Star
 from rosproxy_operator.docker.planner.model import STARTED
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
-    ROLE_EAR,
     ROLE_FLUSH,
+    ROLE_LAN_RELAY,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
-    ear_name,
     flush_name,
+    lan_relay_name,
     own_labels,
     proxy_name,
     read_own,
@@ -237,7 +237,11 @@ class Hosts(Invariants):
         """Under any other name it would be a stranger, for all that the operator knows."""
         if boxes := [box for box in self.boxes() if box.role != ROLE_REDIRECT]:
             box = pick(boxes, n)
-            names = {ROLE_SANDBOX: sandbox_name, ROLE_EAR: ear_name, ROLE_FLUSH: flush_name}
+            names = {
+                ROLE_SANDBOX: sandbox_name,
+                ROLE_LAN_RELAY: lan_relay_name,
+                ROLE_FLUSH: flush_name,
+            }
             own = names.get(box.role, proxy_name)
             name = own(box.own.key) + pick(("-old", "-2", "-old-2"), m) if box.own else ""
             if name and not self.engine.named(name):

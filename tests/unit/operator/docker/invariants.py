@@ -5,19 +5,19 @@ from msgspec import structs
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.port_negotiation import overlap
-from rosproxy_operator.docker.planner.actions import Create, CreateEar, CreateSandbox
+from rosproxy_operator.docker.planner.actions import Create, CreateLanRelay, CreateSandbox
 from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane, chosen_udp
 from rosproxy_operator.docker.planner.model import STARTED, Key, Member
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
-    ROLE_EAR,
     ROLE_FLUSH,
+    ROLE_LAN_RELAY,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
     OwnLabels,
-    ear_fingerprint,
-    ear_name,
+    lan_relay_fingerprint,
+    lan_relay_name,
     proxy_fingerprint,
     proxy_name,
     reserved_ports,
@@ -216,9 +216,9 @@ class Invariants:
         if any(box.state == "restarting" and box.role == ROLE_SANDBOX for box, _ in own):
             return
         roles = [own.role for _, own in own]
-        has_ear = key.is_ros2 and (bool(self.engine.image) or ROLE_EAR in roles)
-        assert sorted(roles) == [ROLE_EAR] * has_ear + [ROLE_SANDBOX, ROLE_PROXY]
-        *ears, (sandbox, is_), (proxy, runs) = sorted(own, key=lambda pair: pair[0].role)
+        has_lan_relay = key.is_ros2 and (bool(self.engine.image) or ROLE_LAN_RELAY in roles)
+        assert sorted(roles) == [ROLE_LAN_RELAY] * has_lan_relay + [ROLE_SANDBOX, ROLE_PROXY]
+        *lan_relays, (sandbox, is_), (proxy, runs) = sorted(own, key=lambda pair: pair[0].role)
         assert sandbox.state == "running"
         assert proxy.state in ("running", "restarting")
         assert set(sandbox.networks) == {SETTINGS.uplink, *wanted}
@@ -228,23 +228,25 @@ class Invariants:
         assert proxy.namespace == sandbox.namespace or proxy.state == "restarting"
         assert runs.range == is_.range
         near = HostPort(GATEWAY, is_.range.last)
-        for ear, hears in ears:
-            self.check_ear(ear, hears, sandbox, near)
+        for lan_relay, hears in lan_relays:
+            self.check_lan_relay(lan_relay, hears, sandbox, near)
         if self.engine.image:
             forwards = made.data_plane == "kernel"
             box = CreateSandbox("", key, is_.range, forwards=forwards, udp=made.udp)
             assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
-            made = structs.replace(made, range=is_.range, ear=near if key.is_ros2 else None)
+            made = structs.replace(made, range=is_.range, lan_relay=near if key.is_ros2 else None)
             assert runs.fingerprint == proxy_fingerprint(made, SETTINGS, self.engine.image, "")
 
-    def check_ear(self, ear: Box, hears: OwnLabels, sandbox: Box, near: HostPort) -> None:
+    def check_lan_relay(
+        self, lan_relay: Box, hears: OwnLabels, sandbox: Box, near: HostPort
+    ) -> None:
         """It runs, and knows where its proxy is."""
-        assert ear.state in ("running", "restarting")
-        assert self.is_named(ear, ear_name(hears.key))
+        assert lan_relay.state in ("running", "restarting")
+        assert self.is_named(lan_relay, lan_relay_name(hears.key))
         if self.engine.image:
             proxy = HostPort(sandbox.address, hears.range.first)
-            made = CreateEar("", hears.key, hears.range, HERE, near, proxy)
-            assert hears.fingerprint == ear_fingerprint(made, SETTINGS, self.engine.image, "")
+            made = CreateLanRelay("", hears.key, hears.range, HERE, near, proxy)
+            assert hears.fingerprint == lan_relay_fingerprint(made, SETTINGS, self.engine.image, "")
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""

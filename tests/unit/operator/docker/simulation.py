@@ -9,8 +9,8 @@ from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
-    CreateEar,
     CreateFlush,
+    CreateLanRelay,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -27,10 +27,10 @@ from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
     Container,
-    EarContainer,
     FlushContainer,
     HostState,
     Key,
+    LanRelayContainer,
     Network,
     Proxy,
     RedirectContainer,
@@ -39,8 +39,8 @@ from rosproxy_operator.docker.planner.model import (
 from rosproxy_operator.docker.planner.own_containers import has_own_name
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
-    ROLE_EAR,
     ROLE_FLUSH,
+    ROLE_LAN_RELAY,
     ROLE_PROXY,
     ROLE_REDIRECT,
     ROLE_SANDBOX,
@@ -165,8 +165,8 @@ class Engine:
     def observe(self) -> HostState:
         started = [box for box in self.boxes if box.state in STARTED]
         tcp_ports = {port for box in started for port in box.ports}
-        # As in `snapshot.foreign_ports`, the port of an ear is not told.
-        udp_ports = {port for box in started if box.role != ROLE_EAR for port in box.udp}
+        # As in `snapshot.foreign_ports`, the port of a LAN relay is not told.
+        udp_ports = {port for box in started if box.role != ROLE_LAN_RELAY for port in box.udp}
         own = [(box, box.own) for box in self.boxes]
         return HostState(
             containers=tuple(self._container(box) for box, role in own if role is None),
@@ -179,10 +179,10 @@ class Engine:
             ephemeral=self.ephemeral,
             listening=frozenset(self.open | tcp_ports),
             listening_udp=frozenset(self.open | udp_ports),
-            ears=tuple(
-                EarContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+            lan_relays=tuple(
+                LanRelayContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
                 for box, is_ in own
-                if is_ and is_.role == ROLE_EAR
+                if is_ and is_.role == ROLE_LAN_RELAY
             ),
             flushes=tuple(
                 FlushContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
@@ -230,7 +230,7 @@ class Engine:
         match action:
             case CreateNetwork() | RemoveNetwork() | Connect() | Disconnect():
                 self._apply_to_network(action)
-            case CreateSandbox() | Create() | CreateEar() | CreateRedirect() | CreateFlush():
+            case CreateSandbox() | Create() | CreateLanRelay() | CreateRedirect() | CreateFlush():
                 self._create(action)
             case Run(name):
                 self._run(self.own(name))
@@ -303,7 +303,7 @@ class Engine:
             tcp = frozenset(port for exposed, port in published if exposed.endswith("/tcp"))
             udp = frozenset(port for exposed, port in published if exposed.endswith("/udp"))
             self.join(self.add(name, labels=labels, ports=tcp, udp=udp), uplink)
-        elif isinstance(action, CreateEar):
+        elif isinstance(action, CreateLanRelay):
             self.add(name, labels=labels, udp=frozenset({action.bind.port}), mode="host")
         elif isinstance(action, CreateFlush):
             self.add(name, labels=labels, mode="host")
@@ -326,13 +326,13 @@ class Engine:
         if box.role in (ROLE_REDIRECT, ROLE_FLUSH):
             self._run(box)
             return
-        if box.role != ROLE_EAR and taken:
+        if box.role != ROLE_LAN_RELAY and taken:
             raise Refused(min(taken) if self.names_ports else None)
         home = self.home(box)
         shares = box.mode.startswith("container:")
         if shares and (home is None or home.state not in STARTED):
             raise Failed("cannot join network of a non running container")
-        box.state = "restarting" if taken else "running"  # an ear takes its port by itself
+        box.state = "restarting" if taken else "running"  # a LAN relay takes its port by itself
         box.started = next(self.ids)
         box.namespace = home.namespace if home else box.started
         box.networks = {n: (self.networks[n].id, names) for n, (_, names) in box.networks.items()}

@@ -17,8 +17,8 @@ from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
-    CreateEar,
     CreateFlush,
+    CreateLanRelay,
     CreateNetwork,
     CreateRedirect,
     CreateSandbox,
@@ -34,7 +34,7 @@ from rosproxy_operator.docker.planner.actions import (
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
-    ear_config,
+    lan_relay_config,
     own_labels,
     proxy_token,
     sandbox_config,
@@ -156,10 +156,10 @@ async def test_a_proxy_gets_its_tokens_hash_and_its_masters_address(engine: Fake
 async def test_a_lan_relay_gets_what_it_shares_with_its_proxy(engine: FakeEngine) -> None:
     key = Key("", "192.0.2.1", 0)
     near = HostPort("172.30.0.1", RANGE.last)
-    relay = CreateEar("e", key, RANGE, "192.0.2.1", near, HostPort("172.30.0.2", RANGE.first))
+    relay = CreateLanRelay("e", key, RANGE, "192.0.2.1", near, HostPort("172.30.0.2", RANGE.first))
     await carry_out(relay)
     variables = engine.calls["POST /containers/create"]["Env"]
-    assert variables == ear_config(relay, SETTINGS, SECRET)["Env"]
+    assert variables == lan_relay_config(relay, SETTINGS, SECRET)["Env"]
 
 
 async def test_the_uplink_holds_the_secret(engine: FakeEngine) -> None:

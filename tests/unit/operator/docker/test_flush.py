@@ -37,7 +37,7 @@ from tests.unit.operator.docker.builders import (
     observed,
     planned,
 )
-from tests.unit.operator.docker.test_ear import KEY, TALKER, running_proxy
+from tests.unit.operator.docker.test_lan_relay import KEY, TALKER, running_proxy
 
 NAME = flush_name(KEY)
 SANDBOX_STARTED = "2026-01-01T10:00:00Z"
@@ -173,7 +173,7 @@ def test_an_engine_that_deletes_entries_by_itself_needs_none() -> None:
 def test_the_record_goes_after_the_sandbox() -> None:
     state = replace(published(), containers=(), flushes=(record(MADE),))
     assert steps(state) == []
-    gone = replace(state, sandboxes=(), proxies=(), ears=())
+    gone = replace(state, sandboxes=(), proxies=(), lan_relays=())
     assert steps(gone) == [Remove(NAME, "it is needed no more")]
 
 
@@ -185,7 +185,7 @@ def test_uninstalling_removes_the_record() -> None:
 
     state = replace(published(), flushes=(record(MADE),))
     assert NAME not in {action.name for action in look(state).actions}
-    gone = replace(state, sandboxes=(), proxies=(), ears=())
+    gone = replace(state, sandboxes=(), proxies=(), lan_relays=())
     assert [action.name for action in look(gone).actions] == [NAME]
 
 

@@ -32,7 +32,7 @@ PROXY = {
     "ros": "1",
     "domain": None,
     "peers": [],
-    "ear": None,
+    "lan_relay": None,
     "master_uri": "http://robot:11311",
     "master_address": "192.0.2.7",
     "advertise_host": "192.0.2.10",
@@ -274,7 +274,8 @@ def test_hostile_names_do_no_harm(name: str, columns: int, lines: int | None) ->
     assert str(action).isprintable()
 
 
-DOMAIN = {**PROXY, "name": "rosproxy-domain-0-7ec54e", "ros": "2", "domain": 0, "ear": "running",
+DOMAIN = {**PROXY, "name": "rosproxy-domain-0-7ec54e", "ros": "2", "domain": 0, "lan_relay":
+"running",
           "master_uri": "", "master_up": False, "range": "11432-11463", "used": 3}  # fmt: skip
 PARTICIPANT = {
     "guid_prefix": "01.0f.56.e7.01.00.c2.37.00.00.00.00",
@@ -308,5 +309,5 @@ def test_both_versions_side_by_side() -> None:
     assert text.count("Fast DDS: publishes /out  /rosout; serves /talker/get_parameters") == 2
     assert "talker     running  rosproxy-domain-0-7ec54e  11432-11463  2 participants" in text
     assert (text.count("! no port is free"), text.count("! is odd")) == (1, 1)
-    deaf = {**DOMAIN, "ear": None}
-    assert "domain 0, no ear" in render({**every, "proxies": [deaf]}, 120)
+    deaf = {**DOMAIN, "lan_relay": None}
+    assert "domain 0, no LAN relay" in render({**every, "proxies": [deaf]}, 120)

@@ -23,9 +23,9 @@ from rosproxy_operator.docker.engine_json import (
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    EarContainer,
     HostState,
     Key,
+    LanRelayContainer,
     Network,
     Sandbox,
 )
@@ -153,11 +153,11 @@ def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
     assert foreign_ports([], [], listening) == listening
 
 
-def test_the_port_of_an_ear_is_no_strangers() -> None:
+def test_the_port_of_an_lan_relay_is_no_strangers() -> None:
     key = Key("", "192.0.2.10", 0)
     ports = PortRange(11400, 11431)
-    ear = EarContainer(key, Container("1", "ear", "running"), ports, "")
-    assert foreign_ports([], [ear], frozenset({11400, 11431})) == {11400}
+    lan_relay = LanRelayContainer(key, Container("1", "lan-relay", "running"), ports, "")
+    assert foreign_ports([], [lan_relay], frozenset({11400, 11431})) == {11400}
 
 
 def test_the_engine_knows_names_that_no_name_server_has() -> None:

@@ -13,11 +13,11 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
-    CreateEar,
+    CreateLanRelay,
     CreatePolicy,
     CreateProxy,
     CreateService,
-    DeleteEar,
+    DeleteLanRelay,
     DeletePolicy,
     DeleteProxy,
     DeleteService,
@@ -80,9 +80,9 @@ def is_own(obj: Object) -> bool:
     return names.is_own(meta(obj).get("labels", {})) and owned
 
 
-def is_ear(obj: Object) -> bool:
-    """Whether it is an ear."""
-    return names.is_ear(meta(obj).get("labels", {}))
+def is_lan_relay(obj: Object) -> bool:
+    """Whether it is a LAN relay."""
+    return names.is_lan_relay(meta(obj).get("labels", {}))
 
 
 def bound_to(pod: Object) -> str:
@@ -286,7 +286,7 @@ class Cluster:
             "conditions": [{"type": "Ready", "status": str(ready)}],
             "containerStatuses": [{"name": container["name"], "state": state, "restartCount": 0}],
         }
-        if is_own(pod) and ready and not is_ear(pod):
+        if is_own(pod) and ready and not is_lan_relay(pod):
             self.ros.setdefault(uid, set())
 
     # what the operator sees
@@ -296,7 +296,7 @@ class Cluster:
         seen = old or self.state
         pods = [parse.pod(pod) for pod in seen.pods.values()]
         own = [proxy for pod in seen.pods.values() if (proxy := parse.proxy_pod(pod))]
-        ears = filter(None, map(parse.ear_pod, seen.pods.values()))
+        lan_relays = filter(None, map(parse.lan_relay_pod, seen.pods.values()))
         services = filter(None, map(parse.service, seen.services.values()))
         policies = seen.policies.values()
         of = tuple(parse_rosproxy.rosproxy(rosproxy) for rosproxy in self.state.rosproxies.values())
@@ -307,7 +307,7 @@ class Cluster:
             nodes={name: parse.node(node) for name, node in seen.nodes.items()},
             pods=tuple(pods),
             proxies=tuple(own),
-            ears=tuple(ears),
+            lan_relays=tuple(lan_relays),
             services={service.of: service for service in services},
             policies={policy.id: policy for policy in filter(None, map(parse.policy, policies))},
             key=self.key,
@@ -335,7 +335,7 @@ class Cluster:
                     if "allocated" not in str(error):
                         raise
                     self.create_service(dict(without_cluster_ip(body)))
-            case CreateProxy(body=body) | CreateEar(body=body):
+            case CreateProxy(body=body) | CreateLanRelay(body=body):
                 self.made += 1
                 self.create_pod(dict(body))
             case CreatePolicy(body=body):
@@ -347,7 +347,7 @@ class Cluster:
             case SetPolicy(id=id, uid=uid, spec=spec):
                 if policy := self._own(self.state.policies, id, uid):
                     policy["spec"] = copy.deepcopy(dict(spec))
-            case DeleteProxy(id=id, uid=uid) | DeleteEar(id=id, uid=uid):
+            case DeleteProxy(id=id, uid=uid) | DeleteLanRelay(id=id, uid=uid):
                 if pod := self._own(self.state.pods, id, uid):
                     self.delete_pod(pod)
             case DeleteService(id=id, uid=uid):
@@ -408,11 +408,11 @@ class Controller:
         try:
             self.cluster.apply(action)
         except Refused as error:
-            assert isinstance(action, CreateProxy | CreateEar | CreateService | CreatePolicy)
+            assert isinstance(action, CreateProxy | CreateLanRelay | CreateService | CreatePolicy)
             name = name_of(dict(action.body))
             state = self.cluster.state
             kinds = {
-                CreateProxy: state.pods, CreateEar: state.pods, CreateService: state.services,
+                CreateProxy: state.pods, CreateLanRelay: state.pods, CreateService: state.services,
             }  # fmt: skip
             existing = kinds.get(type(action), state.policies).get(name)
             if str(error) == "AlreadyExists" and existing is not None:

@@ -51,7 +51,7 @@ def test_names_are_in_the_rosproxys_namespace() -> None:
 def test_own_labels_are_recognized_and_selected() -> None:
     labels = names.own_labels("robot")
     assert names.is_own(labels)
-    assert names.OWN_SELECTOR.endswith("app.kubernetes.io/component in (ear,proxy)")
+    assert names.OWN_SELECTOR.endswith("app.kubernetes.io/component in (ear,lan-relay,proxy)")
     rest = labels.items() - {(names.PROXY_OF, "robot"), (names.COMPONENT_LABEL, "proxy")}
     assert all(f"{key}={value}" in names.OWN_SELECTOR for key, value in rest)
 
@@ -69,3 +69,10 @@ def test_half_the_labels_are_not_enough(missing: str) -> None:
 )
 def test_what_pods_use_as_their_master(address: str, uri: str) -> None:
     assert names.master_uri(address) == uri
+
+
+def test_the_lan_relay_of_an_operator_before_0_1_0_is_its_own() -> None:
+    labels = {**names.own_labels("robot"), names.COMPONENT_LABEL: "ear"}
+    assert names.is_own(labels)
+    assert names.is_lan_relay(labels)
+    assert not names.is_lan_relay(names.own_labels("robot"))

@@ -54,7 +54,7 @@ class Together:
             pods=first.pods + second.pods,
             misspelt_pods=first.misspelt_pods + second.misspelt_pods,
             proxies=first.proxies + second.proxies,
-            ears=first.ears + second.ears,
+            lan_relays=first.lan_relays + second.lan_relays,
             services={**first.services, **second.services},
             masters={**second.masters, **first.masters},
             selected=first.selected | second.selected,

@@ -10,17 +10,17 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.access.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.actions import (
-    CreateEar,
+    CreateLanRelay,
     CreateProxy,
-    DeleteEar,
+    DeleteLanRelay,
     DeleteProxy,
 )
 from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
-from rosproxy_operator.kubernetes.planner.steps.ear import ear_pod
+from rosproxy_operator.kubernetes.planner.steps.lan_relay import lan_relay_pod
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
-from rosproxy_operator.kubernetes.resources.cluster import EarPod, ProxyReport
+from rosproxy_operator.kubernetes.resources.cluster import LanRelayPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import (
     Json,
@@ -129,8 +129,8 @@ def test_a_proxy_understands_its_variables_and_takes_ports_of_udp():
     settings = settings_of(env_of(body))
     assert (settings.ros, settings.domains, settings.master_uri) == (("2",), (3,), "")
     assert settings.ros2_peer == (HostPort("192.0.2.2", 11400), HostPort("robot", 0))
-    assert settings.ros2_ear == HostPort("192.0.2.1", 11407)
-    assert settings.ros2_ear_secret == SECRET
+    assert settings.ros2_lan_relay == HostPort("192.0.2.1", 11407)
+    assert settings.ros2_lan_relay_secret == SECRET
     assert settings.ports.listen == PortRange(11400, 11406)
     taken = body["spec"]["containers"][0]["ports"]
     assert {port["protocol"] for port in taken} == {"UDP"}
@@ -196,30 +196,30 @@ def hearing(**changes: Any) -> tuple[RosProxy, Any]:
     return of, proxy(of, ports=PortRange(11400, 11404), **changes)
 
 
-def ear(of: RosProxy, address: str = "10.244.1.200", **changes: Any) -> EarPod:
+def lan_relay(of: RosProxy, address: str = "10.244.1.200", **changes: Any) -> LanRelayPod:
     place = site(of, node(), PortRange(11400, 11404))
-    assert place.ear is not None
-    body = ear_pod(place, place.ear, address, SETTINGS)
-    parsed = objects.ear_pod({**body, "status": {"phase": "Running"}})
+    assert place.lan_relay is not None
+    body = lan_relay_pod(place, place.lan_relay, address, SETTINGS)
+    parsed = objects.lan_relay_pod({**body, "status": {"phase": "Running"}})
     assert parsed is not None
-    own = replace(parsed.pod, uid="uid-ear", node="one")
+    own = replace(parsed.pod, uid="uid-lan-relay", node="one")
     return replace(parsed, **{"pod": own, "ready": True, **changes})
 
 
-def test_an_ear_is_made_once_its_proxy_has_an_address():
+def test_an_lan_relay_is_made_once_its_proxy_has_an_address():
     of, proxy_pod = hearing()
     seen = observed(of, service(of), pod(), proxy_pod)
 
     (action,) = done(look(seen))
 
-    assert isinstance(action, CreateEar)
+    assert isinstance(action, CreateLanRelay)
     body = action.body
-    assert env_of(body)["ROSPROXY_EAR_PROXY"] == "10.244.1.200:11400"
-    assert env_of(body)["ROSPROXY_EAR_BIND"] == "192.0.2.1:11404"
+    assert env_of(body)["ROSPROXY_LAN_RELAY_PROXY"] == "10.244.1.200:11400"
+    assert env_of(body)["ROSPROXY_LAN_RELAY_BIND"] == "192.0.2.1:11404"
     assert body["spec"]["hostNetwork"] is True
     assert body["spec"]["containers"][0]["securityContext"]["capabilities"] == {"drop": ["ALL"]}
     assert not names.own_labels("robot").items() <= body["metadata"]["labels"].items()
-    assert done(look(replace(seen, ears=(ear(of),)))) == []
+    assert done(look(replace(seen, lan_relays=(lan_relay(of),)))) == []
     starting = replace(proxy_pod, pod=replace(proxy_pod.pod, ip=""), ready=False)
     assert done(look(observed(of, service(of), pod(), starting))) == []
 
@@ -232,7 +232,7 @@ def test_a_proxy_and_its_lan_relay_share_a_secret():
     def secrets(key: bytes) -> list[str]:
         seen = observed(of, service(of), node(), far, pod(), pod(name="b", on="two"), key=key)
         made = [action for action in done(look(seen)) if isinstance(action, CreateProxy)]
-        return [env_of(action.body)["ROSPROXY_ROS2_EAR_SECRET"] for action in made]
+        return [env_of(action.body)["ROSPROXY_ROS2_LAN_RELAY_SECRET"] for action in made]
 
     of_proxies = secrets(KEY)
     assert len({*of_proxies, *secrets(bytes(32))}) == 4
@@ -242,56 +242,60 @@ def test_a_proxy_and_its_lan_relay_share_a_secret():
     # Who may read pods can't call the admin endpoint by what stands there.
     assert names.token_of(KEY, proxy_id, "one") not in of_proxies
     place = replace(site(of, node(), PortRange(11400, 11404)), relay_secret=SECRET)
-    assert place.ear is not None
-    relay = ear_pod(place, place.ear, "10.244.1.200", SETTINGS)
-    assert env_of(relay)["ROSPROXY_EAR_SECRET"] == SECRET
+    assert place.lan_relay is not None
+    relay = lan_relay_pod(place, place.lan_relay, "10.244.1.200", SETTINGS)
+    assert env_of(relay)["ROSPROXY_LAN_RELAY_SECRET"] == SECRET
 
 
 def test_a_proxy_without_a_lan_relay_has_no_secret():
     place = replace(site(of2(), node()), relay_secret=SECRET)
-    assert "ROSPROXY_ROS2_EAR_SECRET" not in env_of(manifests.proxy_pod(place, SETTINGS))
+    assert "ROSPROXY_ROS2_LAN_RELAY_SECRET" not in env_of(manifests.proxy_pod(place, SETTINGS))
 
 
 def test_both_are_made_anew_for_another_key():
     of, proxy_pod = hearing()
-    seen = observed(of, service(of), pod(), proxy_pod, ears=(ear(of),))
+    seen = observed(of, service(of), pod(), proxy_pod, lan_relays=(lan_relay(of),))
     assert done(look(seen)) == []
     actions = done(look(replace(seen, key=KEY)))
     assert [type(action) for action in actions] == [DeleteProxy]
 
 
 @pytest.mark.parametrize("why", ["address", "not asked for"])
-def test_an_ear_that_is_not_right_goes(why: str):
+def test_an_lan_relay_that_is_not_right_goes(why: str):
     of, proxy_pod = hearing()
-    wrong_ear = ear(of, "10.244.1.9" if why == "address" else "10.244.1.200")
+    wrong_lan_relay = lan_relay(of, "10.244.1.9" if why == "address" else "10.244.1.200")
     if why == "not asked for":
         of = of2(ports=5)
         proxy_pod = proxy(of, ports=PortRange(11400, 11404))
-    (action,) = done(look(observed(of, service(of), pod(), proxy_pod, ears=(wrong_ear,))))
-    assert isinstance(action, DeleteEar)
+    (action,) = done(
+        look(observed(of, service(of), pod(), proxy_pod, lan_relays=(wrong_lan_relay,)))
+    )
+    assert isinstance(action, DeleteLanRelay)
 
 
-def test_an_ear_stays_while_its_proxy_is_made_anew():
+def test_an_lan_relay_stays_while_its_proxy_is_made_anew():
     of, _ = hearing()
-    (action,) = done(look(observed(of, service(of), pod(), ears=(ear(of),))))
+    (action,) = done(look(observed(of, service(of), pod(), lan_relays=(lan_relay(of),))))
     assert isinstance(action, CreateProxy)
 
 
-def test_an_ear_stays_until_its_proxy_has_left_its_ports():
+def test_an_lan_relay_stays_until_its_proxy_has_left_its_ports():
     """It carries to the LAN that the proxy's participants have ended."""
     _, proxy_pod = hearing()
     moved = of2(HEARING, ports=5, window=PortRange(13000, 13099))
-    (action,) = done(look(observed(moved, service(moved), pod(), proxy_pod, ears=(ear(moved),))))
+    (action,) = done(
+        look(observed(moved, service(moved), pod(), proxy_pod, lan_relays=(lan_relay(moved),)))
+    )
     assert isinstance(action, DeleteProxy)
     assert action.retire
 
 
-def test_an_ear_that_does_not_run_is_told():
+def test_an_lan_relay_that_does_not_run_is_told():
     of, proxy_pod = hearing()
     deaf = pod_failure({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
-    stuck_ear = ear(of, stuck=deaf[0], message=deaf[1])
-    plan = look(observed(of, service(of), pod(), proxy_pod, ears=(stuck_ear,)))
-    assert "so that the LAN is not heard" in told(plan, "EarStuck")[0]
+    stuck_lan_relay = lan_relay(of, stuck=deaf[0], message=deaf[1])
+    plan = look(observed(of, service(of), pod(), proxy_pod, lan_relays=(stuck_lan_relay,)))
+    assert "so that the LAN is not heard" in told(plan, "LanRelayStuck")[0]
 
 
 def test_a_node_without_a_lan_address_is_told():

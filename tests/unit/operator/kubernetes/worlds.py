@@ -25,7 +25,7 @@ from tests.unit.operator.kubernetes.simulation import (
     deleting,
     ended,
     host_ports,
-    is_ear,
+    is_lan_relay,
     is_own,
     meta,
     name_of,
@@ -77,7 +77,7 @@ class World:
 
     def proxies(self) -> Iterator[tuple[Object, ProxyPod]]:
         for pod in self.own():
-            if is_ear(pod):
+            if is_lan_relay(pod):
                 continue
             proxy = objects.proxy_pod(pod)
             assert proxy is not None
@@ -171,7 +171,7 @@ class World:
                 for pod in (state.pods.values() if state else ())
                 if place.node in (node_of(pod), meta(pod).get("annotations", {}).get(names.NODE))
                 and name_of(pod) != names.proxy_id(place.of, place.node)
-                and name_of(pod) != names.ear_id(place.of, place.node)
+                and name_of(pod) != names.lan_relay_id(place.of, place.node)
             ]
             taken = {port for pod in other_pods for port in objects.pod(pod).every_port}
             refused = {port for node, port in self.controller.state.taken if node == place.node}
@@ -247,34 +247,35 @@ class World:
             assert stored_policy is not None
             assert stored_policy.spec == policy(rosproxy, SETTINGS)["spec"]
         self.check_addresses(unready)
-        self.check_ears(plan, unready)
+        self.check_lan_relays(plan, unready)
 
-    def check_ears(self, plan: ClusterPlan, unready: set[str]) -> None:
-        """Each proxy that hears the LAN has an ear, which knows its address; nobody else has.
+    def check_lan_relays(self, plan: ClusterPlan, unready: set[str]) -> None:
+        """Each proxy that hears the LAN has a LAN relay, which knows its address; nobody else has.
 
-        A proxy stays as it was where an obstacle is told of, and gets no ear before that is gone.
+        A proxy stays as it was where an obstacle is told of, and gets no LAN relay before that is
+        gone.
         """
-        ears = {}
+        lan_relays = {}
         for pod in self.own():
-            if ear := objects.ear_pod(pod):
-                ears[ProxyPlace(ear.of, ear.node)] = pod, ear
+            if lan_relay := objects.lan_relay_pod(pod):
+                lan_relays[ProxyPlace(lan_relay.of, lan_relay.node)] = pod, lan_relay
         wanted = {}
         for _, proxy in self.proxies():
             of = self.cluster.state.rosproxies.get(proxy.of)
             if of and of["spec"].get("multicast"):
                 wanted[ProxyPlace(proxy.of, proxy.node)] = proxy
-        assert {p for p in ears if p.node not in unready} <= wanted.keys()
+        assert {p for p in lan_relays if p.node not in unready} <= wanted.keys()
         for place, proxy in wanted.items():
             if place.node in unready or not proxy.pod.ip or self.obstacles(plan, place):
                 continue
             env = {
                 variable["name"]: variable["value"]
-                for variable in container_of(ears[place][0])["env"]
+                for variable in container_of(lan_relays[place][0])["env"]
             }
-            assert env["ROSPROXY_EAR_PROXY"] == f"{proxy.pod.ip}:{proxy.range.first}"
+            assert env["ROSPROXY_LAN_RELAY_PROXY"] == f"{proxy.pod.ip}:{proxy.range.first}"
             secret = names.relay_secret_of(self.cluster.key, proxy.pod.id, place.node)
-            assert env["ROSPROXY_EAR_SECRET"] == secret
-            assert env["ROSPROXY_EAR_BIND"] == f"{self.names[place.node]}:{proxy.range.last}"
+            assert env["ROSPROXY_LAN_RELAY_SECRET"] == secret
+            assert env["ROSPROXY_LAN_RELAY_BIND"] == f"{self.names[place.node]}:{proxy.range.last}"
             assert proxy.range.last not in proxy.pod.udp_ports
 
     def check_proxies(self, plan: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:
@@ -307,8 +308,8 @@ class World:
         assert bool(proxy.pod.host_ports) == spec.ros1
         assert bool(proxy.pod.udp_ports) == (spec.ros2 is not None)
         secret = names.relay_secret_of(self.cluster.key, proxy.pod.id, place.node)
-        expected = secret if "ROSPROXY_ROS2_EAR" in env else None
-        assert env.get("ROSPROXY_ROS2_EAR_SECRET") == expected
+        expected = secret if "ROSPROXY_ROS2_LAN_RELAY" in env else None
+        assert env.get("ROSPROXY_ROS2_LAN_RELAY_SECRET") == expected
         domain = str(spec.ros2.number) if spec.ros2 else None
         assert env.get("ROSPROXY_ROS2_DOMAINS") == domain
 

@@ -87,13 +87,13 @@ def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
     speaker = add_node(addressing, f"http://{address}:40001/", address, **{"named": True} | options)
     add_registration(addressing, speaker, PUB, "/t", "/speaker")
     add_registration(addressing, speaker, SUB, "/t", "/speaker")
-    ear = add_node(addressing)
+    listener = add_node(addressing)
     registrations = {
-        "/ear": [add_registration(addressing, ear, SUB, "/t", "/ear")],
+        "/listener": [add_registration(addressing, listener, SUB, "/t", "/listener")],
         "/speaker": [Registration(SUB, "/t", "/speaker")],
     }
     subscriptions = decisions.subscriptions(registrations, [speaker], addressing)
-    assert subscriptions == subscribed(speaker, "/ear")[:count]
+    assert subscriptions == subscribed(speaker, "/listener")[:count]
 
 
 @pytest.mark.parametrize(

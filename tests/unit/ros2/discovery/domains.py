@@ -9,7 +9,7 @@ from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, LanRelay, Outgoing
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, LanRelayLink, Outgoing
 from rosproxy.ros2.discovery.port_keeper import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
@@ -26,7 +26,7 @@ NEAR = "172.30.0.2"
 HOST = "10.0.0.1"
 ROBOT = "10.0.0.9"
 STRANGER = "10.0.0.66"
-EAR = HostPort("172.30.0.1", 7500)
+LAN_RELAY = HostPort("172.30.0.1", 7500)
 A = b"\x01\x0f" + bytes(10)
 B = b"\x01\x0f" + bytes(range(10))
 NETWORK = ip_network("172.30.0.0/24")
@@ -45,7 +45,7 @@ def everything(*_: object) -> bool:
 
 def make_domain(
     peers: Sequence[str] = (ROBOT,),
-    ear: HostPort | None = EAR,
+    lan_relay: HostPort | None = LAN_RELAY,
     judge: Judge = everything,
     both_ways: bool = False,
     ports: PortMap = RANGE,
@@ -61,7 +61,7 @@ def make_domain(
         is_inside=lambda address: ip_address(address) in NETWORK,
         both_ways=both_ways,
         peers=tuple(HostPort(peer, 7410) for peer in peers),
-        relay=LanRelay(ear, PROOF) if ear else None,
+        relay=LanRelayLink(lan_relay, PROOF) if lan_relay else None,
         keeper_key=keeper_key,
     )
     return Domain.starting(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
@@ -179,7 +179,7 @@ def settle(domain: Domain, now: float) -> list[Outgoing]:
 def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
     """What is sent to a host; what is for the LAN relay has its proof."""
     return [
-        PROOF.opened(Direction.TO_LAN, sent.datagram) if sent.target == EAR else sent.datagram
+        PROOF.opened(Direction.TO_LAN, sent.datagram) if sent.target == LAN_RELAY else sent.datagram
         for sent in outgoing
         if sent.target.host == host
     ]

@@ -9,8 +9,8 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     INSIDE,
+    LAN_RELAY,
     NEAR,
     NOW,
     ROBOT,
@@ -45,9 +45,9 @@ def writer(*hosts: str) -> bytes:
 
 
 def told_of_participant(domain: Domain, *hosts: str) -> list[str]:
-    """Where inside finds one outside, which the ear has heard."""
+    """Where inside finds one outside, which the LAN relay has heard."""
     told = carried(ROBOT, participant(ROBOT, *hosts))
-    (datagram,) = to(domain.heard_outside(told, EAR.host, NOW), INSIDE)
+    (datagram,) = to(domain.heard_outside(told, LAN_RELAY.host, NOW), INSIDE)
     metatraffic, *users = [locator.host for locator in reached_at(datagram)]
     assert metatraffic == NEAR
     return users

@@ -15,8 +15,8 @@ from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS, order_
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     INSIDE,
+    LAN_RELAY,
     NEAR,
     NOW,
     OTHER,
@@ -197,7 +197,7 @@ def test_forged_participants_do_not_take_the_port_of_a_peer_before_it_comes() ->
     domain = make_domain()
     meet(domain)
     for prefix in islice(chosen, MOST_SHARING):
-        domain.heard_outside(carried(STRANGER, spdp(prefix, STRANGER)), EAR.host, NOW)
+        domain.heard_outside(carried(STRANGER, spdp(prefix, STRANGER)), LAN_RELAY.host, NOW)
     assert len(domain.outside.stand_ins[before]) == MOST_SHARING
     assert told_port(domain) == [before]
 

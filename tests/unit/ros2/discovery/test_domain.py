@@ -23,9 +23,9 @@ from rosproxy.ros2.registry.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import LeaseKind, ShortageKind
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     HOST,
     INSIDE,
+    LAN_RELAY,
     NEAR,
     NOW,
     OTHER,
@@ -63,7 +63,7 @@ def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
     domain = make_domain()
     sent = meet(domain)
     (told,) = to(sent, ROBOT)
-    (carried,) = to(sent, EAR.host)
+    (carried,) = to(sent, LAN_RELAY.host)
     assert told == carried
     meta, user = reached_at(told)
     assert {meta.host, user.host} == {HOST}
@@ -120,7 +120,7 @@ def test_an_address_of_a_link_outside_is_not_told_inside() -> None:
 def test_the_observer_is_reached_by_either_family() -> None:
     domain = make_domain()
     domain.settings.hosts = (HOST, "fd77::1")
-    (told,) = to(domain.own.announced_outside(), EAR.host)
+    (told,) = to(domain.own.announced_outside(), LAN_RELAY.host)
     assert {locator.host for locator in reached_at(told)} == {HOST, "fd77::1"}
 
 
@@ -220,7 +220,7 @@ def test_a_stranger_is_not_answered() -> None:
 def test_an_announcement_for_another_address_is_refused() -> None:
     domain = make_domain()
     meet(domain)
-    assert domain.heard_outside(carried(ROBOT, spdp(B, STRANGER)), EAR.host, NOW) == []
+    assert domain.heard_outside(carried(ROBOT, spdp(B, STRANGER)), LAN_RELAY.host, NOW) == []
     assert not domain.outside.by_prefix
 
 
@@ -233,7 +233,7 @@ def test_nobody_takes_the_prefix_of_another() -> None:
     assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
     assert domain.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
     assert domain.heard_inside(farewell(A), OTHER, NOW) == []
-    assert domain.heard_outside(carried(STRANGER, farewell(B)), EAR.host, NOW) == []
+    assert domain.heard_outside(carried(STRANGER, farewell(B)), LAN_RELAY.host, NOW) == []
     assert domain.inside.leases == before
     assert domain.outside.by_prefix.keys() == {B}
 
@@ -242,7 +242,7 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
     domain = make_domain(peers=())
     meet(domain)
     heard = spdp(B, ROBOT)
-    domain.heard_outside(carried(ROBOT, heard), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, heard), LAN_RELAY.host, NOW)
     (stand_in,) = domain.outside.stand_ins
     sent = 0
     for _ in range(20):
@@ -358,7 +358,7 @@ def test_participants_are_reminded_until_they_keep_their_ports() -> None:
     assert domain.own.port_reminders(NOW) == []
 
 
-@given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, EAR.host]))
+@given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, LAN_RELAY.host]))
 @pytest.mark.parametrize("start", [b"", b"RTPS\x02\x03\x01\x0f" + A, spdp(A, INSIDE)[:120]])
 def test_nothing_that_is_sent_breaks_it(start: bytes, rest: bytes, source: str) -> None:
     domain = make_domain()
@@ -481,11 +481,11 @@ def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
 
 def test_who_has_heard_the_observer_may_announce_itself() -> None:
     """On a LAN, whose participants are nobody's peers, they answer it directly, where one of the
-    same host was heard by the ear."""
+    same host was heard by the LAN relay."""
     domain = make_domain(peers=())
     meet(domain)
     neighbour = b"\x01\x10" + bytes(10)
-    domain.heard_outside(carried(ROBOT, spdp(neighbour, ROBOT)), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, spdp(neighbour, ROBOT)), LAN_RELAY.host, NOW)
     answer = spdp(B, ROBOT)
     named = answer[:20] + submessage(0x0E, 0, domain.own.observer.prefix) + answer[20:]
     assert domain.heard_outside(answer, ROBOT, NOW) == []
@@ -503,7 +503,7 @@ def test_who_is_gone_is_ended_outside_on_his_behalf() -> None:
     sent = domain.gone({INSIDE})
 
     assert [out.target for out in sent] == [out.target for out in domain.settings.to_outside(b"")]
-    (ended,) = to(sent, EAR.host)
+    (ended,) = to(sent, LAN_RELAY.host)
     (announcement,) = read_discovery(ended).announcements
     assert (announcement.ended, announcement.sample.prefix, announcement.sample.sequence) == (
         True,
@@ -524,7 +524,7 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     domain = make_domain()
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    domain.rediscovery.ear_heard = True
+    domain.rediscovery.lan_relay_heard = True
     first = domain.inside.by_prefix[A].announcement
     elsewhere = spdp(A, OTHER)
     assert not to(domain.heard_inside(elsewhere, OTHER, NOW), ROBOT), "it is served at the first"
@@ -554,7 +554,7 @@ def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -
 
     With 16 others it got no port. Fast DDS takes no new locators of a participant that it knows.
     """
-    domain = make_domain(ear=None, ports=LONG_RANGE)
+    domain = make_domain(lan_relay=None, ports=LONG_RANGE)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     guid = A + bytes([0, 0, 1, 0xC1])
     others = [
@@ -583,7 +583,7 @@ def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
 
     sent = domain.retire(NOW)
 
-    (ended,) = to(sent, EAR.host)
+    (ended,) = to(sent, LAN_RELAY.host)
     (outward,) = read_discovery(ended).announcements
     (inward,) = (read_discovery(datagram).announcements[0] for datagram in to(sent, INSIDE))
     assert (outward.ended, outward.sample.prefix) == (True, A)

@@ -30,8 +30,8 @@ from rosproxy.ros2.registry.participants import (
 )
 from rosproxy.ros2.rewriting import discovery
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     INSIDE,
+    LAN_RELAY,
     NEAR,
     NOW,
     OTHER,
@@ -110,7 +110,9 @@ def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> N
     sent = domain.heard_inside(spdp(A, INSIDE) + behind, INSIDE, NOW)
     sent += domain.heard_inside(farewell(A) + behind, INSIDE, NOW)
     sent += domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW)
-    sent += domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
+    sent += domain.heard_outside(
+        carried(STRANGER, spdp(EVIL, STRANGER) + behind), LAN_RELAY.host, NOW
+    )
     sent += domain.at_lease(lease.port, spdp(B, ROBOT) + behind, ROBOT, NOW)
     assert domain.refused.count == 5
     sent += domain.heard_outside(farewell(B) + behind, ROBOT, NOW)
@@ -166,7 +168,7 @@ def test_an_unproven_participant_has_no_credit_for_copies(is_at_lease: bool, siz
     """What a message became when it was split counted as received: a victim was sent 30 times what
     came in its name."""
     domain = make_domain(peers=[])
-    domain.heard_outside(carried(STRANGER, spdp(B, STRANGER)), EAR.host, NOW)
+    domain.heard_outside(carried(STRANGER, spdp(B, STRANGER)), LAN_RELAY.host, NOW)
     meet(domain)
     (port, *_) = domain.inside.leases
     info_dst = submessage(0x0E, 0, bytes([7]) * size)
@@ -308,14 +310,14 @@ def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
     assert not domain.outside.count_by_address
 
 
-def test_nobody_proves_anything_by_the_ear() -> None:
-    """Whoever can send as the ear's host could have the proxy send to any address."""
+def test_nobody_proves_anything_by_the_lan_relay() -> None:
+    """Whoever can send as the LAN relay's host could have the proxy send to any address."""
     domain = make_domain(peers=())
     domain.own.observer.prefix = bytes([7]) * 12
     meet(domain)
-    domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), LAN_RELAY.host, NOW)
     answer = sedp(B, ROBOT, 7411, to=domain.own.observer.prefix)
-    domain.heard_outside(carried(ROBOT, answer), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, answer), LAN_RELAY.host, NOW)
     assert not domain.outside.by_prefix[B].has_answered
     domain.heard_outside(answer, ROBOT, NOW)
     assert domain.outside.by_prefix[B].has_answered
@@ -346,7 +348,7 @@ def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> No
     )
     for size in (0, 4, 11):
         half = message(submessage(0x0E, 0, bytes(size)), data(told), prefix=evil)
-        domain.heard_outside(carried(STRANGER, half), EAR.host, NOW)
+        domain.heard_outside(carried(STRANGER, half), LAN_RELAY.host, NOW)
         domain.heard_inside(half, OTHER, NOW)
     assert evil not in {*domain.outside.by_prefix, *domain.inside.by_prefix}
     denied.append("/chatter")
@@ -369,7 +371,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     domain = make_domain(judge=lambda _kind, name, _address: name not in denied)
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
     domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
-    domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), EAR.host, NOW)
+    domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), LAN_RELAY.host, NOW)
     assert (domain.refused.count, domain.inside.leases) == (3, {})
     assert EVIL not in {*domain.inside.by_prefix, *domain.outside.by_prefix}
     meet(domain, A, OTHER)

@@ -10,8 +10,8 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     INSIDE,
+    LAN_RELAY,
     NOW,
     OTHER,
     ROBOT,
@@ -52,7 +52,7 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     yield domain.heard_inside(inside, INSIDE, NOW)
     yield domain.at_lease(lease.port, outside, ROBOT, NOW)
     yield domain.heard_outside(outside, ROBOT, NOW)
-    yield domain.heard_outside(carried(ROBOT, outside), EAR.host, NOW)
+    yield domain.heard_outside(carried(ROBOT, outside), LAN_RELAY.host, NOW)
 
 
 @pytest.mark.parametrize("whose", ["observer", "keeper", "witness"])
@@ -71,7 +71,7 @@ def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> N
     sent = list[Outgoing]()
     for said in (spdp(prefix, ROBOT), farewell(prefix)):
         sent += domain.heard_outside(said, ROBOT, NOW)
-        sent += domain.heard_outside(carried(ROBOT, said), EAR.host, NOW)
+        sent += domain.heard_outside(carried(ROBOT, said), LAN_RELAY.host, NOW)
         sent += domain.at_lease(port, said, ROBOT, NOW)
     for said in (spdp(prefix, OTHER), farewell(prefix)):
         sent += domain.heard_inside(said, OTHER, NOW)

@@ -13,9 +13,9 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_proof import WINDOW_S, Direction, RelayProof
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     HOST,
     INSIDE,
+    LAN_RELAY,
     NEAR,
     NOW,
     OTHER,
@@ -52,7 +52,7 @@ def made_at(seconds: float, secret: str = SECRET) -> RelayProof:
 
 CLAIM = wrapped(STRANGER, spdp(B, STRANGER))
 WITHOUT_THE_SECRET: dict[str, tuple[bytes, str]] = {
-    "an announcement of its own": (spdp(B, EAR.host), "not_a_peer"),
+    "an announcement of its own": (spdp(B, LAN_RELAY.host), "not_a_peer"),
     "an envelope without a proof": (CLAIM, "relay_proof"),
     "half a proof": (carried(STRANGER, spdp(B, STRANGER))[:20], "relay_proof"),
     "a proof of another secret": (
@@ -79,11 +79,11 @@ def test_a_process_at_the_relays_address_is_not_the_relay(how: str) -> None:
     domain = make_domain()
     meet(domain)
     reasons = watched(domain)
-    assert domain.heard_outside(datagram, EAR.host, NOW) == []
+    assert domain.heard_outside(datagram, LAN_RELAY.host, NOW) == []
     assert reasons == [reason]
     assert not domain.outside.by_prefix
     assert not domain.outside.stand_ins
-    assert not domain.rediscovery.ear_heard
+    assert not domain.rediscovery.lan_relay_heard
 
 
 def test_an_engine_that_hides_who_sends_is_named() -> None:
@@ -91,7 +91,7 @@ def test_an_engine_that_hides_who_sends_is_named() -> None:
     reasons = watched(domain)
     domain.settings.gateways = frozenset({STRANGER})
     assert domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
-    assert domain.heard_outside(spdp(B, EAR.host), EAR.host, NOW) == []
+    assert domain.heard_outside(spdp(B, LAN_RELAY.host), LAN_RELAY.host, NOW) == []
     assert reasons == ["hidden_source", "not_a_peer"]
 
 
@@ -109,7 +109,7 @@ def test_nothing_is_read_before_the_proof(monkeypatch: pytest.MonkeyPatch) -> No
     for unread in ("read_messages", "credited_messages", "unwrapped"):
         monkeypatch.setattr(discovery_domain, unread, None)
     for datagram in (CLAIM, made_at(0, "another secret").sealed(Direction.TO_PROXY, CLAIM)):
-        assert domain.heard_outside(datagram, EAR.host, NOW) == []
+        assert domain.heard_outside(datagram, LAN_RELAY.host, NOW) == []
     assert not domain.rates._by_source
 
 
@@ -118,21 +118,21 @@ def test_the_relay_is_known_by_its_proof(late: float) -> None:
     domain = make_domain()
     meet(domain)
     sealed = made_at(late).sealed(Direction.TO_PROXY, CLAIM)
-    assert to(domain.heard_outside(sealed, EAR.host, NOW), INSIDE)
+    assert to(domain.heard_outside(sealed, LAN_RELAY.host, NOW), INSIDE)
     assert domain.outside.by_prefix[B].address == STRANGER
 
 
 def test_what_the_relay_is_told_has_a_proof() -> None:
     domain = make_domain(peers=())
     told = [*meet(domain), *domain.own.announced_outside(), *domain.gone({INSIDE})]
-    sealed = [sent.datagram for sent in told if sent.target == EAR]
+    sealed = [sent.datagram for sent in told if sent.target == LAN_RELAY]
     assert len(sealed) == 3
     assert all(PROOF.opened(Direction.TO_LAN, datagram) for datagram in sealed)
 
 
 IMPOSSIBLE = {
     INSIDE: "an inside address",
-    EAR.host: "the relay's, inside",
+    LAN_RELAY.host: "the relay's, inside",
     "172.30.0.255": "broadcast, inside",
     "127.0.0.1": "loopback",
     "::1": "loopback",
@@ -153,11 +153,11 @@ def test_a_claimed_address_is_not_inside_nor_the_proxys(address: str) -> None:
     domain.settings.proxy_address_for = lambda a: "10.99.0.2" if a == "10.99.0.2" else NEAR
     meet(domain)
     reasons = watched(domain)
-    assert domain.heard_outside(carried(address, spdp(B, address, 9999)), EAR.host, NOW) == []
+    assert domain.heard_outside(carried(address, spdp(B, address, 9999)), LAN_RELAY.host, NOW) == []
     assert reasons == ["claimed_address"]
     assert not domain.outside.by_prefix
     assert not domain.outside.stand_ins
-    assert domain.rediscovery.ear_heard
+    assert domain.rediscovery.lan_relay_heard
 
 
 def test_a_participant_inside_that_the_relay_hears_is_no_fault() -> None:
@@ -166,7 +166,7 @@ def test_a_participant_inside_that_the_relay_hears_is_no_fault() -> None:
     meet(domain)
     reasons = watched(domain)
     before = dict(domain.rates._by_source)
-    assert domain.heard_outside(carried(INSIDE, spdp(A, INSIDE)), EAR.host, NOW) == []
+    assert domain.heard_outside(carried(INSIDE, spdp(A, INSIDE)), LAN_RELAY.host, NOW) == []
     assert not reasons
     # Nor is its own allowance charged, which a forged source on the LAN would use up.
     assert domain.rates._by_source == before
@@ -180,14 +180,14 @@ def test_any_other_address_may_be_claimed(address: str, is_own: bool) -> None:
     if is_own and address == HOST:
         domain.settings.proxy_address_for = lambda a: a
     meet(domain)
-    sent = domain.heard_outside(carried(address, spdp(B, address, 7412)), EAR.host, NOW)
+    sent = domain.heard_outside(carried(address, spdp(B, address, 7412)), LAN_RELAY.host, NOW)
     assert to(sent, INSIDE)
     leads = {lease.target for lease in domain.outside.by_prefix[B].leases.values()}
     assert leads == {HostPort(address, 7412), HostPort(address, 7413)}
 
 
 def by_relay(domain: Domain, host: str, port: int) -> None:
-    domain.heard_outside(carried(host, spdp(B, host, port)), EAR.host, NOW)
+    domain.heard_outside(carried(host, spdp(B, host, port)), LAN_RELAY.host, NOW)
 
 
 def by_peer(domain: Domain, host: str, port: int) -> None:
@@ -220,8 +220,8 @@ def test_another_machine_may_have_ports_of_the_same_numbers() -> None:
     meet(domain)
     for number, port in enumerate([PUBLISHED, LISTEN, 7410]):
         prefix = B[:-1] + bytes([number])
-        domain.heard_outside(carried(ROBOT, spdp(prefix, ROBOT, port)), EAR.host, NOW)
-    domain.heard_outside(carried(HOST, spdp(B, HOST, LISTEN)), EAR.host, NOW)
+        domain.heard_outside(carried(ROBOT, spdp(prefix, ROBOT, port)), LAN_RELAY.host, NOW)
+    domain.heard_outside(carried(HOST, spdp(B, HOST, LISTEN)), LAN_RELAY.host, NOW)
     assert len(domain.outside.by_prefix) == 4
 
 
@@ -242,7 +242,7 @@ def test_other_locators_of_an_announcement_get_no_stand_in(host: str, port: int)
     datagram = message(data(payload(told)), prefix=B)
     if host == HOST:  # the first one for discovery at the claimed address is the one that counts
         datagram = message(data(payload(told[1:])), prefix=B)
-    assert to(domain.heard_outside(carried(HOST, datagram), EAR.host, NOW), INSIDE)
+    assert to(domain.heard_outside(carried(HOST, datagram), LAN_RELAY.host, NOW), INSIDE)
     leads = {lease.target: lease.kind for lease in domain.outside.by_prefix[B].leases.values()}
     assert leads == {
         HostPort(HOST, 7410): LeaseKind.METATRAFFIC,
@@ -254,7 +254,7 @@ def test_what_the_relay_carries_waits_as_the_one_that_was_heard() -> None:
     """Else a flood on the LAN would have all that it carries wait."""
     domain = make_domain()
     heard = carried(ROBOT, spdp(B, ROBOT))
-    assert domain.source_of(heard, EAR.host) == ROBOT
+    assert domain.source_of(heard, LAN_RELAY.host) == ROBOT
     assert domain.source_of(heard, STRANGER) == STRANGER
     for datagram, _ in WITHOUT_THE_SECRET.values():
-        assert domain.source_of(datagram, EAR.host) == EAR.host
+        assert domain.source_of(datagram, LAN_RELAY.host) == LAN_RELAY.host

@@ -4,9 +4,9 @@ from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.protocol.rtps import source_prefix
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     HOST,
     INSIDE,
+    LAN_RELAY,
     NOW,
     RANGE,
     ROBOT,
@@ -28,7 +28,7 @@ MOVED_IPV6 = "fd77::2"
 def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     domain = make_domain()
     meet(domain)
-    domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
+    domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), LAN_RELAY.host, NOW)
     moved = domain.move_to((MOVED,), NOW)
     farewells = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
     assert farewells == [domain.own.observer.prefix, A]

@@ -9,12 +9,12 @@ from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.discovery.outside_participants import FAREWELL_INTERVAL
-from rosproxy.ros2.discovery.rediscovery import APART_TIME, EAR_TIME
+from rosproxy.ros2.discovery.rediscovery import APART_TIME, LAN_RELAY_TIME
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     INSIDE,
+    LAN_RELAY,
     NEAR,
     NOW,
     OTHER,
@@ -119,9 +119,9 @@ def test_those_on_other_networks_are_not_introduced() -> None:
     assert by(B, to(meet(domain, B, OTHER), INSIDE)) == []
 
 
-def moved(ear: HostPort | None = None) -> Domain:
+def moved(lan_relay: HostPort | None = None) -> Domain:
     """One whose participant has known the proxy at another address; the robot is there."""
-    domain = make_domain(peers=(ROBOT,), ear=ear)
+    domain = make_domain(peers=(ROBOT,), lan_relay=lan_relay)
     domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
     domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
     return domain
@@ -151,24 +151,24 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     assert [is_farewell(datagram) for datagram in by(C, to(again, INSIDE))] == [False]
 
 
-def test_they_meet_anew_once_the_ear_is_heard() -> None:
+def test_they_meet_anew_once_the_lan_relay_is_heard() -> None:
     """It starts after the proxy. What outside is not told it does not forget."""
-    domain = moved(EAR)
+    domain = moved(LAN_RELAY)
     meet(domain)
     assert settle(domain, NOW) == settle(domain, NOW + 1) == []
 
     told = carried(ROBOT, spdp(C, ROBOT))
-    assert by(C, to(domain.heard_outside(told, EAR.host, NOW + 1), INSIDE)) == []
+    assert by(C, to(domain.heard_outside(told, LAN_RELAY.host, NOW + 1), INSIDE)) == []
 
     parting = settle(domain, NOW + 1)
-    assert [is_farewell(datagram) for datagram in by(A, to(parting, EAR.host))] == [True]
+    assert [is_farewell(datagram) for datagram in by(A, to(parting, LAN_RELAY.host))] == [True]
     assert [is_farewell(datagram) for datagram in by(C, to(parting, INSIDE))] == [True]
 
 
-def test_they_meet_anew_though_nobody_is_on_the_ears_lan() -> None:
-    domain = moved(EAR)
+def test_they_meet_anew_though_nobody_is_on_the_lan_relays_lan() -> None:
+    domain = moved(LAN_RELAY)
     meet(domain)
-    assert by(A, to(settle(domain, NOW + EAR_TIME), ROBOT))
+    assert by(A, to(settle(domain, NOW + LAN_RELAY_TIME), ROBOT))
 
 
 def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
@@ -215,7 +215,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     ports: tuple[int, ...],
 ) -> None:
     """Outside heeds no other locators of whom it knows."""
-    domain = make_domain(peers=(ROBOT,), ear=None)
+    domain = make_domain(peers=(ROBOT,), lan_relay=None)
     domain.returning.note_former({A: ports}, domain.inside.by_prefix)
     meet(domain)
     assert not set(domain.inside.by_prefix[A].ports) & set(ports)
@@ -226,7 +226,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
 
 
 def test_who_had_no_ports_was_not_there() -> None:
-    domain = make_domain(ear=EAR)
+    domain = make_domain(lan_relay=LAN_RELAY)
     domain.returning.note_former({A: ()}, domain.inside.by_prefix)
     sent = meet(domain)
     assert domain.inside.by_prefix[A].ports

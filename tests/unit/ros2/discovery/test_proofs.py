@@ -35,9 +35,9 @@ from rosproxy.ros2.protocol.rtps import HEADER, PREFIX, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     HOST,
     INSIDE,
+    LAN_RELAY,
     NOW,
     OTHER,
     RANGE,
@@ -72,7 +72,7 @@ def named(number: int) -> bytes:
 def hear(domain: Domain, prefix: bytes, address: str, now: float = NOW) -> list[Outgoing]:
     """Have the LAN relay tell of a participant."""
     announcement = spdp(prefix, address, lease=LEASE, padding=PADDING)
-    return domain.heard_outside(carried(address, announcement), EAR.host, now)
+    return domain.heard_outside(carried(address, announcement), LAN_RELAY.host, now)
 
 
 def forge(domain: Domain, first: int, count: int) -> list[Outgoing]:
@@ -237,7 +237,7 @@ def test_a_participant_that_only_answers_is_sent_three_times_as_much() -> None:
 
 def test_a_question_is_no_longer_than_what_came() -> None:
     domain = make_domain(peers=())
-    short = domain.heard_outside(carried(LAPTOP, spdp(B, LAPTOP)), EAR.host, NOW)
+    short = domain.heard_outside(carried(LAPTOP, spdp(B, LAPTOP)), LAN_RELAY.host, NOW)
     assert questions(short, LAPTOP) == []  # 140 bytes
     assert questions(hear(domain, B, LAPTOP, NOW + 1), LAPTOP)
 
@@ -249,10 +249,10 @@ def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
     asking = make_domain(peers=())
     asking.settings.hosts = (LAPTOP,)
     sent = meet(asked)
-    (announced,) = to(sent, EAR.host)
+    (announced,) = to(sent, LAN_RELAY.host)
     (meta, _) = reached_at(announced)
     padded = spdp(A, HOST, meta.port, padding=PADDING)
-    (question,) = questions(asking.heard_outside(carried(HOST, padded), EAR.host, NOW), HOST)
+    (question,) = questions(asking.heard_outside(carried(HOST, padded), LAN_RELAY.host, NOW), HOST)
     if known:
         hear(asked, B, LAPTOP)
     back = asked.at_lease(meta.port - 1000, question, LAPTOP, NOW)

@@ -14,9 +14,9 @@ from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED, SETTLING
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     HOST,
     INSIDE,
+    LAN_RELAY,
     NOW,
     OTHER,
     RANGE,
@@ -285,7 +285,7 @@ def announce_from(domain: Domain, prefix: bytes, source: str, now: float) -> lis
     announcement = spdp(prefix, source, padding=PADDING)
     if domain.settings.is_peer(source):
         return domain.heard_outside(announcement, source, now)
-    return domain.heard_outside(carried(source, announcement), EAR.host, now)
+    return domain.heard_outside(carried(source, announcement), LAN_RELAY.host, now)
 
 
 @pytest.mark.parametrize("start", [0.1, NOW])
@@ -394,15 +394,15 @@ def test_only_other_networks_are_told_of_the_end_of_a_forged_participant() -> No
 
 def test_what_the_lan_relay_hears_of_itself_is_no_claim() -> None:
     domain = restarted(peers=())
-    (announced,) = [d for d in to(meet(domain), EAR.host) if source_prefix(d) == A]
-    assert domain.heard_outside(carried(HOST, announced), EAR.host, NOW) == []
+    (announced,) = [d for d in to(meet(domain), LAN_RELAY.host) if source_prefix(d) == A]
+    assert domain.heard_outside(carried(HOST, announced), LAN_RELAY.host, NOW) == []
     assert not reasons_of(domain)
 
 
 def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
     """It waits, answers the keeper, and is refused, since a peer's participant has the prefix."""
     domain = restarted()
-    domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), EAR.host, SETTLING)
+    domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), LAN_RELAY.host, SETTLING)
     come(domain, A, INSIDE, 1, SETTLING)
     assert A in domain.own.keeper.prefixes
     settle(domain, SETTLING + ANSWER_TIME)

@@ -20,8 +20,8 @@ from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
 from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from tests.unit.ros2.discovery.domains import (
-    EAR,
     INSIDE,
+    LAN_RELAY,
     NOW,
     OTHER,
     ROBOT,
@@ -134,9 +134,9 @@ class Neighbours(RuleBasedStateMachine):
         self.check(self.domain.heard_outside(datagram, source, self.now))
 
     @rule(datagram=datagrams(), source=ADDRESS)
-    def the_ear_tells(self, datagram: bytes, source: str) -> None:
+    def the_lan_relay_tells(self, datagram: bytes, source: str) -> None:
         self.came[source] += len(datagram)
-        self.check(self.domain.heard_outside(carried(source, datagram), EAR.host, self.now))
+        self.check(self.domain.heard_outside(carried(source, datagram), LAN_RELAY.host, self.now))
 
     @rule(datagram=datagrams(), source=ADDRESS, port=st.integers(45001, 45015))
     def a_port_gets_something(self, datagram: bytes, source: str, port: int) -> None:
@@ -159,7 +159,7 @@ class Neighbours(RuleBasedStateMachine):
         if address in NEAR_BY:
             self.inside_announces(spdp(prefix, address), address)
         else:
-            self.the_ear_tells(spdp(prefix, address), address)
+            self.the_lan_relay_tells(spdp(prefix, address), address)
 
     @rule(prefix=PREFIX, address=ADDRESS, is_true=st.booleans())
     def somebody_answers_a_question(self, prefix: bytes, address: str, is_true: bool) -> None:
@@ -229,7 +229,7 @@ class Neighbours(RuleBasedStateMachine):
         self.answered |= {outsider.address for outsider in outsiders if outsider.has_answered}
         for out in sent:
             assert 0 < out.target.port < 65536
-            if out.target == EAR or out.target.host in self.proven:
+            if out.target == LAN_RELAY or out.target.host in self.proven:
                 continue
             if (
                 out.target.host not in NEAR_BY

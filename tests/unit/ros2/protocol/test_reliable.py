@@ -6,7 +6,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.reliable import acknack, heartbeat, nack_frag
 from rosproxy.ros2.protocol.rtps import submessages
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
-from tests.unit.ros2.discovery.domains import EAR, NOW, A, B, carried, make_domain, spdp, to
+from tests.unit.ros2.discovery.domains import LAN_RELAY, NOW, A, B, carried, make_domain, spdp, to
 
 OWN = bytes(range(12))
 WRITER = BuiltinWriter.PUBLICATIONS
@@ -31,5 +31,5 @@ def test_a_participant_is_met_however_many_questions_were_asked() -> None:
     domain.own.observer._count = 2**31 - 1
     domain.heard_inside(spdp(A, "172.30.0.5"), "172.30.0.5", NOW)
     announced = carried("10.0.0.77", spdp(B, "10.0.0.77", padding=300))
-    assert to(domain.heard_outside(announced, EAR.host, NOW), "10.0.0.77")
+    assert to(domain.heard_outside(announced, LAN_RELAY.host, NOW), "10.0.0.77")
     assert domain.proofs.question("10.0.0.78", A, [HostPort("10.0.0.1", 46000)])

@@ -1,1 +1,1 @@
-"""What is to be done next: for Services, proxies, ears, NetworkPolicies and unwired pods."""
+"""What is to be done next: for Services, proxies, LAN relays, NetworkPolicies and unwired pods."""

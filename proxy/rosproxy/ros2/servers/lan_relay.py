@@ -1,4 +1,4 @@
-"""The ear: carries announcements of participants between a LAN's multicast and the proxy.
+"""The LAN relay: carries announcements of participants between a LAN's multicast and the proxy.
 
 Multicast ends at the bridge of a container network. This program runs in the host's network, hears
 there what participants announce to the group (SPDP), and tells the proxy, with the address that it
@@ -33,7 +33,7 @@ from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
-from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
+from rosproxy.ros2.servers.groups import GroupLanRelays, family_of, groups_of, send_through
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +42,8 @@ QUIET_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class EarSettings:
-    """The settings of an ear.
+class LanRelaySettings:
+    """The settings of a LAN relay.
 
     ``lan`` is this host's address on the LAN, ``bind`` where the proxy's announcements come in,
     ``proxy`` the address and port of the proxy that hears the LAN's, ``secret`` what both know.
@@ -56,16 +56,16 @@ class EarSettings:
     secret: str = field(repr=False)
 
 
-class Ear:
+class LanRelay:
     """Carries announcements from `start` on, until it is closed; needs a running event loop."""
 
-    def __init__(self, settings: EarSettings) -> None:
+    def __init__(self, settings: LanRelaySettings) -> None:
         self._settings = settings
         self._loop = asyncio.get_running_loop()
         self._proof = RelayProof(settings.secret, time.time)
         self._sockets: list[socket.socket] = []
         self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
-        self._groups = GroupEars(self._port, self._begin, self._end)
+        self._groups = GroupLanRelays(self._port, self._begin, self._end)
         self._sources = LanSources()
         # A machine on the LAN may forge the proxy's address, but not its proof.
         self._proxy_rates = DiscoveryRates(PER_SECOND, BURST)

@@ -1,8 +1,9 @@
-"""What is to be done for the ear of a proxy for ROS 2.
+"""What is to be done for the LAN relay of a proxy for ROS 2.
 
-The ear is in the host's network: it hears the LAN's multicast there, and the proxy at the uplink's
-gateway, at the last of the ports that are held for the proxy, which is not published. It has to
-know the proxy's address, so it is made once the sandbox has one, and anew when that is another.
+The LAN relay is in the host's network: it hears the LAN's multicast there, and the proxy at the
+uplink's gateway, at the last of the ports that are held for the proxy, which is not published. It
+has to know the proxy's address, so it is made once the sandbox has one, and anew when that is
+another.
 """
 
 from collections.abc import Collection, Iterator
@@ -14,7 +15,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.option_values import NOWHERE
 from rosproxy_operator.docker.planner.actions import (
     Action,
-    CreateEar,
+    CreateLanRelay,
     CreateSandbox,
     Remove,
     Rename,
@@ -28,14 +29,14 @@ from rosproxy_operator.docker.planner.container_steps import (
 )
 from rosproxy_operator.docker.planner.duplicates import free_name
 from rosproxy_operator.docker.planner.model import HostState, Key
-from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
+from rosproxy_operator.docker.planner.specs import lan_relay_fingerprint, lan_relay_name, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
 
 
-def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:
-    """The steps for a proxy, and if it is for ROS 2 those for its ear.
+def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
+    """The steps for a proxy, and if it is for ROS 2 those for its LAN relay.
 
-    Before a sandbox is started the ear goes: its port may become one that is published.
+    Before a sandbox is started the LAN relay goes: its port may become one that is published.
     """
     key = context.desired.key
     if not key.is_ros2:
@@ -43,12 +44,12 @@ def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:
     sandboxes = {s.container.name for s in context.observed.sandboxes_of(key)}
     if any(_starts(step, sandboxes) for step in steps):
         return [*_without(context, "its proxy gets another address"), *steps]
-    return [*steps, *_ear_steps(context)]
+    return [*steps, *_lan_relay_steps(context)]
 
 
-def missing_ear(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
-    """Why a proxy for ROS 2 has no ear though it ought to."""
-    if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.ears_of(key):
+def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
+    """Why a proxy for ROS 2 has no LAN relay though it ought to."""
+    if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.lan_relays_of(key):
         return None
     text = (
         "does not hear the LAN, since this host's address there is not known: start the operator "
@@ -70,13 +71,13 @@ def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
     return key.advertise_host if is_address(key.advertise_host) else observed.far
 
 
-def _wanted(context: PlanContext) -> CreateEar | None:
-    """The ear that there ought to be; None if there ought to be none, or its proxy is not found."""
+def _wanted(context: PlanContext) -> CreateLanRelay | None:
+    """The LAN relay that is wanted; None if none is wanted, or the proxy is not found."""
     key = context.desired.key
     observed = context.observed
     settings = context.settings
     lan = _lan(key, observed, settings)
-    bind = context.ear
+    bind = context.lan_relay
     address = next(
         (
             attachment.address
@@ -89,40 +90,42 @@ def _wanted(context: PlanContext) -> CreateEar | None:
     if not lan or not address or bind is None:
         return None
     proxy = HostPort(address, context.ports.first)
-    return CreateEar(ear_name(key), key, context.ports, lan, bind, proxy)
+    return CreateLanRelay(lan_relay_name(key), key, context.ports, lan, bind, proxy)
 
 
-def _ear_steps(context: PlanContext) -> Iterator[Action]:
-    ear = _wanted(context)
+def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
+    lan_relay = _wanted(context)
     if context.settings.ros2_lan == NOWHERE:
         yield from _without(context, "the LAN is not to be heard")
-    # Where an address is not known now, the ear that is there stays as it is.
-    elif ear is not None:
-        yield from _ensure_ear(context, ear)
+    # Where an address is not known now, the LAN relay that is there stays as it is.
+    elif lan_relay is not None:
+        yield from _ensure_lan_relay(context, lan_relay)
 
 
-def _ensure_ear(context: PlanContext, ear: CreateEar) -> Iterator[Action]:
-    """The steps to have this ear and no other."""
-    ears = context.observed.ears_of(ear.key)
+def _ensure_lan_relay(context: PlanContext, lan_relay: CreateLanRelay) -> Iterator[Action]:
+    """The steps to have this LAN relay and no other."""
+    lan_relays = context.observed.lan_relays_of(lan_relay.key)
     observed = context.observed
-    expected = ear_fingerprint(ear, context.settings, observed.image_id, observed.secret)
-    selection = context.select(ears, ear.name, expected, lambda _: True)
+    expected = lan_relay_fingerprint(
+        lan_relay, context.settings, observed.image_id, observed.secret
+    )
+    selection = context.select(lan_relays, lan_relay.name, expected, lambda _: True)
     if selection.stuck or selection.waiting:
         return
     yield from (Remove(container.name, "left over") for container in selection.surplus)
-    taken = context.taken(ears)
+    taken = context.taken(lan_relays)
     if selection.kept is None:
-        ear = replace(ear, name=free_name(ear.name, taken), fingerprint=expected)
+        lan_relay = replace(lan_relay, name=free_name(lan_relay.name, taken), fingerprint=expected)
         yield from creation_steps(
-            selection, ear, former_name(selection.predecessor, ear.name, taken)
+            selection, lan_relay, former_name(selection.predecessor, lan_relay.name, taken)
         )
         return
     yield from keep_running_steps(selection, selection.kept)
-    if ear.name not in (selection.kept.name, *taken):
-        yield Rename(selection.kept.name, ear.name)
+    if lan_relay.name not in (selection.kept.name, *taken):
+        yield Rename(selection.kept.name, lan_relay.name)
 
 
 def _without(context: PlanContext, reason: str) -> Iterator[Action]:
-    for ear in context.observed.ears_of(context.desired.key):
-        if ear.container.state != "removing":
-            yield Remove(ear.container.name, reason)
+    for lan_relay in context.observed.lan_relays_of(context.desired.key):
+        if lan_relay.container.state != "removing":
+            yield Remove(lan_relay.container.name, reason)

@@ -1,4 +1,4 @@
-"""Proxies for ROS 2, and their ears: how they are made, and when anew."""
+"""Proxies for ROS 2, and their LAN relays: how they are made, and when anew."""
 
 from dataclasses import replace
 from typing import Any
@@ -12,7 +12,7 @@ from rosproxy_operator.docker.engine_json import read_making
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Create,
-    CreateEar,
+    CreateLanRelay,
     CreateNetwork,
     CreateSandbox,
     Remove,
@@ -23,20 +23,22 @@ from rosproxy_operator.docker.planner.container_steps import removal_steps
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    EarContainer,
     HostState,
     Key,
+    LanRelayContainer,
     Proxy,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
+    FINGERPRINT,
+    ROLE,
     OwnLabels,
     container_config,
-    ear_config,
-    ear_fingerprint,
-    ear_name,
+    lan_relay_config,
+    lan_relay_fingerprint,
+    lan_relay_name,
     own_labels,
     proxy_fingerprint,
     proxy_name,
@@ -66,10 +68,10 @@ from tests.unit.operator.docker.builders import (
 TWO = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
 KEY = Key("", HERE, 0)
 NEAR = "172.30.0.2"
-EAR = HostPort(UPLINK.gateway, RANGE.last)
-MADE = CreateEar(ear_name(KEY), KEY, RANGE, HERE, EAR, HostPort(NEAR, RANGE.first))
+LAN_RELAY = HostPort(UPLINK.gateway, RANGE.last)
+MADE = CreateLanRelay(lan_relay_name(KEY), KEY, RANGE, HERE, LAN_RELAY, HostPort(NEAR, RANGE.first))
 BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
-PROXY = Create(proxy_name(KEY), KEY, RANGE, BOX.name, ear=EAR)
+PROXY = Create(proxy_name(KEY), KEY, RANGE, BOX.name, lan_relay=LAN_RELAY)
 
 
 def own(made: Any, places: tuple[Attachment, ...] = (), mode: str = "host") -> Container:
@@ -79,19 +81,21 @@ def own(made: Any, places: tuple[Attachment, ...] = (), mode: str = "host") -> C
     )  # fmt: skip
 
 
-def running_proxy(near: str = NEAR, ear: CreateEar | None = MADE) -> dict[str, Any]:
-    """A proxy for ROS 2 that runs, with its ear."""
+def running_proxy(near: str = NEAR, lan_relay: CreateLanRelay | None = MADE) -> dict[str, Any]:
+    """A proxy for ROS 2 that runs, with its LAN relay."""
     box = structs.replace(BOX, fingerprint=sandbox_fingerprint(BOX, SETTINGS))
     made = proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET)
     places = (Attachment(SETTINGS.uplink, near), Attachment("app", "172.18.0.9"))
-    ears = []
-    if ear is not None:
-        ear = structs.replace(ear, fingerprint=ear_fingerprint(ear, SETTINGS, IMAGE, SECRET))
-        ears = [EarContainer(KEY, own(ear), RANGE, ear.fingerprint)]
+    lan_relays = []
+    if lan_relay is not None:
+        lan_relay = structs.replace(
+            lan_relay, fingerprint=lan_relay_fingerprint(lan_relay, SETTINGS, IMAGE, SECRET)
+        )
+        lan_relays = [LanRelayContainer(KEY, own(lan_relay), RANGE, lan_relay.fingerprint)]
     return {
         "sandboxes": [Sandbox(KEY, own(box, places, "app"), RANGE, box.fingerprint)],
         "proxies": [Proxy(KEY, own(PROXY, mode=f"container:id-{BOX.name}"), RANGE, made)],
-        "ears": tuple(ears),
+        "lan_relays": tuple(lan_relays),
     }
 
 
@@ -106,21 +110,21 @@ def actions(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]
 TALKER = container(labels=TWO)
 
 
-def test_a_proxy_waits_for_the_uplink_where_its_ear_is_to_listen() -> None:
+def test_a_proxy_waits_for_the_uplink_where_its_lan_relay_is_to_listen() -> None:
     plan = look(observed(TALKER, networks=[APP]))
     assert list(plan.actions) == [CreateNetwork(SETTINGS.uplink)]
     assert isinstance(plan.deferred[0].actions[0], CreateSandbox)
 
 
-def test_the_ear_is_made_once_its_proxy_has_an_address() -> None:
+def test_the_lan_relay_is_made_once_its_proxy_has_an_address() -> None:
     made = actions(observed(TALKER))
     assert [type(action) for action in made] == [CreateSandbox, Start, *map(type, made[2:])]
-    assert not any(isinstance(action, CreateEar) for action in made)
-    assert next(action for action in made if isinstance(action, Create)).ear == EAR
+    assert not any(isinstance(action, CreateLanRelay) for action in made)
+    assert next(action for action in made if isinstance(action, Create)).lan_relay == LAN_RELAY
 
-    create, start = actions(observed(TALKER, **running_proxy(ear=None)))
+    create, start = actions(observed(TALKER, **running_proxy(lan_relay=None)))
 
-    fingerprint = ear_fingerprint(MADE, SETTINGS, IMAGE, SECRET)
+    fingerprint = lan_relay_fingerprint(MADE, SETTINGS, IMAGE, SECRET)
     assert create == structs.replace(MADE, fingerprint=fingerprint)
     assert start == Start(MADE.name)
     assert actions(observed(TALKER, **running_proxy())) == []
@@ -137,31 +141,31 @@ def test_a_proxy_retires_before_its_relay_and_its_sandbox_go() -> None:
 
 def test_a_paused_relay_is_resumed_before_its_proxy_retires() -> None:
     parts = running_proxy()
-    (ear,) = parts["ears"]
-    paused = replace(ear.container, state="paused")
-    parts["ears"] = (EarContainer(KEY, paused, RANGE, ear.fingerprint),)
+    (lan_relay,) = parts["lan_relays"]
+    paused = replace(lan_relay.container, state="paused")
+    parts["lan_relays"] = (LanRelayContainer(KEY, paused, RANGE, lan_relay.fingerprint),)
 
     first, second, *_ = removal_steps(observed(**parts), KEY, "gone")
 
     assert (first, second) == (Unpause(MADE.name), Remove(PROXY.name, "gone", retire=True))
 
 
-def test_the_ear_is_made_anew_when_its_proxy_has_another_address() -> None:
+def test_the_lan_relay_is_made_anew_when_its_proxy_has_another_address() -> None:
     old = f"{MADE.name}-old"
     rename, create, remove, start = actions(observed(TALKER, **running_proxy("172.30.0.7")))
     assert (rename.name, remove, start) == (
         MADE.name, Remove(old, "made anew"), Start(MADE.name),
     )  # fmt: skip
-    assert isinstance(create, CreateEar)
+    assert isinstance(create, CreateLanRelay)
     assert create.proxy == HostPort("172.30.0.7", RANGE.first)
 
 
-def test_the_ear_goes_before_its_sandbox_is_made_anew() -> None:
+def test_the_lan_relay_goes_before_its_sandbox_is_made_anew() -> None:
     more = container(labels={**TWO, "rosproxy.ports": "40"})
     steps = actions(observed(more, **running_proxy()))
     assert steps[0] == Remove(MADE.name, "its proxy gets another address")
     assert any(isinstance(action, CreateSandbox) and len(action.range) == 40 for action in steps)
-    assert not any(isinstance(action, CreateEar) for action in steps)
+    assert not any(isinstance(action, CreateLanRelay) for action in steps)
 
 
 def test_all_three_go_when_nobody_wants_them() -> None:
@@ -169,13 +173,13 @@ def test_all_three_go_when_nobody_wants_them() -> None:
     assert [action.name for action in plan.actions] == [PROXY.name, MADE.name, BOX.name]
 
 
-def test_no_lan_no_ear() -> None:
+def test_no_lan_no_lan_relay() -> None:
     deaf = replace(SETTINGS, ros2_lan="none")
     plan = look(observed(TALKER, **running_proxy()), deaf)
     assert Remove(MADE.name, "the LAN is not to be heard") in plan.actions
     assert not plan.problems
     (create,) = (action for action in actions(observed(TALKER), deaf) if isinstance(action, Create))
-    assert create.ear is None
+    assert create.lan_relay is None
 
 
 def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_are() -> None:
@@ -191,7 +195,7 @@ def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_ar
         )  # fmt: skip
         plan = look(state, settings)
         told = [p.text for p in plan.problems if "does not hear the LAN" in p.text]
-        return [action.lan for action in plan.actions if isinstance(action, CreateEar)] or told
+        return [action.lan for action in plan.actions if isinstance(action, CreateLanRelay)] or told
 
     assert lan(HERE, "192.0.2.77") == ["192.0.2.77"]
     assert lan(HERE, "", "192.0.2.99") == [HERE]
@@ -240,7 +244,7 @@ def test_what_a_proxy_for_ros_2_is_made_of() -> None:
     env = environment(container_config(made, SETTINGS, SECRET, ""))
     settings_of(env)  # it starts
     env.pop("ROSPROXY_ADMIN_TOKEN_HASH")
-    env.pop("ROSPROXY_ROS2_EAR_SECRET")
+    env.pop("ROSPROXY_ROS2_LAN_RELAY_SECRET")
     assert env == {
         "ROSPROXY_ROS": "2",
         "ROSPROXY_ADVERTISE_HOST": HERE,
@@ -248,7 +252,7 @@ def test_what_a_proxy_for_ros_2_is_made_of() -> None:
         "ROSPROXY_ADMIN_BIND": "0.0.0.0:11312",
         "ROSPROXY_ROS2_DOMAINS": "0",
         "ROSPROXY_ROS2_PEERS": "arm:11400 robot",
-        "ROSPROXY_ROS2_EAR": "172.30.0.1:11431",
+        "ROSPROXY_ROS2_LAN_RELAY": "172.30.0.1:11431",
         "ROSPROXY_AWAIT_POLICY": "3",
     }
     ports = sandbox_config(BOX, SETTINGS)["HostConfig"]["PortBindings"]
@@ -265,10 +269,10 @@ def environment(config: dict[str, Any]) -> dict[str, str]:
 def secrets_of(secret: str, key: Key = KEY) -> tuple[str, str]:
     """What the proxy of a key holds, and what its LAN relay does."""
     proxy = container_config(structs.replace(PROXY, key=key), SETTINGS, secret, "")
-    relay = ear_config(structs.replace(MADE, key=key), SETTINGS, secret)
+    relay = lan_relay_config(structs.replace(MADE, key=key), SETTINGS, secret)
     proxy_env = environment(proxy)
     relay_env = environment(relay)
-    return proxy_env["ROSPROXY_ROS2_EAR_SECRET"], relay_env["ROSPROXY_EAR_SECRET"]
+    return proxy_env["ROSPROXY_ROS2_LAN_RELAY_SECRET"], relay_env["ROSPROXY_LAN_RELAY_SECRET"]
 
 
 def test_a_proxy_and_its_lan_relay_share_a_secret() -> None:
@@ -279,19 +283,19 @@ def test_a_proxy_and_its_lan_relay_share_a_secret() -> None:
     assert len({of_proxy, *(secret for pair in others for secret in pair)}) == 3
     # Who reads it by an inspection of the LAN relay can't call the admin endpoint.
     assert proxy_token(KEY, SECRET) != of_proxy
-    without = container_config(structs.replace(PROXY, ear=None), SETTINGS, SECRET, "")
-    assert "ROSPROXY_ROS2_EAR_SECRET" not in environment(without)
+    without = container_config(structs.replace(PROXY, lan_relay=None), SETTINGS, SECRET, "")
+    assert "ROSPROXY_ROS2_LAN_RELAY_SECRET" not in environment(without)
 
 
 def test_both_are_made_anew_for_another_secret() -> None:
     state = replace(observed(TALKER, **running_proxy()), secret="another")
-    created = [type(a) for a in actions(state) if isinstance(a, Create | CreateEar)]
-    assert created == [Create, CreateEar]
+    created = [type(a) for a in actions(state) if isinstance(a, Create | CreateLanRelay)]
+    assert created == [Create, CreateLanRelay]
     assert actions(replace(state, secret=SECRET)) == []
 
 
-def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
-    config = ear_config(MADE, SETTINGS, SECRET)
+def test_an_lan_relay_has_the_hosts_network_and_no_other_right() -> None:
+    config = lan_relay_config(MADE, SETTINGS, SECRET)
     assert config["User"] == "10001:10001"
     assert config["HostConfig"] == {
         "ReadonlyRootfs": True,
@@ -304,8 +308,26 @@ def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
         "NetworkMode": "host",
     }
     own = read_own(config["Labels"])
-    assert own == OwnLabels("ear", KEY, RANGE, "")
+    assert own == OwnLabels("lan-relay", KEY, RANGE, "")
     assert not forgery_reason(own, MADE.name, read_making(inspection(config)), IMAGE)
+
+
+def test_one_that_an_operator_before_0_1_0_made_is_known_and_made_anew() -> None:
+    former = f"{proxy_name(KEY)}-ear"
+    config = lan_relay_config(MADE, SETTINGS, SECRET)
+    labels = {**config["Labels"], ROLE: "ear", FINGERPRINT: "of then"}
+    making = inspection({**config, "Cmd": ["ear"]})
+    own = read_own(labels)
+    assert own == OwnLabels("lan-relay", KEY, RANGE, "of then")
+    assert not forgery_reason(own, former, read_making(making), IMAGE)
+
+    parts = running_proxy()
+    (lan_relay,) = parts["lan_relays"]
+    there = replace(lan_relay.container, name=former)
+    parts["lan_relays"] = (LanRelayContainer(KEY, there, RANGE, "of then"),)
+    steps = actions(observed(TALKER, **parts))
+    assert any(isinstance(step, Remove) and step.name.startswith(former) for step in steps)
+    assert any(isinstance(step, CreateLanRelay) and step.name == MADE.name for step in steps)
 
 
 @pytest.mark.parametrize(
@@ -318,10 +340,10 @@ def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
         ("PortBindings", {"80/tcp": [{"HostPort": "80"}]}),
     ],
 )
-def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
-    making = inspection(ear_config(MADE, SETTINGS, SECRET))
+def test_what_gives_a_forged_lan_relay_away(field: str, value: object) -> None:
+    making = inspection(lan_relay_config(MADE, SETTINGS, SECRET))
     making["HostConfig"][field] = value
-    own = OwnLabels("ear", KEY, RANGE, "")
+    own = OwnLabels("lan-relay", KEY, RANGE, "")
     reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)
     assert reason == f"its HostConfig.{field} is not the operator's"
 
@@ -336,5 +358,5 @@ def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
         {"io.rosproxy.domain": "", "io.rosproxy.master-uri": "http://robot:11311"},
     ],
 )
-def test_labels_of_an_ear_that_are_not_whole(wrong: dict[str, str]) -> None:
+def test_labels_of_a_lan_relay_that_are_not_whole(wrong: dict[str, str]) -> None:
     assert read_own({**own_labels(MADE), **wrong}) is None

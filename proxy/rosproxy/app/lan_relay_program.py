@@ -1,26 +1,26 @@
-"""The ear as a program: started, and stopped by a signal."""
+"""The LAN relay as a program: started, and stopped by a signal."""
 
 import asyncio
 import logging
 
 from rosproxy.app.signals import stop_event
 from rosproxy.binding import setting_error_if_taken
-from rosproxy.ros2.servers.multicast_ear import Ear, EarSettings
+from rosproxy.ros2.servers.lan_relay import LanRelay, LanRelaySettings
 
 log = logging.getLogger(__name__)
 
 
-def run_ear(settings: EarSettings) -> None:
+def run_lan_relay(settings: LanRelaySettings) -> None:
     """Run it until a signal ends it. Raises SettingError if a port is taken."""
     asyncio.run(_run(settings))
 
 
-async def _run(settings: EarSettings) -> None:
+async def _run(settings: LanRelaySettings) -> None:
     ending = stop_event()
-    ear = Ear(settings)
+    lan_relay = LanRelay(settings)
     try:
         with setting_error_if_taken("--bind", settings.bind):
-            ear.start()
+            lan_relay.start()
         log.info(
             "ready: carries announcements of domain %d between the LAN at %s and the proxy at %s",
             settings.domain,
@@ -29,4 +29,4 @@ async def _run(settings: EarSettings) -> None:
         )
         await ending.wait()
     finally:
-        ear.close()
+        lan_relay.close()

@@ -1,0 +1,142 @@
+"""What is to be done for the LAN relays of a RosProxy: how they are made, and when.
+
+A LAN relay is a pod in its node's own network: it hears the LAN's multicast there, and the proxy at
+the last port of the proxy's range, which the LAN relay holds. It has to know the proxy's address,
+so it is made once the proxy's pod has one, and anew when that changes. It has no right but that
+network.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND, lan_relay_variables
+from rosproxy_operator.kubernetes.planner.actions import Action, CreateLanRelay, DeleteLanRelay
+from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
+from rosproxy_operator.kubernetes.planner.manifests import (
+    POD_SECURITY_CONTEXT,
+    ProxySite,
+    bound_to,
+    fingerprint_of,
+    fingerprinted,
+    image_of,
+    metadata,
+    proxy_fingerprint,
+)
+from rosproxy_operator.kubernetes.planner.retries import Task
+from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext, site_of
+from rosproxy_operator.kubernetes.resources.cluster import LanRelayPod
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, ProxyPlace, RosProxy
+from rosproxy_operator.kubernetes.resources.names import LAN_RELAY, NODE, lan_relay_id
+from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.status.findings import finding
+
+_RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"memory": "128Mi"}}
+"""A LAN relay has 30 MiB and one thread."""
+
+
+def lan_relay_pod(
+    site: ProxySite, lan_relay: HostPort, proxy_address: str, settings: ClusterSettings
+) -> Json:
+    """The pod of a LAN relay that listens at ``lan_relay``, for the proxy at ``proxy_address``."""
+    rosproxy = site.rosproxy
+    ros2 = site.rosproxy.spec.ros2
+    annotations = {NODE: site.node.name}
+    meta = metadata(rosproxy, lan_relay_id(rosproxy.id, site.node.name), annotations, LAN_RELAY)
+    target = HostPort(proxy_address, site.ports.first)
+    number = ros2.number if ros2 else 0
+    variables = lan_relay_variables(number, lan_relay.host, lan_relay, target, site.relay_secret)
+    policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
+    container: dict[str, Any] = {
+        "name": LAN_RELAY,
+        "image": image_of(rosproxy, settings),
+        **({"imagePullPolicy": policy} if policy else {}),
+        "command": [*LAN_RELAY_COMMAND],
+        "env": [{"name": name, "value": value} for name, value in variables.items()],
+        # The scheduler counts it; that of a pod in its node's network is a port of the node.
+        "ports": [{"containerPort": lan_relay.port, "hostPort": lan_relay.port, "protocol": "UDP"}],
+        "resources": dict(_RESOURCES),
+        "terminationMessagePolicy": "FallbackToLogsOnError",
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+    }
+    spec = {
+        **bound_to(site.node.name, rosproxy.spec),
+        "hostNetwork": True,
+        "terminationGracePeriodSeconds": 1,
+        "securityContext": dict(POD_SECURITY_CONTEXT),
+        "containers": [container],
+    }
+    return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
+
+
+def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
+    """The next actions for the LAN relays of a RosProxy.
+
+    The LAN relay of a proxy that is to be made anew stays until the new proxy has an address: the
+    one that goes tells outside by it that its participants have ended.
+    """
+    places = {*context.view.places.get(rosproxy.id, ())}
+    lan_relays_by_node = group_by_key(
+        (e.node, e) for e in context.observed.lan_relays if e.owner == rosproxy.uid
+    )
+    for node_name in sorted({*lan_relays_by_node, *(place.node for place in places)}):
+        place = ProxyPlace(rosproxy.id, node_name)
+        lan_relays = lan_relays_by_node.get(node_name, ())
+        node = context.observed.nodes.get(node_name)
+        if node is None or not node.ready:
+            continue  # the garbage collector takes the pods of nodes that are gone
+        if place not in places or not rosproxy.spec.multicast:
+            yield from _delete_lan_relays(context, lan_relays, "no proxy needs it")
+        else:
+            yield from _ensure_lan_relay(context, place, lan_relays)
+
+
+def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
+    """Where a RosProxy's proxy can't have a LAN relay though it ought to."""
+    for place in context.view.places.get(rosproxy.id, ()) if rosproxy.spec.multicast else ():
+        site = site_of(context, place) if place in context.view.wanted else None
+        if isinstance(site, ProxySite) and site.lan_relay is None:
+            text = (
+                f"node {place.node} has no IPv4 address of type InternalIP, so its LAN is not "
+                "heard: name the hosts outside in spec.peers, and leave spec.multicast out"
+            )
+            yield finding(rosproxy, "NoLanAddress", text)
+
+
+def _ensure_lan_relay(
+    context: ClusterContext, place: ProxyPlace, lan_relays: tuple[LanRelayPod, ...]
+) -> Iterator[Action]:
+    current = context.view.current.get(place)
+    wanted = place in context.view.wanted
+    site = site_of(context, place) if wanted else None
+    address = current.pod.ip if current is not None and not current.pod.ended else ""
+    if current is None or not isinstance(site, ProxySite) or site.lan_relay is None or not address:
+        return
+    if current.fingerprint != proxy_fingerprint(site, context.settings):
+        return
+    body = lan_relay_pod(site, site.lan_relay, address, context.settings)
+    expected = fingerprint_of(body)
+    id = lan_relay_id(place.of, place.node)
+    outdated = [
+        lan_relay
+        for lan_relay in lan_relays
+        if lan_relay.fingerprint != expected or lan_relay.pod.ended
+    ]
+    yield from _delete_lan_relays(
+        context, outdated, "made anew: its proxy or its settings have changed"
+    )
+    if not lan_relays and context.retries.is_due(Task(place.of, "create", id)):
+        yield CreateLanRelay(place.of, body)
+
+
+def _delete_lan_relays(
+    context: ClusterContext, lan_relays: Iterable[LanRelayPod], why: str
+) -> Iterator[Action]:
+    for lan_relay in lan_relays:
+        task = Task(lan_relay.of, "delete", lan_relay.pod.id, lan_relay.pod.uid)
+        if not lan_relay.pod.deleting and context.retries.is_due(task):
+            yield DeleteLanRelay(lan_relay.of, lan_relay.pod.id, lan_relay.pod.uid, why)
