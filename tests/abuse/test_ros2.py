@@ -34,7 +34,7 @@ from tests.abuse.ros2_neighbours import (
     forge,
 )
 from tests.integration.net import until
-from tests.unit.ros2.discovery.domains import SEDP_WRITERS, farewell, sedp, spdp
+from tests.unit.ros2.discovery.domains import SEDP_WRITERS, dispose_message, sedp, spdp
 from tests.unit.ros2.protocol.messages import (
     data,
     fragment,
@@ -170,7 +170,9 @@ def heavy(number: int) -> list[bytes]:
 def announced() -> list[tuple[str, Address, bytes]]:
     """Participants that come, speak at length, go, and are too many."""
     said = [[spdp(prefix(number), EVIL, 9000 + number), *heavy(number)] for number in range(100)]
-    said += [[spdp(prefix(number), EVIL), farewell(prefix(number))] for number in range(40, 400)]
+    said += [
+        [spdp(prefix(number), EVIL), dispose_message(prefix(number))] for number in range(40, 400)
+    ]
     return [(EVIL, ANNOUNCED, datagram) for datagram in itertools.chain(*said)]
 
 
@@ -199,8 +201,10 @@ async def test_one_address_inside_floods(abused, good, robot):
         with Flood(announced(), is_forged=False) as flood:
             flood.wait(AMONG)
         served(good, robot, b"again")
-        goodbyes = [(EVIL, ANNOUNCED, farewell(prefix(number))) for number in range(400)]
-        with Flood(goodbyes, is_forged=False):
+        dispose_messages = [
+            (EVIL, ANNOUNCED, dispose_message(prefix(number))) for number in range(400)
+        ]
+        with Flood(dispose_messages, is_forged=False):
             await until(lambda: evil_count() == 0, "they have gone")
     assert abused.most_memory() - most < MORE
 
@@ -209,7 +213,7 @@ def test_strangers_flood(abused, good, robot, first):
     """At all ports, from addresses of their own and from forged ones."""
     leases = served(good, robot, b"before")
     ports = [(APART, port) for port in range(first, first + PORTS)]
-    said = [spdp(prefix(1), STRANGERS[3]), *heavy(1), farewell(GOOD), b"\0" * 999]
+    said = [spdp(prefix(1), STRANGERS[3]), *heavy(1), dispose_message(GOOD), b"\0" * 999]
     said += [sedp(ROBOT, STRANGERS[0], 4000, to=GOOD)]
     own = [
         (STRANGERS[3], to, datagram) for to in ports for datagram in said if to not in leases[1:]
@@ -235,13 +239,15 @@ def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
     leases = served(good, robot, b"before")
     for number, source in enumerate((EVIL, STRANGERS[3])):
         said = [
-            farewell(GOOD),
-            farewell(ROBOT),
+            dispose_message(GOOD),
+            dispose_message(ROBOT),
             spdp(GOOD, source, 9000),
             spdp(ROBOT, source, 9000),
             spdp(GOOD, good.address, 9000),
             spdp(prefix(number), good.address, WELL_KNOWN),
-            message(submessage(0x0C, 0, bytes(8) + GOOD), farewell(GOOD)[20:], prefix=prefix(8)),
+            message(
+                submessage(0x0C, 0, bytes(8) + GOOD), dispose_message(GOOD)[20:], prefix=prefix(8)
+            ),
         ]
         to = [ANNOUNCED, (APART, first), (APART, leases[0][1])]
         with Flood(
@@ -267,7 +273,7 @@ def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
             (stand_in, _) = good.hears(datagram[8:20], lambda: None)
             for _ in range(100):
                 good.meta.sendto(sedp(GOOD, good.address, 4000), (stand_in.host, stand_in.port))
-            forge(VICTIM, (APART, first), farewell(prefix(999)))
+            forge(VICTIM, (APART, first), dispose_message(prefix(999)))
             served(good, robot, b"amid")
             got += counted.bytes_from([APART, APART_HOST])
             assert got <= came

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.rtps import FAST_DDS
 from tests.ros.processes import wait_until
 from tests.ros2.lab import Lab, is_whole
@@ -117,6 +117,6 @@ def test_a_forged_end_is_no_end_for_good(lab: Lab, source: str, sink: str) -> No
     (participant,) = lab.domain().inside
     prefix = bytes.fromhex(participant.guid_prefix.replace(".", ""))
     with lab.place("c1").entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.sendto(farewell(prefix, FAST_DDS, 1000), (lab.place("px").address, 7410))
+        sock.sendto(dispose_message(prefix, FAST_DDS, 1000), (lab.place("px").address, 7410))
     wait_until("it has ended", lambda: not lab.domain().inside)
     reader.wait_for_count("^got hello ", 20, since=reader.mark())

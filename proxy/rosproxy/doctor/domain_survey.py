@@ -26,7 +26,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     SPDP_MULTICAST,
     SPDP_UNICAST,
 )
-from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, farewell
+from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, source_vendor
 from rosproxy.ros2.registry.participants import Participant
@@ -38,7 +38,7 @@ DOMAINS = 233
 ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
 WITHIN = 2.0
 """Seconds in which participants answer."""
-# Seconds after which participants forget the doctor if its farewell does not arrive.
+# Seconds after which participants forget the doctor if its dispose message does not arrive.
 LEASE = 5.0
 MOST_HEARD = 200
 
@@ -90,7 +90,7 @@ def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
                 datagram, sender = sock.recvfrom(datagrams.LARGEST_DATAGRAM)
                 participant = heard_participant(datagram, plain_address(sender[0]))
                 by_prefix |= {participant.guid_prefix: participant} if participant else {}
-        _send(sock, farewell(prefix), targets)
+        _send(sock, dispose_message(prefix), targets)
     return list(by_prefix.values())
 
 

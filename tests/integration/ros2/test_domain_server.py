@@ -21,7 +21,7 @@ from rosproxy.ros2.registry.locator_ports import REMEMBERED, SETTLING, stand_in_
 from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT, DomainServer
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
-from tests.unit.ros2.discovery.domains import A, B, farewell, reached_at, spdp
+from tests.unit.ros2.discovery.domains import A, B, dispose_message, reached_at, spdp
 
 PROXY = "127.0.7.1"
 INSIDE = "127.0.7.2"
@@ -153,7 +153,7 @@ async def test_participants_that_have_waited_are_let_in_one_after_the_other() ->
     table = server.domain.inside.by_prefix
     await server.expire()
     assert not table
-    server.domain.heard_inside(farewell(prefixes[-1]), INSIDE, SETTLING)
+    server.domain.heard_inside(dispose_message(prefixes[-1]), INSIDE, SETTLING)
     counts = list[int]()
     while len(table) < len(prefixes) - 1:
         await asyncio.sleep(0)

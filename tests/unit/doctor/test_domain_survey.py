@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rosproxy.doctor.domain_survey import ask_participants, heard_participant
 from rosproxy.doctor.facts import HeardParticipant
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from tests.unit.ros2.protocol.messages import PREFIX, data, message, payload
@@ -35,7 +35,7 @@ def test_of_which_domain_it_is(port: int, said: int | None, domain: int) -> None
 
 @pytest.mark.parametrize(
     "datagram",
-    [answer(1024), farewell(PREFIX), message(), b"", b"RTPS"],
+    [answer(1024), dispose_message(PREFIX), message(), b"", b"RTPS"],
     ids=["port", "end", "nothing", "empty", "cut"],
 )
 def test_what_says_nothing(datagram: bytes) -> None:

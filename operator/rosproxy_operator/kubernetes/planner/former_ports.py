@@ -27,7 +27,7 @@ def remember(view: View, former: Mapping[ProxyPlace, FormerPorts]) -> dict[Proxy
 
     Those of the former proxy count until the new one has participants. The last ports count as
     well where a proxy has none any more: it may have unregistered its participants because it is to
-    be made anew, and the farewells are datagrams, of which some may be lost.
+    be made anew, and the dispose messages are datagrams, of which some may be lost.
     """
     latest = {place: ports for place, ports in former.items() if place.of in view.rosproxies}
     for place, proxy in view.current.items():

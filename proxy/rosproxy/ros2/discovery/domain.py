@@ -58,7 +58,7 @@ from rosproxy.ros2.protocol.addressing import (
     for_all,
     may_be_discovery,
 )
-from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.envelope import unwrapped
 from rosproxy.ros2.protocol.relay_proof import Direction
 from rosproxy.ros2.protocol.rtps import (
@@ -332,7 +332,7 @@ class Domain:
         Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp), so all
         outside meet the participants and the observer anew.
         """
-        sent = self.settings.to_outside(self.own.observer.farewell())
+        sent = self.settings.to_outside(self.own.observer.dispose_message())
         self.settings.hosts = hosts
         for insider in self.inside.by_prefix.values():
             move = partial(self.rediscovery.move, insider)
@@ -543,7 +543,7 @@ class Domain:
         sent += self.inside.introduced(insider, message)
         # It knew the proxy elsewhere: it forgets the keeper there, and meets all outside anew.
         if is_new and self.returning.must_meet_anew(prefix):
-            sent += self.own.keeper_farewell(insider)
+            sent += self.own.keeper_dispose_message(insider)
             insider.parting_from = now
         else:
             sent += self._reminders(insider, lease_count, now)
@@ -725,7 +725,7 @@ class Domain:
 
         It may live, and come back by other ports. Outside has to meet it anew then.
         """
-        ended = _farewell_of(insider)
+        ended = _dispose_message_of(insider)
         self._forget_inside(insider)
         self.returning.displace(insider.prefix)
         return self.settings.to_outside(ended)
@@ -734,7 +734,7 @@ class Domain:
         self, outsider: OutsideParticipant, inside: Iterable[InsideParticipant]
     ) -> list[Outgoing]:
         """Forget a participant outside, and tell some inside that it has ended."""
-        ended = _farewell_of(outsider)
+        ended = _dispose_message_of(outsider)
         told = list(inside) if outsider.is_introduced else []
         self._forget_outside(outsider)
         return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
@@ -815,10 +815,10 @@ def _pass_on_each(
     return passed, back
 
 
-def _farewell_of(participant: Participant) -> bytes:
+def _dispose_message_of(participant: Participant) -> bytes:
     """The dispose message of a participant that may come back.
 
     The number is the next one after that of its last announcement: Fast DDS takes no older sample
     of the same writer (StatelessReader.cpp), so a greater one would keep it out for good.
     """
-    return farewell(participant.prefix, participant.vendor, participant.next_number)
+    return dispose_message(participant.prefix, participant.vendor, participant.next_number)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import READER_ENDPOINTS, announcement, farewell
+from rosproxy.ros2.protocol.announcement import READER_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.reliable import MOST_ASKED, Heartbeat, acknack, heartbeats
 from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
@@ -76,9 +76,9 @@ class Observer:
         """The datagram by which it announces itself; ``reached_at`` is where it is answered."""
         return announcement(self.prefix, reached_at, LEASE, READER_ENDPOINTS)
 
-    def farewell(self) -> bytes:
+    def dispose_message(self) -> bytes:
         """The datagram by which it says that it has ended."""
-        return farewell(self.prefix)
+        return dispose_message(self.prefix)
 
     def first_question(self, prefix: bytes) -> list[bytes]:
         """What asks a participant's writers what they have."""

@@ -38,7 +38,7 @@ from rosproxy.ros2.discovery.domain_settings import (
 )
 from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.protocol.addressing import destination
-from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_vendor
 from rosproxy.ros2.registry.locator_ports import stand_in_port
@@ -62,7 +62,7 @@ HIDDEN_SOURCE = (
     "it is the gateway of the proxy's own network: the engine sends datagrams of outside on with "
     "this address, so that the proxy does not know who sent them"
 )
-FAREWELL_INTERVAL = 2.0
+DISPOSE_MESSAGE_INTERVAL = 2.0
 """Seconds after which a participant inside is told again to forget one outside, until they meet."""
 
 
@@ -170,7 +170,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             for near, told in by_near.items():
                 datagram = self._introduction(outsider, near)
                 for insider in told:
-                    sent += self.farewell_to(outsider, insider, now)
+                    sent += self.dispose_message_to(outsider, insider, now)
                     sent += sent_to(insider.metatraffic, [datagram])
         return sent
 
@@ -197,17 +197,18 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             )
         return outsider.is_introduced
 
-    def farewell_to(
+    def dispose_message_to(
         self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
     ) -> list[Outgoing]:
         """What makes one inside forget one outside, if it has to and was not told just now."""
         if (
-            insider.farewell_times is None
-            or now - insider.farewell_times.get(outsider.prefix, -inf) < FAREWELL_INTERVAL
+            insider.dispose_message_times is None
+            or now - insider.dispose_message_times.get(outsider.prefix, -inf)
+            < DISPOSE_MESSAGE_INTERVAL
         ):
             return []
-        insider.farewell_times[outsider.prefix] = now
-        datagram = farewell(outsider.prefix, outsider.vendor, outsider.next_number)
+        insider.dispose_message_times[outsider.prefix] = now
+        datagram = dispose_message(outsider.prefix, outsider.vendor, outsider.next_number)
         return sent_to(insider.metatraffic, [datagram])
 
     def to_met(self, datagram: bytes) -> list[Outgoing]:

@@ -86,9 +86,9 @@ class OwnParticipants:
         """What asks a participant inside that has announced itself for its readers and writers."""
         return sent_to(participant.metatraffic, self.observer.first_question(participant.prefix))
 
-    def keeper_farewell(self, participant: InsideParticipant) -> list[Outgoing]:
+    def keeper_dispose_message(self, participant: InsideParticipant) -> list[Outgoing]:
         """What makes a participant forget the keeper, which it knows at a former address."""
-        return sent_to(participant.metatraffic, self.keeper.farewells(participant.prefix))
+        return sent_to(participant.metatraffic, self.keeper.dispose_messages(participant.prefix))
 
     def port_reminders(self, now: float) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""

@@ -28,7 +28,7 @@ from hashlib import blake2b, pbkdf2_hmac
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import KEEPER_ENDPOINTS, announcement, farewell
+from rosproxy.ros2.protocol.announcement import KEEPER_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
 from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
@@ -125,13 +125,13 @@ class Keeper:
         if any(is_missing[w[0]] and n < answers.get(w, 1) for w, n in wanted.items()):
             # A reader heeds no smaller number (DDSI-RTPS 2.5, 8.4.12.1): it has to forget the
             # keeper first, and is told the number the next time.
-            return self.farewells(prefix)
+            return self.dispose_messages(prefix)
         return self._told(prefix, wanted, reached_at, now)
 
-    def farewells(self, prefix: bytes) -> list[bytes]:
+    def dispose_messages(self, prefix: bytes) -> list[bytes]:
         """What makes a participant forget the keeper, with what it keeps."""
         self.forget(prefix)
-        return [farewell(own) for own in self._own_prefixes]
+        return [dispose_message(own) for own in self._own_prefixes]
 
     def keeps(self, prefix: bytes, ports: Sequence[int]) -> bool:
         """Whether a participant keeps all these ports, as many of them as fit."""

@@ -13,7 +13,7 @@ the proxy: before that, outside would not hear that they have ended. Participant
 with each announcement from outside, until they send something to where outside is found now: while
 so many meet, not every datagram arrives.
 
-Hundreds inside may have to meet hundreds outside, which takes many seconds. So farewells and
+Hundreds inside may have to meet hundreds outside, which takes many seconds. So dispose messages and
 introductions wait, and are made a few at a time (`next_datagrams`). Addresses inside take turns.
 """
 
@@ -27,13 +27,13 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
 from rosproxy.ros2.rewriting.discovery import read_discovery, rewritten
 
 APART_TIME = 0.4
-"""Seconds in which a farewell arrives, and is taken in, on both sides."""
+"""Seconds in which a dispose message arrives, and is taken in, on both sides."""
 VERDICTS_AT_ONCE = 32
 """Verdicts that are judged again at a time. With 1,000 rules one takes 0.7 ms."""
 PAIRS_AT_ONCE = 32
@@ -58,12 +58,12 @@ class Rediscovery:
 
     def separate(self, insider: InsideParticipant) -> list[Outgoing]:
         """Have a participant inside and all outside forget each other."""
-        datagram = farewell(insider.prefix, insider.vendor, insider.next_number)
+        datagram = dispose_message(insider.prefix, insider.vendor, insider.next_number)
         insider.parting_from = None
-        insider.apart_until = inf  # until the last farewell
-        insider.farewell_times = {}  # it was not told to forget anybody yet
+        insider.apart_until = inf  # until the last dispose message
+        insider.dispose_message_times = {}  # it was not told to forget anybody yet
         outsiders = [o for o in self.outside.by_prefix.values() if o.is_introduced]
-        self._put(insider, self._farewells(insider, outsiders))
+        self._put(insider, self._dispose_messages(insider, outsiders))
         return self.settings.to_outside(datagram)
 
     def review(self) -> None:
@@ -73,7 +73,7 @@ class Rediscovery:
 
     @property
     def is_busy(self) -> bool:
-        """Whether verdicts, farewells or introductions wait."""
+        """Whether verdicts, dispose messages or introductions wait."""
         return self._has_verdicts or bool(self._waiting)
 
     def next_datagrams(self, now: float) -> list[Outgoing]:
@@ -109,14 +109,14 @@ class Rediscovery:
 
     def note_met(self, insider: InsideParticipant, prefix: bytes) -> None:
         """Note that a participant inside has sent something to where one outside is found now."""
-        if insider.farewell_times is not None and prefix in insider.farewell_times:
-            insider.farewell_times[prefix] = inf
+        if insider.dispose_message_times is not None and prefix in insider.dispose_message_times:
+            insider.dispose_message_times[prefix] = inf
 
     def forget(self, insiders: Iterable[InsideParticipant], prefix: bytes) -> None:
         """Forget that those inside were told to forget a participant outside, which has gone."""
         for insider in insiders:
-            if insider.farewell_times is not None:
-                insider.farewell_times.pop(prefix, None)
+            if insider.dispose_message_times is not None:
+                insider.dispose_message_times.pop(prefix, None)
 
     def _part(self, insider: InsideParticipant) -> list[Outgoing]:
         """Part a participant, of which the policy is asked anew then, unless it has gone."""
@@ -139,11 +139,11 @@ class Rediscovery:
     def _put(self, insider: InsideParticipant, steps: Iterator[list[Outgoing]]) -> None:
         self._waiting.setdefault(insider.address, deque()).append(steps)
 
-    def _farewells(
+    def _dispose_messages(
         self, insider: InsideParticipant, outsiders: Iterable[OutsideParticipant]
     ) -> Iterator[list[Outgoing]]:
         for outsider in outsiders:
-            yield self.outside.farewell_to(outsider, insider, self._now)
+            yield self.outside.dispose_message_to(outsider, insider, self._now)
         if insider.apart_until == inf:
             insider.apart_until = self._now + APART_TIME
 

@@ -48,7 +48,7 @@ def announcement(
 
 
 @lru_cache(1024)
-def farewell(prefix: bytes, vendor: bytes = NO_VENDOR, sequence: int = 2) -> bytes:
+def dispose_message(prefix: bytes, vendor: bytes = NO_VENDOR, sequence: int = 2) -> bytes:
     """The datagram by which a participant says that it has ended: its key, with that status.
 
     Sent for another participant it has that one's vendor, and a sequence number beyond its own:

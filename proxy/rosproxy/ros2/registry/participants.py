@@ -282,7 +282,7 @@ class InsideParticipant(Participant):
     announced_at: float = 0.0
     parting_from: float | None = None
     apart_until: float | None = None
-    farewell_times: dict[bytes, float] | None = None
+    dispose_message_times: dict[bytes, float] | None = None
 
     @property
     def is_apart(self) -> bool:

@@ -220,10 +220,10 @@ class DomainServer:
         if self._next_part:
             self._next_part.cancel()
         # The observer's alone: participants are not to forget the keeper, by which they keep ports.
-        farewell = self.domain.own.observer.farewell()
+        dispose_message = self.domain.own.observer.dispose_message()
         for address in self._groups.joined:
-            self._multicast(address, farewell)
-        self._send(self.domain.settings.to_outside(farewell))
+            self._multicast(address, dispose_message)
+        self._send(self.domain.settings.to_outside(dispose_message))
         self._groups.close()
         for sock in [*self._sockets, *self._stand_ins.values()]:
             self._stop_reading(sock)

@@ -90,7 +90,7 @@ def carried(source: str, datagram: bytes) -> bytes:
     return PROOF.sealed(Direction.TO_PROXY, wrapped(source, datagram))
 
 
-def farewell(prefix: bytes) -> bytes:
+def dispose_message(prefix: bytes) -> bytes:
     qos = parameter_list([(Pid.STATUS_INFO, bytes([0, 0, 0, 3]))])
     return message(data(qos=qos), prefix=prefix)
 

@@ -70,7 +70,7 @@ def parts(domain: Domain, first: list[Outgoing], now: float) -> list[list[Outgoi
 
 
 def told(sent: list[Outgoing], ended: bool) -> Counter[str]:
-    """How many announcements, or farewells, of those outside an address inside gets."""
+    """How many announcements, or dispose messages, of those outside an address inside gets."""
     return Counter(
         out.target.host
         for out in sent
@@ -110,7 +110,7 @@ def test_addresses_take_turns() -> None:
     assert told(sent, ended=False)[INSIDE] < 2 * OUTSIDE_COUNT
 
 
-def test_a_participant_stays_apart_until_it_has_all_farewells() -> None:
+def test_a_participant_stays_apart_until_it_has_all_dispose_messages() -> None:
     policy = Policy()
     domain = crowd(policy)
     policy.allows = False

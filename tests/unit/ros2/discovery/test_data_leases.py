@@ -13,7 +13,7 @@ from tests.unit.ros2.discovery.domains import (
     OTHER,
     A,
     B,
-    farewell,
+    dispose_message,
     make_domain,
     meet,
     of_vendor,
@@ -63,7 +63,7 @@ def test_who_keeps_a_lease_is_the_same_and_who_comes_after_is_not() -> None:
     (first,) = leases
     meet(domain, B, OTHER)
     assert [lease for lease in leases if lease is first]
-    domain.heard_inside(farewell(A), INSIDE, 100)
+    domain.heard_inside(dispose_message(A), INSIDE, 100)
     assert set(led(leases).values()) == {HostPort(OTHER, 7411)}
     meet(domain)
     (again,) = (lease for lease in leases if lease.target == LOCATOR)
@@ -75,14 +75,14 @@ def test_what_was_forwarded_before_goes_on_until_its_port_is_given_to_somebody()
     leases = data_leases_of(domain)
     meet(domain)
     ((port, target),) = led(leases).items()
-    domain.heard_inside(farewell(A), INSIDE, 100)
+    domain.heard_inside(dispose_message(A), INSIDE, 100)
     elsewhere = HostPort(OTHER, 7413)
     free = next(p for p in domain.settings.ports.listen.ports() if p not in (port, 45000))
     leases.note_former({port: elsewhere, free: elsewhere})
     assert led(leases) == {port: elsewhere, free: elsewhere}
     meet(domain)
     assert led(leases)[port] == target
-    domain.heard_inside(farewell(A), INSIDE, 100)
+    domain.heard_inside(dispose_message(A), INSIDE, 100)
     assert port not in led(leases)
     leases.note_former({})
     assert led(leases) == {}

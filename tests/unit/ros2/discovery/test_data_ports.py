@@ -22,8 +22,8 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     allowance_left,
+    dispose_message,
     everything,
-    farewell,
     make_domain,
     of_vendor,
     reached_at,
@@ -263,7 +263,7 @@ def test_a_port_of_another_participant_at_the_address_is_read(
         domain.heard_inside(datagram, INSIDE, NOW)
     lease = domain.inside.by_prefix[C].leases[HostPort(INSIDE, 7410)]
     assert domain.at_lease(lease.port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []
-    domain.heard_inside(of_vendor(farewell(A), vendor), INSIDE, NOW)
+    domain.heard_inside(of_vendor(dispose_message(A), vendor), INSIDE, NOW)
     assert domain.at_lease(lease.port, sedp(B, ROBOT, 7000), STRANGER, NOW)
 
 
@@ -272,5 +272,5 @@ def test_the_end_of_one_participant_leaves_the_ports_of_another_read() -> None:
     domain = met()
     domain.heard_inside(of_vendor(spdp(C, INSIDE)), INSIDE, NOW)
     port = domain.inside.by_prefix[C].leases[HostPort(INSIDE, 7411)].port
-    domain.heard_inside(of_vendor(farewell(A)), INSIDE, NOW)
+    domain.heard_inside(of_vendor(dispose_message(A)), INSIDE, NOW)
     assert domain.at_lease(port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []

@@ -171,11 +171,11 @@ def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> N
     meet(domain)
     for number, reader in enumerate(readers):
         domain.heard_outside(spdp(reader, ROBOT, 7420 + 10 * number), ROBOT, NOW)
-    domain.inside.by_prefix[A].farewell_times = dict.fromkeys(readers, NOW)
+    domain.inside.by_prefix[A].dispose_message_times = dict.fromkeys(readers, NOW)
     domain.at_stand_in(20_000, sedp(A, INSIDE, 7001), INSIDE, NOW)
-    assert domain.inside.by_prefix[A].farewell_times == dict.fromkeys(readers, NOW)
+    assert domain.inside.by_prefix[A].dispose_message_times == dict.fromkeys(readers, NOW)
     domain.at_stand_in(20_000, sedp(A, INSIDE, 7001, to=readers[1]), INSIDE, NOW)
-    assert domain.inside.by_prefix[A].farewell_times == {readers[0]: NOW, readers[1]: inf}
+    assert domain.inside.by_prefix[A].dispose_message_times == {readers[0]: NOW, readers[1]: inf}
 
 
 def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:

@@ -36,7 +36,7 @@ from tests.unit.ros2.discovery.domains import (
     B,
     allowance_left,
     carried,
-    farewell,
+    dispose_message,
     kept_answer,
     make_domain,
     meet,
@@ -232,8 +232,8 @@ def test_nobody_takes_the_prefix_of_another() -> None:
     assert domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW) == []
     assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
     assert domain.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
-    assert domain.heard_inside(farewell(A), OTHER, NOW) == []
-    assert domain.heard_outside(carried(STRANGER, farewell(B)), LAN_RELAY.host, NOW) == []
+    assert domain.heard_inside(dispose_message(A), OTHER, NOW) == []
+    assert domain.heard_outside(carried(STRANGER, dispose_message(B)), LAN_RELAY.host, NOW) == []
     assert domain.inside.leases == before
     assert domain.outside.by_prefix.keys() == {B}
 
@@ -291,7 +291,7 @@ def test_who_has_gone_gives_everything_back() -> None:
     assert not domain.outside.stand_ins
     assert domain.ports.pool.free == free + 2
     meet(domain)
-    assert to(domain.heard_inside(farewell(A), INSIDE, NOW), ROBOT)
+    assert to(domain.heard_inside(dispose_message(A), INSIDE, NOW), ROBOT)
     assert not domain.inside.by_prefix
     assert domain.ports.pool.free == free + 2
 
@@ -530,8 +530,8 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     assert not to(domain.heard_inside(elsewhere, OTHER, NOW), ROBOT), "it is served at the first"
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 15)
     ended = domain.gone({INSIDE}) if is_told else domain.expire(NOW + 21)
-    (farewell_of_first,) = to(ended, ROBOT)
-    (announcement,) = read_discovery(farewell_of_first).announcements
+    (dispose_message_of_first,) = to(ended, ROBOT)
+    (announcement,) = read_discovery(dispose_message_of_first).announcements
     assert announcement.ended
     assert announcement.sample.sequence == next_number(first)
 
@@ -611,8 +611,8 @@ def test_who_ends_while_he_waits_is_not_announced() -> None:
     domain.returning.note_former({A: [45003]}, ())
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     domain.heard_inside(spdp(B, OTHER), OTHER, 0.1)
-    domain.heard_inside(farewell(B), INSIDE, 0.2)  # nobody ends one at another address
-    domain.heard_inside(farewell(A), INSIDE, 0.2)
+    domain.heard_inside(dispose_message(B), INSIDE, 0.2)  # nobody ends one at another address
+    domain.heard_inside(dispose_message(A), INSIDE, 0.2)
 
     sent = settle(domain, SETTLING + ANSWER_TIME)
 

@@ -42,7 +42,7 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
-    farewell,
+    dispose_message,
     make_domain,
     meet,
     prove,
@@ -64,7 +64,7 @@ def heartbeat(first: int, last: int) -> bytes:
 
 
 def test_a_number_that_has_no_next_one_is_malformed() -> None:
-    """It broke the writing of a GAP, an answer or a farewell, and kept a policy from others."""
+    """It broke writing a GAP, an answer or a dispose message, and kept a policy from others."""
     domain = make_domain(judge=lambda kind, *_: kind is not RuleKind.PUBLISH)
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
@@ -88,7 +88,7 @@ def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
     behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
     (told,) = to(domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW), INSIDE)
     assert len(told) == len(spdp(B, ROBOT))
-    (ended,) = to(domain.heard_inside(farewell(A) + behind, INSIDE, NOW), ROBOT)
+    (ended,) = to(domain.heard_inside(dispose_message(A) + behind, INSIDE, NOW), ROBOT)
     for sent in (told, ended):
         assert b"chatter" not in sent
     assert not domain.inside.by_prefix
@@ -108,14 +108,14 @@ def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> N
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     (lease, *_) = domain.inside.by_prefix[A].leases.values()
     sent = domain.heard_inside(spdp(A, INSIDE) + behind, INSIDE, NOW)
-    sent += domain.heard_inside(farewell(A) + behind, INSIDE, NOW)
+    sent += domain.heard_inside(dispose_message(A) + behind, INSIDE, NOW)
     sent += domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW)
     sent += domain.heard_outside(
         carried(STRANGER, spdp(EVIL, STRANGER) + behind), LAN_RELAY.host, NOW
     )
     sent += domain.at_lease(lease.port, spdp(B, ROBOT) + behind, ROBOT, NOW)
     assert domain.refused.count == 5
-    sent += domain.heard_outside(farewell(B) + behind, ROBOT, NOW)
+    sent += domain.heard_outside(dispose_message(B) + behind, ROBOT, NOW)
     sent += meet(domain, EVIL, OTHER)
     sent += settle(domain, NOW)
     assert sent

@@ -18,7 +18,7 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
-    farewell,
+    dispose_message,
     make_domain,
     meet,
     spdp,
@@ -69,11 +69,11 @@ def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> N
     prefix = own[whose]
     (port,) = [p for p, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410]
     sent = list[Outgoing]()
-    for said in (spdp(prefix, ROBOT), farewell(prefix)):
+    for said in (spdp(prefix, ROBOT), dispose_message(prefix)):
         sent += domain.heard_outside(said, ROBOT, NOW)
         sent += domain.heard_outside(carried(ROBOT, said), LAN_RELAY.host, NOW)
         sent += domain.at_lease(port, said, ROBOT, NOW)
-    for said in (spdp(prefix, OTHER), farewell(prefix)):
+    for said in (spdp(prefix, OTHER), dispose_message(prefix)):
         sent += domain.heard_inside(said, OTHER, NOW)
     assert prefix not in {source_prefix(datagram) for datagram in to(sent, INSIDE)}
     assert prefix not in {source_prefix(datagram) for datagram in to(sent, ROBOT)}

@@ -121,9 +121,9 @@ def test_a_participant_forgets_a_number_that_is_greater(is_proof: bool) -> None:
     number = keeper.number([11405])
     proof = keeper.proof(PEER, [11405])
     answered(keeper, number + (not is_proof), proof + is_proof)
-    farewells = keeper.reminders(PEER, [11405], BACK, 0.0)
-    assert [source_prefix(told) for told in farewells] == [keeper.prefix, keeper.witness]
-    assert not [beat for told in farewells for beat in heartbeats(told)]
+    dispose_messages = keeper.reminders(PEER, [11405], BACK, 0.0)
+    assert [source_prefix(told) for told in dispose_messages] == [keeper.prefix, keeper.witness]
+    assert not [beat for told in dispose_messages for beat in heartbeats(told)]
     assert len(keeper.reminders(PEER, [11405], BACK, 0.0)) == 4
 
 

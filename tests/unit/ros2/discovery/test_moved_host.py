@@ -30,8 +30,8 @@ def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     meet(domain)
     domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), LAN_RELAY.host, NOW)
     moved = domain.move_to((MOVED,), NOW)
-    farewells = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
-    assert farewells == [domain.own.observer.prefix, A]
+    dispose_messages = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
+    assert dispose_messages == [domain.own.observer.prefix, A]
     (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     assert {locator.host for locator in reached_at(again)} == {MOVED}
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}

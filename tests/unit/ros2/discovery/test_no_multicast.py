@@ -8,7 +8,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS
-from rosproxy.ros2.discovery.outside_participants import FAREWELL_INTERVAL
+from rosproxy.ros2.discovery.outside_participants import DISPOSE_MESSAGE_INTERVAL
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, LAN_RELAY_TIME
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -23,7 +23,7 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
-    farewell,
+    dispose_message,
     make_domain,
     meet,
     sedp,
@@ -40,7 +40,7 @@ def by(prefix: bytes, datagrams: list[bytes]) -> list[bytes]:
     return [datagram for datagram in datagrams if source_prefix(datagram) == prefix]
 
 
-def is_farewell(datagram: bytes) -> bool:
+def is_dispose_message(datagram: bytes) -> bool:
     told = read_discovery(datagram).of_participant
     return told is not None and told.ended
 
@@ -137,18 +137,18 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     domain = moved()
 
     sent = meet(domain)
-    assert is_farewell(by(domain.own.keeper.prefix, to(sent, INSIDE))[0])
+    assert is_dispose_message(by(domain.own.keeper.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
     parting = settle(domain, NOW)
     meeting = settle(domain, NOW + APART_TIME)
 
     for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
-        assert [is_farewell(datagram) for datagram in told] == [True]
+        assert [is_dispose_message(datagram) for datagram in told] == [True]
     for told in (by(C, to(meeting, INSIDE)), by(A, to(meeting, ROBOT))):
-        assert [is_farewell(datagram) for datagram in told] == [False]
+        assert [is_dispose_message(datagram) for datagram in told] == [False]
     assert not domain.is_kept(domain.inside.by_prefix[A])
     again = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
-    assert [is_farewell(datagram) for datagram in by(C, to(again, INSIDE))] == [False]
+    assert [is_dispose_message(datagram) for datagram in by(C, to(again, INSIDE))] == [False]
 
 
 def test_they_meet_anew_once_the_lan_relay_is_heard() -> None:
@@ -161,8 +161,10 @@ def test_they_meet_anew_once_the_lan_relay_is_heard() -> None:
     assert by(C, to(domain.heard_outside(told, LAN_RELAY.host, NOW + 1), INSIDE)) == []
 
     parting = settle(domain, NOW + 1)
-    assert [is_farewell(datagram) for datagram in by(A, to(parting, LAN_RELAY.host))] == [True]
-    assert [is_farewell(datagram) for datagram in by(C, to(parting, INSIDE))] == [True]
+    assert [is_dispose_message(datagram) for datagram in by(A, to(parting, LAN_RELAY.host))] == [
+        True
+    ]
+    assert [is_dispose_message(datagram) for datagram in by(C, to(parting, INSIDE))] == [True]
 
 
 def test_they_meet_anew_though_nobody_is_on_the_lan_relays_lan() -> None:
@@ -177,9 +179,9 @@ def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
     settle(domain, NOW)
     settle(domain, NOW + APART_TIME)
     later = by(B, to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
-    assert [is_farewell(datagram) for datagram in later] == [True, False]
-    domain.heard_outside(farewell(B), ROBOT, NOW + 1)
-    assert domain.inside.by_prefix[A].farewell_times == {C: NOW}
+    assert [is_dispose_message(datagram) for datagram in later] == [True, False]
+    domain.heard_outside(dispose_message(B), ROBOT, NOW + 1)
+    assert domain.inside.by_prefix[A].dispose_message_times == {C: NOW}
 
 
 def test_who_does_not_take_it_in_is_told_again() -> None:
@@ -191,13 +193,13 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
 
     def told(later: float) -> list[bool]:
         sent = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
-        return [is_farewell(datagram) for datagram in by(C, to(sent, INSIDE))]
+        return [is_dispose_message(datagram) for datagram in by(C, to(sent, INSIDE))]
 
-    assert told(FAREWELL_INTERVAL - 0.1) == [False]
-    assert told(FAREWELL_INTERVAL) == [True, False]
+    assert told(DISPOSE_MESSAGE_INTERVAL - 0.1) == [False]
+    assert told(DISPOSE_MESSAGE_INTERVAL) == [True, False]
     (stand_in,) = domain.outside.stand_ins
-    domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + FAREWELL_INTERVAL)
-    assert told(3 * FAREWELL_INTERVAL) == [False]
+    domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + DISPOSE_MESSAGE_INTERVAL)
+    assert told(3 * DISPOSE_MESSAGE_INTERVAL) == [False]
 
 
 def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
@@ -221,8 +223,8 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     assert not set(domain.inside.by_prefix[A].ports) & set(ports)
     parting = settle(domain, NOW)
     meeting = settle(domain, NOW + APART_TIME)
-    assert [is_farewell(datagram) for datagram in by(A, to(parting, ROBOT))] == [True]
-    assert [is_farewell(datagram) for datagram in by(A, to(meeting, ROBOT))] == [False]
+    assert [is_dispose_message(datagram) for datagram in by(A, to(parting, ROBOT))] == [True]
+    assert [is_dispose_message(datagram) for datagram in by(A, to(meeting, ROBOT))] == [False]
 
 
 def test_who_had_no_ports_was_not_there() -> None:
@@ -232,7 +234,7 @@ def test_who_had_no_ports_was_not_there() -> None:
     assert domain.inside.by_prefix[A].ports
     told = by(domain.own.keeper.prefix, to(sent, INSIDE))
     assert told
-    assert not any(map(is_farewell, told))
+    assert not any(map(is_dispose_message, told))
 
 
 def test_who_is_there_already_keeps_what_he_has() -> None:

@@ -24,8 +24,8 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
+    dispose_message,
     everything,
-    farewell,
     kept_answer,
     make_domain,
     meet,
@@ -375,7 +375,7 @@ def test_a_participant_inside_that_is_served_keeps_its_prefix(source: str) -> No
     announce_from(domain, A, source, NOW)
     assert A in domain.inside.by_prefix
     assert A not in domain.outside.by_prefix
-    domain.heard_outside(farewell(A), source, NOW)
+    domain.heard_outside(dispose_message(A), source, NOW)
     assert A in domain.inside.by_prefix
 
 

@@ -30,7 +30,7 @@ from tests.unit.ros2.discovery.domains import (
     A,
     B,
     carried,
-    farewell,
+    dispose_message,
     kept_answer,
     make_domain,
     proof_answer,
@@ -77,7 +77,7 @@ def told(prefix: bytes, sequence: int) -> bytes:
 SAID = st.one_of(
     st.builds(spdp, PREFIX, ADDRESS, PORT, st.sampled_from([-1, 2, 20])),
     st.builds(spdp, PREFIX, ADDRESS),
-    st.builds(farewell, PREFIX),
+    st.builds(dispose_message, PREFIX),
     st.builds(sedp, PREFIX, ADDRESS, PORT, MEANT),
     st.builds(
         lambda announcement, behind: announcement + behind[20:],
