@@ -13,7 +13,7 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.leases.ports import PortRange
-from rosproxy.ros2.discovery.port_keeper import Keeper, keeper_key
+from rosproxy.ros2.discovery.port_store import PortStore, port_store_key
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.reliable import heartbeats
@@ -173,10 +173,10 @@ async def test_a_claimed_port_goes_to_the_participant_that_had_it(
     """The attacker got the ports, and the messages, in 20 of 20 restarts."""
     before = await serve_and_restart(abused, good, robot)
     listened = PortRange(first, first + PORTS - 1)
-    keeper = Keeper.of(APART_HOST, listened, 0, 0.0, keeper_key(SECRET))
-    seen = keeper.numbers(GOOD, before)
+    port_store = PortStore.of(APART_HOST, listened, 0, 0.0, port_store_key(SECRET))
+    seen = port_store.numbers(GOOD, before)
     thief.claimed = {
-        writer: number if has_proof or writer[0] == keeper.prefix else 1
+        writer: number if has_proof or writer[0] == port_store.prefix else 1
         for writer, number in seen.items()
     }
     with abused.watched():

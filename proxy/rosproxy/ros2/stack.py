@@ -39,7 +39,7 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
-from rosproxy.ros2.discovery.port_keeper import keeper_key
+from rosproxy.ros2.discovery.port_store import port_store_key
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import DomainWatch
 from rosproxy.ros2.protocol.relay_proof import RelayProof
@@ -117,7 +117,7 @@ class Ros2:
         settings = self._settings
         taken = list[int]()
         # Each process of the proxy is given the same secret, and containers know neither.
-        key = keeper_key(settings.token_hash or settings.ros2_lan_relay_secret)
+        key = port_store_key(settings.token_hash or settings.ros2_lan_relay_secret)
         for number, ports in zip(settings.domains, self._domain_ports(), strict=True):
             domain_settings = DomainSettings(
                 number=number,
@@ -130,7 +130,7 @@ class Ros2:
                 is_inside=self._is_inside,
                 both_ways=settings.direction == "both",
                 relay=_relay(settings),
-                keeper_key=key,
+                port_store_key=key,
             )
             server = DomainServer(
                 domain_settings,

@@ -33,7 +33,7 @@ async def test_each_node_is_asked_once_what_it_is(make_proxy, master, nodes):
     await populate(proxy, nodes)
     for node in nodes:
         node.calls.clear()
-        node.delay = 0.6  # the keeper looks at them meanwhile
+        node.delay = 0.6  # the proxy asks them meanwhile
     await proxy.restart()
     await until(lambda: all_served(proxy), "all are served")
     await looks(master)  # and the prober, more often

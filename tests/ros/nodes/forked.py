@@ -28,12 +28,12 @@ from rosgraph.names import get_ros_namespace
 
 
 def main() -> None:
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # a keeper leaves nothing to be waited for
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # a parent leaves nothing to be waited for
     for line in sys.stdin:
         request = json.loads(line)
         reader, writer = os.pipe()
-        keeper = os.fork()
-        if keeper == 0:
+        parent = os.fork()
+        if parent == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             child = os.fork()
             if child == 0:

@@ -49,7 +49,7 @@ from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.own_participants import OwnParticipants
-from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
@@ -133,17 +133,21 @@ class Domain:
         ports = LocatorPorts(pool, now)
         refused = Refused(settings.note)
         proofs = AddressProofs(secret)
-        keeper = Keeper.of(
-            settings.host, settings.ports.listen, settings.number, when - now, settings.keeper_key
+        port_store = PortStore.of(
+            settings.host,
+            settings.ports.listen,
+            settings.number,
+            when - now,
+            settings.port_store_key,
         )
         verdicts = Verdicts(settings.judge)
         inside = InsideParticipants(settings, ports, refused, proofs, verdicts)
         outside = OutsideParticipants(settings, refused, proofs, verdicts)
         settings.participants_at = outside.count_by_address.__getitem__
-        returning = ReturningParticipants(settings, ports, keeper, proofs)
+        returning = ReturningParticipants(settings, ports, port_store, proofs)
         fragments = FragmentStores()
         participants = OwnParticipants(
-            settings, Observer(own), keeper, inside, outside, returning, fragments, proofs
+            settings, Observer(own), port_store, inside, outside, returning, fragments, proofs
         )
         return cls(
             settings,
@@ -363,7 +367,7 @@ class Domain:
 
     def is_kept(self, participant: InsideParticipant) -> bool:
         """Whether a participant inside keeps all the ports that it has, for the next process."""
-        return self.own.keeper.keeps(participant.prefix, participant.ports)
+        return self.own.port_store.keeps(participant.prefix, participant.ports)
 
     def expire(self, now: float) -> list[Outgoing]:
         """Forget participants that have not been heard for as long as they said.
@@ -541,9 +545,9 @@ class Domain:
         lease_count = len(insider.leases)
         exported = self.inside.exported(insider, message, now, self.returning.former_ports(prefix))
         sent += self.inside.introduced(insider, message)
-        # It knew the proxy elsewhere: it forgets the keeper there, and meets all outside anew.
+        # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
         if is_new and self.returning.must_meet_anew(prefix):
-            sent += self.own.keeper_dispose_message(insider)
+            sent += self.own.port_store_dispose_message(insider)
             insider.parting_from = now
         else:
             sent += self._reminders(insider, lease_count, now)

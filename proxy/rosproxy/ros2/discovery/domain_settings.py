@@ -95,7 +95,7 @@ class DomainSettings:
     participants outside that are known at an address. ``gateways`` are those of the proxy's
     default routes. ``settled`` is called with the address of each participant that is met.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
-    ``keeper_key`` proves which ports participants had (`port_keeper.keeper_key`).
+    ``port_store_key`` proves which ports participants had (`port_store.port_store_key`).
     """
 
     number: int
@@ -108,7 +108,7 @@ class DomainSettings:
     both_ways: bool = False
     peers: tuple[HostPort, ...] = ()
     relay: LanRelayLink | None = None
-    keeper_key: bytes = field(default=b"", repr=False)
+    port_store_key: bytes = field(default=b"", repr=False)
     participants_at: Callable[[str], int] = lambda _: 0
     gateways: frozenset[str] = frozenset()
     settled: Settled = lambda _: None

@@ -1,8 +1,8 @@
 """The proxy's own participants in a domain: what they send, and what they are told.
 
-The *observer* reads which readers and writers others have, on both sides; the *keeper* has those
-inside keep their ports for the next process. Neither has any of its own, and neither is told to the
-other side: each side knows them as its own.
+The *observer* reads which readers and writers others have, on both sides; the *port store* has
+those inside keep their ports for the next process. Neither has any of its own, and neither is told
+to the other side: each side knows them as its own.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
@@ -26,11 +26,11 @@ from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
 
 @dataclass(slots=True)
 class OwnParticipants:
-    """The observer and the keeper of a domain, and the tables in which they note what they hear."""
+    """The observer and the port store of a domain, and the tables that they fill."""
 
     settings: DomainSettings
     observer: Observer
-    keeper: Keeper
+    port_store: PortStore
     inside: InsideParticipants
     outside: OutsideParticipants
     returning: ReturningParticipants
@@ -40,10 +40,10 @@ class OwnParticipants:
     def is_own(self, prefix: bytes) -> bool:
         """Whether a GUID prefix is that of one of the proxy's own participants.
 
-        No other participant may use it. The keeper's follows from what all can see, and whatever
-        ends the keeper for those inside has them forget their ports.
+        No other participant may use it. The port store's follows from what all can see, and
+        whatever ends the port store for those inside has them forget their ports.
         """
-        return prefix in (self.observer.prefix, self.keeper.prefix, self.keeper.witness)
+        return prefix in (self.observer.prefix, self.port_store.prefix, self.port_store.witness)
 
     def announced_inside(self, near: str) -> bytes:
         """The observer's announcement for a network inside, where the proxy has an address."""
@@ -86,9 +86,11 @@ class OwnParticipants:
         """What asks a participant inside that has announced itself for its readers and writers."""
         return sent_to(participant.metatraffic, self.observer.first_question(participant.prefix))
 
-    def keeper_dispose_message(self, participant: InsideParticipant) -> list[Outgoing]:
-        """What makes a participant forget the keeper, which it knows at a former address."""
-        return sent_to(participant.metatraffic, self.keeper.dispose_messages(participant.prefix))
+    def port_store_dispose_message(self, participant: InsideParticipant) -> list[Outgoing]:
+        """What makes a participant forget the port store, which it knows at a former address."""
+        return sent_to(
+            participant.metatraffic, self.port_store.dispose_messages(participant.prefix)
+        )
 
     def port_reminders(self, now: float) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
@@ -96,7 +98,7 @@ class OwnParticipants:
         return [sent for p in participants for sent in self.returning.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Take in what a participant inside tells the keeper, or the observer. Raises RtpsError."""
+        """Take in what a participant inside tells the port store or the observer. RtpsError."""
         prefix = message.prefix
         insider = self.inside.find(prefix, source)
         # One that waits to be let in is in no table yet, and its answer is what it waits for.

@@ -1,8 +1,8 @@
 """Participants that may have had ports before the proxy started: they are asked which.
 
 For some seconds from the start an announcement from inside waits: until the participant has said
-which ports it had (`Keeper`), or has had the time to, and until outside has had the time to go on
-sending to the ports that it knows (`LocatorPorts`).
+which ports it had (`PortStore`), or has had the time to, and until outside has had the time to go
+on sending to the ports that it knows (`LocatorPorts`).
 """
 
 from collections import Counter
@@ -18,7 +18,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     DomainSettings,
     Outgoing,
 )
-from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
@@ -40,7 +40,7 @@ class ReturningParticipants:
 
     settings: DomainSettings
     ports: LocatorPorts
-    keeper: Keeper
+    port_store: PortStore
     proofs: AddressProofs
     waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
     former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
@@ -126,18 +126,18 @@ class ReturningParticipants:
 
     def former_ports(self, prefix: bytes) -> Sequence[int]:
         """The ports that a participant had before the start, in the order of its locators."""
-        return self.former.get(prefix) or self.keeper.former_ports(prefix)
+        return self.former.get(prefix) or self.port_store.former_ports(prefix)
 
     def take_answer(self, prefix: bytes, source: str, datagram: bytes) -> bool:
-        """Note what a participant tells the keeper; return whether it does. Raises RtpsError.
+        """Note what a participant tells the port store; return whether it does. Raises RtpsError.
 
         What it tells once it has its ports follows from these, and is no claim.
         """
-        if not self.keeper.take(prefix, datagram):
+        if not self.port_store.take(prefix, datagram):
             return False
         if self.is_waiting(prefix, source) and prefix not in self.former:
-            proven_count = self.keeper.proven_count(prefix)
-            self.ports.note_claims(prefix, self.keeper.former_ports(prefix), proven_count)
+            proven_count = self.port_store.proven_count(prefix)
+            self.ports.note_claims(prefix, self.port_store.former_ports(prefix), proven_count)
         return True
 
     def was_inside(self, prefix: bytes) -> bool:
@@ -147,7 +147,7 @@ class ReturningParticipants:
         """
         return (
             prefix in self.former
-            or self.keeper.proven_count(prefix) > 0
+            or self.port_store.proven_count(prefix) > 0
             or self.ports.is_named(prefix)
         )
 
@@ -165,14 +165,14 @@ class ReturningParticipants:
         """Forget a participant that has gone."""
         self.former.pop(prefix, None)
         self.displaced.pop(prefix, None)
-        self.keeper.forget(prefix)
+        self.port_store.forget(prefix)
         self.ports.forget_claims(prefix)
 
     def reminders(self, participant: InsideParticipant, now: float) -> list[Outgoing]:
         """What makes a participant keep the ports that it has now."""
         if participant.metatraffic is None:
             return []
-        datagrams = self.keeper.reminders(
+        datagrams = self.port_store.reminders(
             participant.prefix, participant.ports, self._reply_target(participant.address), now
         )
         return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
@@ -184,7 +184,7 @@ class ReturningParticipants:
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
         return (
             self.must_meet_anew(prefix)
-            or self.keeper.has_answered(prefix)
+            or self.port_store.has_answered(prefix)
             or now - since >= ANSWER_TIME
         )
 
@@ -193,7 +193,7 @@ class ReturningParticipants:
         target = first_metatraffic(spdp, message.datagram, source) if spdp else None
         if target is None:
             return []
-        questions = self.keeper.questions(message.prefix, self._reply_target(source), now)
+        questions = self.port_store.questions(message.prefix, self._reply_target(source), now)
         return [Outgoing(target, datagram) for datagram in questions]
 
     def _reply_target(self, address: str) -> HostPort:

@@ -19,7 +19,7 @@ _PARTICIPANT = bytes([0, 0, 1, 0xC1])
 SPDP_ENDPOINTS = 0x01 | 0x02
 READER_ENDPOINTS = SPDP_ENDPOINTS | 0x08 | 0x20
 WRITER_ENDPOINTS = SPDP_ENDPOINTS | 0x04
-KEEPER_ENDPOINTS = WRITER_ENDPOINTS | 0x10
+PORT_STORE_ENDPOINTS = WRITER_ENDPOINTS | 0x10
 """Built-in endpoints that a participant has (9.3.2.12): those of SPDP, and with them the readers of
 SEDP, its writer of publications, or its writers of publications and of subscriptions."""
 

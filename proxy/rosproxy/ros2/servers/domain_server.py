@@ -219,7 +219,8 @@ class DomainServer:
         self._reader.close()
         if self._next_part:
             self._next_part.cancel()
-        # The observer's alone: participants are not to forget the keeper, by which they keep ports.
+        # The observer's alone: participants are not to forget the port store, by which they keep
+        # ports.
         dispose_message = self.domain.own.observer.dispose_message()
         for address in self._groups.joined:
             self._multicast(address, dispose_message)

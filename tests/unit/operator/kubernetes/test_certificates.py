@@ -344,7 +344,7 @@ async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> 
     assert certificate_rotation.pair is first is not None
 
 
-async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_renewal_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
     class Broken:
         every = 1.0
         problems = ()

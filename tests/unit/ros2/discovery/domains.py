@@ -10,7 +10,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, LanRelayLink, Outgoing
-from rosproxy.ros2.discovery.port_keeper import HALF_BITS, WRITERS, halves
+from rosproxy.ros2.discovery.port_store import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -49,7 +49,7 @@ def make_domain(
     judge: Judge = everything,
     both_ways: bool = False,
     ports: PortMap = RANGE,
-    keeper_key: bytes = b"",
+    port_store_key: bytes = b"",
 ) -> Domain:
     settings = DomainSettings(
         number=0,
@@ -62,7 +62,7 @@ def make_domain(
         both_ways=both_ways,
         peers=tuple(HostPort(peer, 7410) for peer in peers),
         relay=LanRelayLink(lan_relay, PROOF) if lan_relay else None,
-        keeper_key=keeper_key,
+        port_store_key=port_store_key,
     )
     return Domain.starting(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
 
@@ -119,30 +119,30 @@ def reached_at(datagram: bytes) -> list[HostPort]:
 
 
 def kept_number(
-    keeper: bytes, prefix: bytes, number: int, writer: int = BuiltinWriter.PUBLICATIONS
+    port_store: bytes, prefix: bytes, number: int, writer: int = BuiltinWriter.PUBLICATIONS
 ) -> bytes:
     """What a participant answers a writer: the number that it expects next."""
     body = struct.pack(">II", writer + 5, writer)
     body += struct.pack("<iIIi", number >> 32, number & 0xFFFFFFFF, 0, 1)
-    return message(submessage(0x0E, 0, keeper), submessage(0x06, 2, body), prefix=prefix)
+    return message(submessage(0x0E, 0, port_store), submessage(0x06, 2, body), prefix=prefix)
 
 
 def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
-    """What a participant answers both writers of the keeper, or of the witness."""
+    """What a participant answers both writers of the port store, or of the witness."""
     pairs = zip(WRITERS, halves(number, bits), strict=True)
     lower, upper = (kept_number(own, prefix, half, writer) for writer, half in pairs)
     return lower + upper[HEADER:]
 
 
 def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:
-    """What a participant answers the keeper of a domain."""
-    keeper = domain.own.keeper
-    return kept_halves(keeper.prefix, prefix, number, keeper.port_bits)
+    """What a participant answers the port store of a domain."""
+    port_store = domain.own.port_store
+    return kept_halves(port_store.prefix, prefix, number, port_store.port_bits)
 
 
 def proof_answer(domain: Domain, prefix: bytes, proof: int) -> bytes:
     """What a participant answers the witness of a domain with a secret."""
-    return kept_halves(domain.own.keeper.witness, prefix, proof, HALF_BITS)
+    return kept_halves(domain.own.port_store.witness, prefix, proof, HALF_BITS)
 
 
 def allowance_left(domain: Domain, source: str) -> float:

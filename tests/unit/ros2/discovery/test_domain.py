@@ -309,9 +309,9 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
 def test_a_participant_says_which_ports_it_had() -> None:
     domain = make_domain()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    answer = kept_answer(domain, A, domain.own.keeper.number([45009, 45004]))
+    answer = kept_answer(domain, A, domain.own.port_store.number([45009, 45004]))
     domain.heard_inside(answer, OTHER, 0.2)
-    assert not domain.own.keeper.prefixes  # from somewhere else it is nobody's word
+    assert not domain.own.port_store.prefixes  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)
     settle(domain, SETTLING)
     ports = {lease.target.port: port for port, (_, lease) in domain.inside.leases.items()}
@@ -338,12 +338,14 @@ def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
     domain = make_domain()
 
     def reminded() -> list[int]:
-        told = [sent for sent in to(meet(domain), INSIDE) if source_prefix(sent) == keeper.prefix]
+        told = [
+            sent for sent in to(meet(domain), INSIDE) if source_prefix(sent) == port_store.prefix
+        ]
         return [beat.first for sent in told for beat in heartbeats(sent)]
 
-    keeper = domain.own.keeper
+    port_store = domain.own.port_store
     numbers = reminded()
-    assert numbers == [*keeper.numbers(A, domain.inside.by_prefix[A].ports).values()]
+    assert numbers == [*port_store.numbers(A, domain.inside.by_prefix[A].ports).values()]
     assert reminded() == []  # not by each announcement
 
 
@@ -353,7 +355,7 @@ def test_participants_are_reminded_until_they_keep_their_ports() -> None:
     told, reminder = domain.own.port_reminders(NOW)
     assert {told.target, reminder.target} == {HostPort(INSIDE, 7410)}
     assert domain.own.port_reminders(NOW)
-    number = domain.own.keeper.number(domain.inside.by_prefix[A].ports)
+    number = domain.own.port_store.number(domain.inside.by_prefix[A].ports)
     domain.heard_inside(kept_answer(domain, A, number), INSIDE, NOW)
     assert domain.own.port_reminders(NOW) == []
 

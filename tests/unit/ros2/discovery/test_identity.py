@@ -55,16 +55,16 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     yield domain.heard_outside(carried(ROBOT, outside), LAN_RELAY.host, NOW)
 
 
-@pytest.mark.parametrize("whose", ["observer", "keeper", "witness"])
+@pytest.mark.parametrize("whose", ["observer", "port-store", "witness"])
 def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> None:
-    """The end of the keeper, told by any machine on the LAN, had inside forget its ports."""
-    domain = make_domain(keeper_key=b"a key")
+    """The end of the port store, told by any machine on the LAN, had inside forget its ports."""
+    domain = make_domain(port_store_key=b"a key")
     meet(domain)
-    keeper = domain.own.keeper
+    port_store = domain.own.port_store
     own = {
         "observer": domain.own.observer.prefix,
-        "keeper": keeper.prefix,
-        "witness": keeper.witness,
+        "port-store": port_store.prefix,
+        "witness": port_store.witness,
     }
     prefix = own[whose]
     (port,) = [p for p, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410]

@@ -137,7 +137,7 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     domain = moved()
 
     sent = meet(domain)
-    assert is_dispose_message(by(domain.own.keeper.prefix, to(sent, INSIDE))[0])
+    assert is_dispose_message(by(domain.own.port_store.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
     parting = settle(domain, NOW)
     meeting = settle(domain, NOW + APART_TIME)
@@ -232,7 +232,7 @@ def test_who_had_no_ports_was_not_there() -> None:
     domain.returning.note_former({A: ()}, domain.inside.by_prefix)
     sent = meet(domain)
     assert domain.inside.by_prefix[A].ports
-    told = by(domain.own.keeper.prefix, to(sent, INSIDE))
+    told = by(domain.own.port_store.prefix, to(sent, INSIDE))
     assert told
     assert not any(map(is_dispose_message, told))
 

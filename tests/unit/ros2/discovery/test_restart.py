@@ -6,7 +6,7 @@ import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.domain_settings import Outgoing
-from rosproxy.ros2.discovery.port_keeper import Keeper
+from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
@@ -50,7 +50,7 @@ C = b"\x01\x0f" + bytes(9) + b"\x07"
 
 def restarted(key: bytes = KEY, peers: tuple[str, ...] = (ROBOT,)) -> Domain:
     """A proxy that has just started; it counts what it refuses."""
-    domain = make_domain(peers=peers, keeper_key=key)
+    domain = make_domain(peers=peers, port_store_key=key)
     domain.refused.note = Reasons()
     return domain
 
@@ -71,13 +71,13 @@ def reasons_of(domain: Domain) -> Reasons:
 
 
 def number_of(ports: list[int]) -> int:
-    """The number of the keeper for these ports, which anyone can compute."""
-    return Keeper.of(HOST, RANGE.listen, 0, 0.0).number(ports)
+    """The number of the port store for these ports, which anyone can compute."""
+    return PortStore.of(HOST, RANGE.listen, 0, 0.0).number(ports)
 
 
 def proof_of(prefix: bytes, ports: list[int], key: bytes = KEY) -> int:
     """The number of the witness, by the key of a process of the proxy."""
-    return Keeper.of(HOST, RANGE.listen, 0, 0.0, key).proof(prefix, ports)
+    return PortStore.of(HOST, RANGE.listen, 0, 0.0, key).proof(prefix, ports)
 
 
 NUMBER = number_of(PORTS)
@@ -87,10 +87,10 @@ PROOF = proof_of(A, PORTS)
 def come(
     domain: Domain, prefix: bytes, address: str, number: int, now: float, proof: int = 1
 ) -> None:
-    """Have a participant announce itself inside, and answer keeper and witness by its numbers."""
+    """Have a participant announce itself inside, and answer with the numbers that it has seen."""
     domain.heard_inside(spdp(prefix, address), address, now)
     domain.heard_inside(kept_answer(domain, prefix, number), address, now)
-    if domain.own.keeper.key:
+    if domain.own.port_store.key:
         domain.heard_inside(proof_answer(domain, prefix, proof), address, now)
 
 
@@ -267,7 +267,7 @@ def test_ports_are_given_once_their_proof_is_known() -> None:
 
 
 def test_a_participant_keeps_its_ports_and_their_proof() -> None:
-    domain = make_domain(keeper_key=KEY)
+    domain = make_domain(port_store_key=KEY)
     meet(domain)
     ports = ports_of(domain, A)
     for answer in (
@@ -400,12 +400,12 @@ def test_what_the_lan_relay_hears_of_itself_is_no_claim() -> None:
 
 
 def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
-    """It waits, answers the keeper, and is refused, since a peer's participant has the prefix."""
+    """It waits, answers the port store, and is refused: a peer's participant has the prefix."""
     domain = restarted()
     domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), LAN_RELAY.host, SETTLING)
     come(domain, A, INSIDE, 1, SETTLING)
-    assert A in domain.own.keeper.prefixes
+    assert A in domain.own.port_store.prefixes
     settle(domain, SETTLING + ANSWER_TIME)
     assert A not in domain.inside.by_prefix
     assert reasons_of(domain)["prefix"]
-    assert A not in domain.own.keeper.prefixes
+    assert A not in domain.own.port_store.prefixes

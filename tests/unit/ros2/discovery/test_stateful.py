@@ -110,7 +110,7 @@ class Neighbours(RuleBasedStateMachine):
             peers=(ROBOT,),
             judge=lambda kind, *_: kind not in self.denied,
             both_ways=True,
-            keeper_key=b"a key",
+            port_store_key=b"a key",
         )
         self.domain.own.observer.prefix = OWN
         self.now = 0.0
@@ -182,9 +182,9 @@ class Neighbours(RuleBasedStateMachine):
     def a_participant_tells_which_ports_it_had(
         self, prefix: bytes, address: str, ports: list[int]
     ) -> None:
-        keeper = self.domain.own.keeper
-        answers = kept_answer(self.domain, prefix, keeper.number(ports))
-        answers += proof_answer(self.domain, prefix, keeper.proof(PREFIXES[0], ports))[20:]
+        port_store = self.domain.own.port_store
+        answers = kept_answer(self.domain, prefix, port_store.number(ports))
+        answers += proof_answer(self.domain, prefix, port_store.proof(PREFIXES[0], ports))[20:]
         if address in NEAR_BY:
             self.inside_announces(answers, address)
         else:
@@ -292,9 +292,9 @@ class Neighbours(RuleBasedStateMachine):
         verdicts = [verdict for p in domain.inside.by_prefix.values() for verdict in p.verdicts]
         assert domain.inside.verdicts.count_by_address.total() == len(verdicts)
         assert {prefix for prefix, _ in domain.own.observer._received} <= prefixes
-        keepers = prefixes | domain.returning.waiting.keys()
-        assert {*domain.own.keeper.prefixes} <= keepers
-        assert domain.ports._ports_claimed.keys() <= keepers
+        known = prefixes | domain.returning.waiting.keys()
+        assert {*domain.own.port_store.prefixes} <= known
+        assert domain.ports._ports_claimed.keys() <= known
         assert domain.fragments.by_prefix.keys() <= prefixes
         sizes = [store.size for store in domain.fragments.by_prefix.values()]
         assert domain.fragments.size == sum(sizes) <= fragments.MOST_OF_ALL

@@ -2,17 +2,18 @@
 
 A reliable reader remembers, of each writer, the number of the next sample that it expects, and says
 so when it is asked by a heartbeat (DDSI-RTPS 2.5, 8.3.8.6 and 8.4.9). So the proxy has a
-participant, the *keeper*, with a writer of SEDP that never writes: it tells each participant inside
-by a heartbeat that all samples before a number are gone, and the number holds its ports. The keeper
-has the same GUID prefix in each process of the proxy, so that the next one asks, and is told.
+participant, the *port store*, with a writer of SEDP that never writes: it tells each participant
+inside by a heartbeat that all samples before a number are gone, and the number holds its ports. The
+port store has the same GUID prefix in each process of the proxy, so that the next one asks, and is
+told.
 
-The keeper has two writers, one for each half of its number. The number is 1 for no ports; else it
-holds each port less the range's first, that of the first port in the lowest bits. A port that is
+The port store has two writers, one for each half of its number. The number is 1 for no ports; else
+it holds each port less the range's first, that of the first port in the lowest bits. A port that is
 added makes neither half smaller, as it has to be. A range that is made longer keeps its first port,
-and a port its bits, up to a length: so the keeper stays the same.
+and a port its bits, up to a length: so the port store stays the same.
 
 Each participant can compute this number for the ports of another one. So a proxy with a secret has
-a second such participant, the *witness*, whose number proves that of the keeper: how many ports
+a second such participant, the *witness*, whose number proves that of the port store: how many ports
 there are, and a keyed hash of the participant's GUID prefix and these ports. The witness's own
 prefix follows from the secret, too: a proxy with another secret asks as another witness.
 
@@ -28,14 +29,14 @@ from hashlib import blake2b, pbkdf2_hmac
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.announcement import KEEPER_ENDPOINTS, announcement, dispose_message
+from rosproxy.ros2.protocol.announcement import PORT_STORE_ENDPOINTS, announcement, dispose_message
 from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
 from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 COUNTS_EACH_SECOND = 4
 LEASE = 24 * 3600.0
-"""Seconds for which participants remember the keeper without hearing it."""
+"""Seconds for which participants remember the port store without hearing it."""
 WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
 """The writers of a participant that keeps a number: for its lower half, and for its upper half."""
 HALF_BITS = 24
@@ -55,7 +56,7 @@ _Writer = tuple[bytes, int]
 """The GUID prefix of a participant of the proxy, and the entity id of its writer."""
 
 
-def keeper_key(secret: str | None) -> bytes:
+def port_store_key(secret: str | None) -> bytes:
     """Return the key of the proofs; empty without a secret. It takes some 40 ms."""
     if not secret:
         return b""
@@ -69,7 +70,7 @@ def halves(number: int, bits: int) -> tuple[int, int]:
 
 
 @dataclass(slots=True)
-class Keeper:
+class PortStore:
     """Keeps ports of a range in participants; ``prefix`` is its own, ``key`` that of the proofs.
 
     ``witness`` is the prefix of the participant that keeps the proofs, empty without a key.
@@ -87,8 +88,8 @@ class Keeper:
     @classmethod
     def of(
         cls, host: str, ports: PortRange, domain: int, unix_offset: float, key: bytes = b""
-    ) -> "Keeper":
-        """Return the keeper of a host, a range and a domain; any process gets the same."""
+    ) -> "PortStore":
+        """Return the port store of a host, a range and a domain; any process gets the same."""
         identity = f"{host} {ports.first} {_width(ports)} {domain}"
         digest = blake2b(identity.encode(), digest_size=PREFIX - 2).digest()
         # A GUID prefix begins with the vendor's id (DDSI 2.2; so in Cyclone DDS, ddsi_init.c).
@@ -124,12 +125,12 @@ class Keeper:
         answers = self._answers.get(prefix, {})
         if any(is_missing[w[0]] and n < answers.get(w, 1) for w, n in wanted.items()):
             # A reader heeds no smaller number (DDSI-RTPS 2.5, 8.4.12.1): it has to forget the
-            # keeper first, and is told the number the next time.
+            # port store first, and is told the number the next time.
             return self.dispose_messages(prefix)
         return self._told(prefix, wanted, reached_at, now)
 
     def dispose_messages(self, prefix: bytes) -> list[bytes]:
-        """What makes a participant forget the keeper, with what it keeps."""
+        """What makes a participant forget the port store, with what it keeps."""
         self.forget(prefix)
         return [dispose_message(own) for own in self._own_prefixes]
 
@@ -190,7 +191,7 @@ class Keeper:
         count = min(len(ports), _most(self.ports))
         if not self.key or not count:
             return 1
-        # The keeper's prefix stands for the proxy, its range and its domain.
+        # The port store's prefix stands for the proxy, its range and its domain.
         content = self.prefix + prefix + self.number(ports).to_bytes(8, "big")
         digest = int.from_bytes(blake2b(content, key=self.key, digest_size=8).digest(), "big")
         lower = digest & _HASH_MASK
@@ -256,7 +257,7 @@ class Keeper:
                 heartbeat(own, prefix, writer, numbers[own, writer], count & 0x7FFFFFFF)
                 for writer in WRITERS
             ]
-            sent.append(announcement(own, [reached_at], LEASE, KEEPER_ENDPOINTS))
+            sent.append(announcement(own, [reached_at], LEASE, PORT_STORE_ENDPOINTS))
             sent.append(beats[0] + b"".join(beat[HEADER:] for beat in beats[1:]))
         return sent
 
