@@ -64,7 +64,7 @@ async def test_strangers_flood_the_master_port(apart, apart_master, make_node):
 
 
 async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node):
-    """Where an operator runs: a new container waits for the news as long as they do.
+    """Where an operator runs: a new container waits for the update as long as they do.
 
     Some call before the operator has told for the first time after the start.
     """

@@ -23,8 +23,8 @@ async def tell(proxy: Proxy, path: str, **fields: Any) -> dict[str, Any]:
     return answer
 
 
-async def news(proxy: Proxy, **fields: Any) -> tuple[int, int, int]:
-    """How many nodes were unregistered, moved and adopted upon some news of containers."""
+async def update(proxy: Proxy, **fields: Any) -> tuple[int, int, int]:
+    """How many nodes were unregistered, moved and adopted upon an update of containers."""
     answer = await tell(proxy, "/containers", **fields)
     assert set(answer) == {"unregistered", "moved", "adopted"}
     return answer["unregistered"], answer["moved"], answer["adopted"]

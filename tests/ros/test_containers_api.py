@@ -131,7 +131,7 @@ def test_nodes_of_a_container_that_is_gone(lab: Lab, library: str, measure: Meas
 
 
 @each_library
-def test_a_node_that_answers_survives_the_news_that_it_is_gone(lab: Lab, library: str) -> None:
+def test_a_node_that_answers_survives_the_update_that_it_is_gone(lab: Lab, library: str) -> None:
     name = lab.unique("alive")
     node = lab.node(library, "c3", "pub", name=name, topic=f"/{name}/t")
     node.wait_for("^ready")
@@ -326,7 +326,7 @@ def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
 
 @pytest.mark.direct
 @each_library
-def test_a_stray_that_registers_through_the_proxy_before_the_news(
+def test_a_stray_that_registers_through_the_proxy_before_the_update(
     lab: Lab, library: str, tmp_path: Path
 ) -> None:
     """Its connection to the master is lost; the next registration takes the others along."""

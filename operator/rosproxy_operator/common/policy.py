@@ -20,7 +20,7 @@ _AWAIT = "ROSPROXY_AWAIT_POLICY"
 POLICY_VARIABLES = (_LAYERS, _AWAIT)
 """The variables that a proxy gets at its creation; they are not part of its fingerprint."""
 AWAITED = 3.0
-"""Seconds that a proxy waits for its operator: as long as it waits for news of a new caller."""
+"""Seconds that a proxy waits for its operator, as for an update about a new caller."""
 MOST_AUTHORS_RULES = MOST_RULES // 2
 """Rules of one author, so that those of the administrator and of another always fit together."""
 LONGEST_VARIABLE = 96 * 1024

@@ -1,7 +1,7 @@
 """Keeping each proxy up to date about the containers on its networks, independently of others.
 
 Which addresses may use a proxy as their master is told first and alone: the call of a new container
-waits for that, while all other news may take a proxy long (it asks nodes and its master). Before
+waits for that, while all other updates may take a proxy long (it asks nodes and its master). Before
 both it is told its policy, if that has changed: no container is let in before its policy is known.
 
 A proxy for ROS 2 that had to leave its ports is told which participants had some of them, so that
@@ -23,7 +23,7 @@ from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
 from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
 from rosproxy_operator.docker.host_document import STARTING
 from rosproxy_operator.docker.planner.model import Member
-from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, network_facts
+from rosproxy_operator.docker.planner.proxy_update import NetworkFacts, ProxyUpdate, network_facts
 from rosproxy_operator.docker.settings import PlanSettings
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
@@ -37,7 +37,7 @@ class ProxyUpdater:
     """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
 
     After each look the proxy is told its policy if that has changed, and who may use it as its
-    master, whether or not that has, asked for its nodes, and told what is new (`ProxyNews`).
+    master, whether or not that has, asked for its nodes, and told what is new (`ProxyUpdate`).
     ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
     ``leases`` are what its participants of ROS 2 have; it is told the ``former_leases`` until it
     has some.
@@ -59,14 +59,14 @@ class ProxyUpdater:
         self._name = name
         self._answered = answered
         self._session = ProxySession(proxies, access.admin, access.token)
-        self._news = ProxyNews()
+        self._update = ProxyUpdate()
         self._status = ProxyStatus()
         self._looked = asyncio.Event()
         self._selecting = asyncio.Event()
 
     def update(self, network_facts: NetworkFacts) -> None:
         """Take note of what a look has found."""
-        self._news.look(network_facts, time.monotonic())
+        self._update.look(network_facts, time.monotonic())
         self._looked.set()
         self._selecting.set()
 
@@ -83,9 +83,9 @@ class ProxyUpdater:
         while True:
             await self._selecting.wait()
             self._selecting.clear()
-            addresses = tuple(self._news.facts.selected)
+            addresses = tuple(self._update.facts.selected)
             try:
-                await self._session.tell_policy(self._news.policy)
+                await self._session.tell_policy(self._update.policy)
                 former_leases = {} if self.leases else self._former_leases
                 callers = AllowedCallers(addresses, former_leases=former_leases)
                 await self._session.tell_callers(callers)
@@ -105,7 +105,7 @@ class ProxyUpdater:
         """Tell what else is new."""
         failures = 0
         while True:
-            pause = self._news.next_due(time.monotonic())
+            pause = self._update.next_due(time.monotonic())
             if failures:
                 pause = PAUSES[min(failures, len(PAUSES)) - 1]
             with contextlib.suppress(TimeoutError):
@@ -131,13 +131,13 @@ class ProxyUpdater:
         status = self._status
         self.leases = leases(status)
         # The facts are not older than need be: its nodes may have come since the last look.
-        address = self._news.facts.master_address
+        address = self._update.facts.master_address
         if address and status.master.address != address:
             await self._session.tell_master_address(address)
             text = "%s: its master is now at %s"
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
-        body = self._news.body(inside_addresses(status), now)
+        body = self._update.body(inside_addresses(status), now)
         if isinstance(refusal, PolicyRefused):
             body.pop("arrived", None)  # adopted nodes would not be kept to the policy
         if body:
@@ -146,13 +146,13 @@ class ProxyUpdater:
             counts = {change: answer.get(change) for change in ("unregistered", "moved", "adopted")}
             if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
                 log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
-        self._news.mark_delivered(now)
+        self._update.mark_delivered(now)
         self._heard(refusal)
 
     async def _policy_refusal(self) -> PolicyRefused | None:
         """Tell the policy; why the proxy does not take it, if it does not. Raises ProxyError."""
         try:
-            await self._session.tell_policy(self._news.policy)
+            await self._session.tell_policy(self._update.policy)
         except PolicyRefused as error:
             return error
         return None

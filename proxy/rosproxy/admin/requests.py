@@ -56,7 +56,7 @@ class ArrivedContainer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         msgspec.structs.force_setattr(self, "names", frozenset(map(str.lower, self.names)))
 
 
-class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ContainerUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The body of ``POST /containers``: what has become of containers.
 
     ``gone``: addresses that no container has any more. ``moved``: old address to new address.
@@ -112,7 +112,7 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             msgspec.structs.force_setattr(self, "selected", tuple(selected))
 
 
-class PolicyNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PolicyUpdate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The body of ``POST /policy``: the layers of rules that replace those told before."""
 
     layers: tuple[WrittenLayer, ...]

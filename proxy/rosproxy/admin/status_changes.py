@@ -14,7 +14,7 @@ from functools import cached_property
 
 from rosproxy.admin.status_bounds import encode
 from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.admin.status_news import version_of
+from rosproxy.admin.status_version import version_of
 from rosproxy.net.fair_slots import FairSlots
 
 POLL_INTERVAL = 0.5

@@ -12,7 +12,7 @@ from typing import Any
 from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.access.layers import PolicyMode, read_layer
 from rosproxy.access.policy_file import LOOK_INTERVAL, OPTION, PolicyFile
-from rosproxy.admin.requests import BodyError, PolicyNews, read_body
+from rosproxy.admin.requests import BodyError, PolicyUpdate, read_body
 from rosproxy.admin.status_document import to_json
 from rosproxy.app.stacks import Stack
 from rosproxy.runtime import Runtime
@@ -66,7 +66,7 @@ class PolicySources:
 
     def _use_operator_layers(self, body: Any) -> None:
         """Take in the rules of a post. Raises BodyError."""
-        written = read_body(body, PolicyNews).layers
+        written = read_body(body, PolicyUpdate).layers
         try:
             self._runtime.policy.use_operator_layers([read_layer(layer) for layer in written])
         except ValueError as error:

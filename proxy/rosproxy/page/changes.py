@@ -12,25 +12,25 @@ def changes(before: Json, after: Json) -> Json:
     Of nodes and links those that are new or differ, and None for those that are gone; of the rest
     all that differs.
     """
-    news: Json = {}
+    update: Json = {}
     for table in _TABLES:
         old = before[table]
         new = after[table]
         rows = {key: row for key, row in new.items() if old.get(key) != row}
         rows |= dict.fromkeys(old.keys() - new.keys())
         if rows:
-            news[table] = rows
+            update[table] = rows
     keys = before.keys() | after.keys()
-    news |= {
+    update |= {
         key: after.get(key) for key in keys.difference(_TABLES) if before.get(key) != after.get(key)
     }
-    return news
+    return update
 
 
-def changed(before: Json, news: Json) -> Json:
+def changed(before: Json, update: Json) -> Json:
     """The document with these changes."""
-    after = {**before, **news}
+    after = {**before, **update}
     for table in _TABLES:
-        rows = {**before[table], **news.get(table, {})}
+        rows = {**before[table], **update.get(table, {})}
         after[table] = {key: row for key, row in rows.items() if row is not None}
     return after

@@ -94,10 +94,10 @@ class Feed:
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within), self._renewed:
-                await self._renewed.wait_for(lambda: self._closed or self._is_news(former))
+                await self._renewed.wait_for(lambda: self._closed or self._is_update(former))
         if self._closed:
             raise Ended
-        return self._newest if self._is_news(former) else None
+        return self._newest if self._is_update(former) else None
 
     async def close(self) -> None:
         """Let everybody go."""
@@ -108,7 +108,7 @@ class Feed:
         async with self._renewed:
             self._renewed.notify_all()
 
-    def _is_news(self, former: Json | None) -> bool:
+    def _is_update(self, former: Json | None) -> bool:
         return self._newest is not None and self._newest is not former
 
     def _begin(self) -> None:

@@ -7,7 +7,7 @@ What the subscriber has counted has arrived. The proxy's counter stops only once
 the publisher's tells what was to be sent.
 
 The proxy's counter is read each second, the nodes' as seldom as a thousand of them need. So what
-the proxy relays is the news, as long as nothing shows that it does not arrive.
+the proxy relays counts, as long as nothing shows that it does not arrive.
 """
 
 from collections.abc import Iterable, Mapping
@@ -22,7 +22,7 @@ STALLED = 5.0
 MISSED = 2
 """Messages that must have been sent meanwhile: one may be under way."""
 LATE_ROUNDS = 2
-"""Rounds of questions after which what a node has counted is no news, if it answers no more."""
+"""Rounds of questions after which the counts of a node that answers no more are not shown."""
 FLOWS = 3.0
 """Seconds after a message in which one is said to come just now."""
 Key = tuple[str, str, str]

@@ -184,7 +184,7 @@ def is_quiet_service(name: str) -> bool:
 
 
 def rounded(value: float) -> float:
-    """A measure as it is shown: what changes in the third digit alone is no news."""
+    """A measure as it is shown: a change in the third digit alone is not sent."""
     return float(f"{value:.2g}")
 
 

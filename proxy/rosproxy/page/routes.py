@@ -171,9 +171,9 @@ class Page:
         """An event. Most watchers have seen the same, so that it is encoded once."""
         cached = self._encoded
         if cached is None or cached[0] is not former or cached[1] is not newest:
-            news = newest if former is None else changes(former, newest)
+            update = newest if former is None else changes(former, newest)
             kind = "all" if former is None else "change"
-            data = json.dumps(news, separators=(",", ":"))
+            data = json.dumps(update, separators=(",", ":"))
             self._encoded = cached = (former, newest, f"event: {kind}\ndata: {data}\n\n".encode())
         return cached[2]
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from rosproxy.admin.admin_server import Action
 from rosproxy.admin.requests import (
-    ContainerNews,
+    ContainerUpdate,
     EmptyBody,
     EnforcementCounts,
     MasterAddress,
@@ -184,7 +184,7 @@ class Ros1:
     def actions(self) -> Mapping[str, Action]:
         """What posts at the admin endpoint do, by their paths."""
         return {
-            "/containers": self._handle_news,
+            "/containers": self._handle_update,
             "/master-address": self._set_master_address,
             "/retire": self._retire,
         }
@@ -251,18 +251,18 @@ class Ros1:
             return None
         return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
 
-    async def _handle_news(self, body: Any) -> dict[str, Any]:
+    async def _handle_update(self, body: Any) -> dict[str, Any]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
 
         The selected addresses apply at once: nodes wait for that, and it needs no master.
         """
-        news = read_body(body, ContainerNews)
-        if news.selected is not None:
-            self._callers.select(news.selected)
-        if not news.tells_events:
+        update = read_body(body, ContainerUpdate)
+        if update.selected is not None:
+            self._callers.select(update.selected)
+        if not update.tells_events:
             return {"moved": 0, "unregistered": 0, "adopted": 0}
-        arrived = [(container.address, container.names) for container in news.arrived]
-        return {**await self._containers.handle(news.gone, news.moved, arrived)}
+        arrived = [(container.address, container.names) for container in update.arrived]
+        return {**await self._containers.handle(update.gone, update.moved, arrived)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
         """``POST /retire``: how many nodes were unregistered."""

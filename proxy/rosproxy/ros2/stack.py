@@ -14,7 +14,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.admin.admin_server import Action
 from rosproxy.admin.common_status import with_hidden
 from rosproxy.admin.requests import (
-    ContainerNews,
+    ContainerUpdate,
     EmptyBody,
     EnforcementCounts,
     PortProbe,
@@ -44,7 +44,7 @@ from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_watch import DomainWatch
 from rosproxy.ros2.protocol.relay_proof import RelayProof
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
-from rosproxy.ros2.registry.selected import NEWS_TIMEOUT
+from rosproxy.ros2.registry.selected import UPDATE_TIMEOUT
 from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
 from rosproxy.ros2.status import Ros2State
 from rosproxy.ros2.udp_probe import try_ports, try_udp
@@ -139,7 +139,7 @@ class Ros2:
                 self._is_inside,
                 self.plane.syncer.note_change,
                 # An operator tells whom it selects by the admin endpoint, which takes its token.
-                NEWS_TIMEOUT if settings.admin_token_hash else 0.0,
+                UPDATE_TIMEOUT if settings.admin_token_hash else 0.0,
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
@@ -182,25 +182,25 @@ class Ros2:
     @property
     def actions(self) -> Mapping[str, Action]:
         """What posts at the admin endpoint do, by their paths."""
-        return {"/containers": self._handle_news, "/retire": self._retire}
+        return {"/containers": self._handle_update, "/retire": self._retire}
 
-    async def _handle_news(self, body: Any) -> dict[str, Any]:
+    async def _handle_update(self, body: Any) -> dict[str, Any]:
         """``POST /containers``: how many participants were ended.
 
         One whose container has moved is ended as well: at its new address it is heard by itself.
         """
-        news = read_body(body, ContainerNews)
+        update = read_body(body, ContainerUpdate)
         self._look_at_networks()  # the proxy may have just joined that of new containers
         # Before anybody is selected: those who wait for that get their ports at once.
         for server in self.servers:
-            server.note_former(news.former_ports)
-        if news.selected is not None:
+            server.note_former(update.former_ports)
+        if update.selected is not None:
             for server in self.servers:
-                server.select(news.selected)
-        if (peers := news.ros2_peers) is not None and peers != self._peers:
+                server.select(update.selected)
+        if (peers := update.ros2_peers) is not None and peers != self._peers:
             self._peers = peers
             await self._find_peers()
-        former_addresses = {*news.gone, *news.moved}
+        former_addresses = {*update.gone, *update.moved}
         return {"unregistered": sum(server.end(former_addresses) for server in self.servers)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.node_client import ProbeAnswer
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.setting_kinds import hash_token
-from tests.integration.admin_calls import news, post, tell
+from tests.integration.admin_calls import post, tell, update
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
@@ -154,10 +154,10 @@ async def test_a_body_that_is_too_long(proxy: Proxy) -> None:
     assert (await post(proxy, "/containers", b" " * (1024 * 1024))).status == 200
 
 
-async def test_no_news(proxy: Proxy) -> None:
-    assert await news(proxy) == (0, 0, 0)
-    assert await news(proxy, gone=[NODE], moved={NODE: OTHER_NODE}) == (0, 0, 0)
-    assert await news(proxy, arrived=[{"address": NODE, "names": ["c1"]}]) == (0, 0, 0)
+async def test_no_update(proxy: Proxy) -> None:
+    assert await update(proxy) == (0, 0, 0)
+    assert await update(proxy, gone=[NODE], moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    assert await update(proxy, arrived=[{"address": NODE, "names": ["c1"]}]) == (0, 0, 0)
 
 
 async def populate(proxy: Proxy, node: FakeNode) -> None:
@@ -181,14 +181,14 @@ async def test_a_container_that_is_gone(
     dead = await make_node()
     alive = await make_node("/alive", OTHER_NODE)
     await populate(proxy, dead)
-    await alive.publish(proxy.master, "/news")
+    await alive.publish(proxy.master, "/update")
     lease = proxy.lease(dead)
     await dead.stop()
-    assert await news(proxy, gone=[NODE, OTHER_NODE, THIRD_NODE]) == (1, 0, 0)
-    assert everything(master) == ["/news"]
+    assert await update(proxy, gone=[NODE, OTHER_NODE, THIRD_NODE]) == (1, 0, 0)
+    assert everything(master) == ["/update"]
     assert await refuses(lease)
-    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
-    assert await greet(proxy.lease(alive), topic_header("/news"))
+    assert await update(proxy, gone=[NODE]) == (0, 0, 0)
+    assert await greet(proxy.lease(alive), topic_header("/update"))
 
 
 @pytest.mark.parametrize("was_unregistered", [False, True])
@@ -206,7 +206,7 @@ async def test_a_node_whose_container_is_gone_is_no_fault(
     else:
         await node.stop()
     await until(lambda: proxy.metric("nodes_down", node=node.name), "it is missed")
-    await news(proxy, gone=[NODE])
+    await update(proxy, gone=[NODE])
     await until(lambda: endpoint.state == "ended", "it is known to have ended")
     assert not proxy.metric("nodes_down", node=node.name)
 
@@ -221,22 +221,22 @@ async def test_a_node_that_hangs_is_not_waited_for(
     await node.publish(proxy.master)
     node.hang = True
     before = proxy.ros1.context.now()
-    assert await news(proxy, gone=[NODE]) == (1, 0, 0)
+    assert await update(proxy, gone=[NODE]) == (1, 0, 0)
     assert proxy.ros1.context.now() - before < 9  # less than its probe may take
     assert not everything(master)
-    node.hang = False  # the news was wrong
+    node.hang = False  # the update was wrong
     await until(lambda: master.holds("publishers", "/chatter"), "it is registered again")
 
 
 async def test_a_node_that_has_just_registered_may_take_its_time(
     make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A restarted container has its address again before the news that it was gone."""
+    """A restarted container has its address again before the update that it was gone."""
     monkeypatch.setattr("rosproxy.ros1.upkeep.containers.SECOND_CHANCE", 0.6)
     proxy = await make_proxy(**PATIENT)
     await node.publish(proxy.master)
     node.hang = True
-    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    assert await update(proxy, gone=[NODE]) == (0, 0, 0)
     assert not await refuses(proxy.lease(node))
     assert everything(master)
     await until(lambda: not everything(master), "it had its chance")
@@ -249,7 +249,7 @@ async def test_its_open_connections_end(make_proxy: MakeProxy, node: FakeNode) -
         await wire.send(topic_header())
         await read_header(wire)
         await node.slave.stop()
-        assert await news(proxy, gone=[NODE]) == (1, 0, 0)
+        assert await update(proxy, gone=[NODE]) == (1, 0, 0)
         assert await wire.end() == "closed"
 
 
@@ -275,16 +275,16 @@ async def test_a_port_that_a_living_node_got_meanwhile_keeps_its_connections(
         return await probe(slave, *timeout)
 
     monkeypatch.setattr(proxy.ros1.context.nodes, "probe", slow_probe)
-    told = asyncio.create_task(news(proxy, gone=[NODE]))
+    told = asyncio.create_task(update(proxy, gone=[NODE]))
     await asked.wait()
-    await alive.publish(proxy.master, "/news")
+    await alive.publish(proxy.master, "/update")
     assert proxy.lease(alive)[1] == port
     async with connect(proxy.lease(alive)) as wire:
-        await wire.send(topic_header("/news"))
+        await wire.send(topic_header("/update"))
         await read_header(wire)
         answered.set()
         await told
-        assert await greet(proxy.lease(alive), topic_header("/news"))
+        assert await greet(proxy.lease(alive), topic_header("/update"))
         assert not wire.reader.at_eof()
 
 
@@ -297,7 +297,7 @@ async def test_another_process_at_an_address_that_is_gone(
     await until(lambda: proxy.endpoint(node).health.pid, "it was probed")
     node.pid += 1
     node.published.clear()
-    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    assert await update(proxy, gone=[NODE]) == (0, 0, 0)
     await until(lambda: not everything(master), "what the former had is taken back")
 
 
@@ -307,7 +307,7 @@ async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
     proxy = await make_proxy(cleanup_after=0.0, linger=0.2)
     await node.publish(proxy.master)
     node.hang = True
-    await news(proxy, gone=[NODE])
+    await update(proxy, gone=[NODE])
     await until(lambda: not len(proxy.ros1.context.registry), "the port is free again")
 
 
@@ -325,7 +325,7 @@ async def test_a_master_that_is_away_hears_of_it_later(
     assert await refuses(lease)
     await master.start()
     await until(lambda: not everything(master), "it is unregistered by itself")
-    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    assert await update(proxy, gone=[NODE]) == (0, 0, 0)
 
 
 class Container:
@@ -370,7 +370,7 @@ async def test_a_container_that_has_moved(
     lease = proxy.lease(node)
     uri = proxy.uri(node)
     await container.move(OTHER_NODE)
-    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
+    assert await update(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
     assert (proxy.lease(node), proxy.uri(node)) == (lease, uri)
     for kind, name in [("publishers", "/chatter"), ("subscribers", "/back"), ("params", "/rate")]:
         assert master.holds(kind, name) == [uri]
@@ -380,7 +380,7 @@ async def test_a_container_that_has_moved(
     assert (await greet(lease, topic_header()))["callerid"] == "/talker"
     assert (await greet(lease, service_header()))["callerid"] == "/talker"
     assert not [call for call in node.calls if call[0] == "shutdown"]
-    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    assert await update(proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
 
 
 async def test_it_goes_on_calling_itself_what_it_did(
@@ -389,7 +389,7 @@ async def test_it_goes_on_calling_itself_what_it_did(
     proxy = container.proxy
     node = container.node
     await container.move(OTHER_NODE)
-    await news(proxy, moved={NODE: OTHER_NODE})
+    await update(proxy, moved={NODE: OTHER_NODE})
     await node.publish(proxy.master, "/more")
     assert master.holds("publishers", "/more") == [proxy.uri(node)]
     assert len(proxy.ros1.context.registry) == 1
@@ -403,7 +403,7 @@ async def test_it_goes_on_calling_itself_what_it_did(
 
 async def test_its_subscriptions_are_told_to_connect_again(container: Container) -> None:
     await container.move(OTHER_NODE)
-    await news(container.proxy, moved={NODE: OTHER_NODE})
+    await update(container.proxy, moved={NODE: OTHER_NODE})
     assert container.node.updates("/back")[:2] == [[], []]
 
 
@@ -413,13 +413,13 @@ async def test_another_process_at_the_new_address_is_not_the_same(
     before = container.proxy.uri(container.node)
     await container.move(OTHER_NODE)
     container.node.pid += 1
-    assert await news(container.proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    assert await update(container.proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
     assert master.holds("publishers", "/chatter") == [before]
 
 
 async def test_a_new_address_outside_of_all_inside_networks(container: Container) -> None:
     await container.move(OUTSIDE)
-    assert await news(container.proxy, moved={NODE: OUTSIDE}) == (0, 0, 0)
+    assert await update(container.proxy, moved={NODE: OUTSIDE}) == (0, 0, 0)
 
 
 async def test_it_has_registered_from_its_new_address_already(
@@ -431,7 +431,7 @@ async def test_it_has_registered_from_its_new_address_already(
     await container.move(OTHER_NODE)
     await node.publish(proxy.master, "/more")
     assert master.holds("publishers", "/chatter") == []
-    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    assert await update(proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
     uri = proxy.uri(node)
     for name in ("/more", "/chatter", "/rosout"):
         assert master.holds("publishers", name) == [uri]
@@ -457,10 +457,10 @@ async def test_a_container_that_is_back_elsewhere(container: Container, master: 
     proxy = container.proxy
     node = container.node
     await node.stop()
-    assert await news(proxy, gone=[NODE]) == (1, 0, 0)
+    assert await update(proxy, gone=[NODE]) == (1, 0, 0)
     assert not everything(master)
     await container.move(OTHER_NODE)
-    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
+    assert await update(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
     assert master.holds("services", "/add")
 

@@ -79,12 +79,12 @@ class Stream:
         """Take in one event."""
         from rosproxy.page.changes import changed
 
-        kind, news = await self.event()
+        kind, update = await self.event()
         self.kinds.append(kind)
         if kind == "all":
-            self.document = news
+            self.document = update
         elif kind == "change":
-            self.document = changed(self.document, news)
+            self.document = changed(self.document, update)
 
     async def link(self, key: str, **wanted: Any) -> dict[str, Any]:
         """A link, once it is so."""
@@ -394,7 +394,9 @@ async def test_a_proxy_whose_master_is_away_is_shown(
         assert page.document["findings"][0]["severity"] == "error"
 
 
-async def test_news_of_containers_go_on_while_a_page_is_open(proxy: Proxy, node: FakeNode) -> None:
+async def test_updates_of_containers_go_on_while_a_page_is_open(
+    proxy: Proxy, node: FakeNode
+) -> None:
     await node.publish(proxy.master)
     async with opened(proxy) as page:
         await page.link("topic /chatter /talker ")

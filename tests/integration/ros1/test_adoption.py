@@ -11,7 +11,7 @@ from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.clients.master_client import MasterClient, Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind
-from tests.integration.admin_calls import news, post
+from tests.integration.admin_calls import post, update
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     NODE,
@@ -36,7 +36,7 @@ def container(address: str = NODE, *names: str) -> dict[str, Any]:
 
 async def adopt(proxy: Proxy, *containers: dict[str, Any]) -> int:
     """How many nodes are adopted when containers arrive."""
-    return (await news(proxy, arrived=containers or [container()]))[2]
+    return (await update(proxy, arrived=containers or [container()]))[2]
 
 
 async def register_directly(master: FakeMaster, node: FakeNode) -> None:
@@ -267,7 +267,7 @@ async def test_one_node_that_can_not_be_adopted_does_not_stop_the_others(
     assert not shutdowns(node, other)
 
 
-async def test_it_registers_through_the_proxy_before_the_news(
+async def test_it_registers_through_the_proxy_before_the_update(
     proxy: Proxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     node = await make_node("/talker", NODE, "c1.invalid")

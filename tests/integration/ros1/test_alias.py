@@ -15,7 +15,7 @@ from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers import callers
 from rosproxy.setting_kinds import hash_token
 from tests.integration.admin.test_admin import metrics
-from tests.integration.admin_calls import news
+from tests.integration.admin_calls import update
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     MASTER,
@@ -579,7 +579,7 @@ async def test_only_tcpros_is_relayed(proxy: Proxy, robot: FakeNode) -> None:
 async def test_only_those_who_are_selected_are_let_in(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[0] == 1
-    await news(proxy, selected=[OTHER_NODE])
+    await update(proxy, selected=[OTHER_NODE])
     assert (await rpc(slave(robot), "getPid", "/tool", source=OTHER_NODE))[0] == 1
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) in ("closed", "reset")
 
@@ -587,7 +587,7 @@ async def test_only_those_who_are_selected_are_let_in(proxy: Proxy, robot: FakeN
 async def test_an_alias_port_waits_for_an_operator_that_has_told_nothing_yet(
     make_proxy: MakeProxy, master: FakeMaster, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 30.0)
     operated = behind_its_name(master, admin_token_hash=hash_token("the operator's"))
     proxy = await make_proxy(**operated)
     assert await look_up(proxy, robot) == robot.uri  # by a program on its own machine
@@ -595,7 +595,7 @@ async def test_an_alias_port_waits_for_an_operator_that_has_told_nothing_yet(
     both = [asyncio.create_task(knock(slave(robot), ask, source)) for source in (NODE, OTHER_NODE)]
     assert (await rpc(proxy.master, "getPid", "/doctor", source="127.0.0.1"))[0] == 1
     assert not any(asked.done() for asked in both)
-    await news(proxy, selected=[NODE])
+    await update(proxy, selected=[NODE])
     assert await both[0] == "answered"
     assert await both[1] in _CLOSED
     assert await knock(slave(robot), ask, NODE) == "answered"

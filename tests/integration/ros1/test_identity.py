@@ -12,7 +12,7 @@ from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.servers import callers
 from rosproxy.setting_kinds import hash_token
 from tests.integration.admin.test_admin import metrics
-from tests.integration.admin_calls import news, post, tell
+from tests.integration.admin_calls import post, tell, update
 from tests.integration.claims import claim, silent_servers
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
@@ -99,13 +99,13 @@ async def test_programs_on_the_proxys_own_machine_are_let_in(proxy: Proxy) -> No
 async def test_where_an_operator_selects_only_its_containers_are_let_in(
     make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 0.05)
     proxy = await make_proxy(linger=60)
     node = await make_node()
     other = await make_node("/other", OTHER_NODE)
     assert (await node.publish(proxy.master))[0] == 1
     assert proxy.app.status()["settings"]["selected"] is None
-    assert await news(proxy, selected=[OTHER_NODE]) == (0, 0, 0)
+    assert await update(proxy, selected=[OTHER_NODE]) == (0, 0, 0)
     assert proxy.app.status()["settings"]["selected"] == 1
     assert (await metrics(proxy))["rosproxy_selected_addresses"] == 1
     body = xml("registerPublisher", node.name, "/more", "x/Y", node.uri)
@@ -118,10 +118,10 @@ async def test_where_an_operator_selects_only_its_containers_are_let_in(
     assert (await other.publish(proxy.master))[0] == 1
     # What it has stays: only the operator's "gone" ends that.
     assert await proxy.serves(node)
-    # Other news leave the selection as it is; nobody is selected by an empty one.
-    await news(proxy, gone=[THIRD_NODE])
+    # Other updates leave the selection as it is; an empty one selects no address.
+    await update(proxy, gone=[THIRD_NODE])
     assert (await other.publish(proxy.master))[0] == 1
-    await news(proxy, selected=[])
+    await update(proxy, selected=[])
     assert (await exchange(proxy.master, request(body), OTHER_NODE)).status == 403
     # A proxy that is started again knows nothing of it yet, and serves whom it served.
     await proxy.restart()
@@ -129,17 +129,17 @@ async def test_where_an_operator_selects_only_its_containers_are_let_in(
 
 
 @pytest.mark.usefixtures("_no_source_is_own")
-async def test_a_new_container_waits_for_the_news_and_loses_nothing(
+async def test_a_new_container_waits_for_the_update_and_loses_nothing(
     proxy: Proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
-    await news(proxy, selected=[])
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 30.0)
+    await update(proxy, selected=[])
     call_ = asyncio.create_task(node.publish(proxy.master))
     waiting = proxy.ros1._callers
     await until(lambda: waiting._waiting.total() == 1, "the call waits")
-    await news(proxy, selected=[OTHER_NODE])
+    await update(proxy, selected=[OTHER_NODE])
     assert not call_.done()
-    await news(proxy, selected=[OTHER_NODE, NODE])
+    await update(proxy, selected=[OTHER_NODE, NODE])
     assert (await call_)[0] == 1
     assert waiting._waiting.total() == 0
     assert proxy.metric("strangers_total", standing="unselected") == 0
@@ -161,7 +161,7 @@ async def test_nobody_slips_in_before_an_operator_has_told_whom_it_selects(
     make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For some tenths of a second after each start all of the inside networks were let in."""
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 30.0)
     proxy = await make_proxy(**BY_AN_OPERATOR)
     node = await make_node()
     stranger = await make_node("/stranger", OTHER_NODE)
@@ -170,8 +170,8 @@ async def test_nobody_slips_in_before_an_operator_has_told_whom_it_selects(
     bad = asyncio.create_task(exchange(proxy.master, body, OTHER_NODE))
     assert (await rpc(proxy.master, "getPid", "/doctor", source="127.0.0.1"))[0] == 1
     assert (good.done(), bad.done()) == (False, False)
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
-    await news(proxy, selected=[NODE])
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 0.05)
+    await update(proxy, selected=[NODE])
     assert (await good)[0] == 1
     assert (await bad).status == 403
     assert {name for row in proxy.app.status()["nodes"] for name in row["nodes"]} == {node.name}
@@ -181,13 +181,13 @@ async def test_nobody_slips_in_before_an_operator_has_told_whom_it_selects(
 async def test_an_operator_that_is_away_stops_nobody(
     make_proxy: MakeProxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.3)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 0.3)
     clock = asyncio.get_running_loop().time
     began = clock()
     proxy = await make_proxy(**BY_AN_OPERATOR)
     assert (await node.publish(proxy.master))[0] == 1
     assert clock() - began > 0.3
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 3600.0)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 3600.0)
     async with asyncio.timeout(60):
         assert (await node.publish(proxy.master))[0] == 1
     assert (await exchange(proxy.master, request(xml("getPid", "/n")), OUTSIDE)).status == 403
@@ -197,10 +197,10 @@ async def test_an_operator_that_is_away_stops_nobody(
 async def test_no_more_than_so_many_calls_wait(
     proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 30.0)
     monkeypatch.setattr(callers, "MOST_WAITING_EACH", 2)
     monkeypatch.setattr(callers, "MOST_WAITING", 3)
-    await news(proxy, selected=[])
+    await update(proxy, selected=[])
     waiting = proxy.ros1._callers._waiting
     body = request(xml("getPid", "/n"))
     sources = [NODE, NODE, OTHER_NODE]
@@ -208,7 +208,7 @@ async def test_no_more_than_so_many_calls_wait(
     await until(lambda: waiting.total() == 3, "the calls wait")
     for source in (NODE, THIRD_NODE):
         assert (await exchange(proxy.master, body, source)).status == 403
-    await news(proxy, selected=[NODE, OTHER_NODE])
+    await update(proxy, selected=[NODE, OTHER_NODE])
     assert [(await call_).status for call_ in calls] == [200] * 3
 
 
@@ -216,7 +216,7 @@ async def test_no_more_than_so_many_calls_wait(
 async def test_the_selection_is_taken_in_while_the_master_is_away(
     make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
+    monkeypatch.setattr(callers, "UPDATE_TIMEOUT", 0.05)
     proxy = await make_proxy(master_uri="http://127.0.1.1:9")
     reply = await post(proxy, "/containers", f'{{"gone": ["{NODE}"], "selected": []}}')
     assert reply.status == 503
@@ -340,7 +340,7 @@ async def test_so_is_one_that_a_gateway_calls_by_another_name(
 async def test_the_selection_counts_for_addresses_that_others_register_too(
     proxy: Proxy, make_node: MakeNode
 ) -> None:
-    await news(proxy, selected=[HIDDEN])
+    await update(proxy, selected=[HIDDEN])
     assert (await publish(await make_node("/other", OTHER_NODE), proxy))[0] == 1
     assert list(proxy.ros1.context.registry) == []
 
@@ -493,7 +493,7 @@ async def test_what_an_operator_selects_is_recovered_wherever_it_lies(
     )
     await until(lambda: proxy.app.status()["master"]["up"], "the master is found")
     assert list(proxy.ros1.context.registry) == []
-    await news(proxy, selected=[NODE])
+    await update(proxy, selected=[NODE])
     await until(lambda: len(proxy.ros1.context.registry), "the node is found")
     await until(lambda: proxy.serves(node), "the node is served")
     assert proxy.uri(node) == uri == master.nodes[node.name]
@@ -523,7 +523,7 @@ async def test_a_hundred_uris_of_one_node_are_not_all_remembered(
     assert not await refuses((PROXY, proxy.endpoint(node).port))
 
 
-async def test_news_of_a_node_that_is_gone_do_not_close_its_port_to_the_next(
+async def test_an_update_that_a_node_is_gone_does_not_close_its_port_to_the_next(
     make_proxy: MakeProxy, make_node: MakeNode
 ) -> None:
     """A probe of a dead node ended after its port had been given to one that lives."""

@@ -147,7 +147,7 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
 ):
     proxy = await make_proxy(**IMPATIENT)
     await node.publish(proxy.master)
-    await node.subscribe(proxy.master, "/news")
+    await node.subscribe(proxy.master, "/update")
     await node.serve(proxy.master)
     await node.call(proxy.master, "subscribeParam", node.uri, "/p")
     uri = proxy.uri(node)
@@ -155,15 +155,15 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
     node.hang = True
     await until(lambda: not master.nodes, "it is cleaned up")
     far = f"http://{OUTSIDE}:4000/"
-    await rpc(master.uri, "registerPublisher", "/far", "/news", "std_msgs/String", far)
+    await rpc(master.uri, "registerPublisher", "/far", "/update", "std_msgs/String", far)
     await looks(master)
     node.hang = False
     await until(lambda: rpc_works(lease), "the port is served again")
     await until(lambda: master.holds("params", "/p"), "all is registered again")
     assert master.holds("publishers", "/chatter") == [uri]
-    assert master.holds("subscribers", "/news") == [uri]
+    assert master.holds("subscribers", "/update") == [uri]
     assert master.holds("services", "/add") == [f"rosrpc://{HOST}:{lease[1]}"]
-    await until(lambda: node.updates("/news")[-1:] == [[far]], "it learns what it has missed")
+    await until(lambda: node.updates("/update")[-1:] == [[far]], "it learns what it has missed")
 
 
 async def test_another_process_at_a_cleaned_uri_gets_only_what_it_has(make_proxy, master, node):

@@ -55,7 +55,7 @@ def lack(node: FakeNode, how: str, *calls: str) -> None:
 async def populate(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master, "/rosout")
     await node.publish(proxy.master, "/out")
-    await node.subscribe(proxy.master, "/news")
+    await node.subscribe(proxy.master, "/update")
     await node.serve(proxy.master)
 
 
@@ -98,7 +98,7 @@ async def test_a_pid_is_taken_whatever_the_status(proxy, node):
 async def test_one_that_can_not_show_who_it_is_stays_registered(proxy, master, node):
     """It publishes nothing: there is no topic that it could be asked for, and no port known."""
     lack(node, "goroslib", *CALLS)
-    await node.subscribe(proxy.master, "/news")
+    await node.subscribe(proxy.master, "/update")
     uri = master.nodes[node.name]
     await proxy.restart()
     await until(lambda: proxy.app.status()["problems"], "it is told")
@@ -231,7 +231,7 @@ async def test_a_uri_without_a_slash_at_the_end_is_the_same_after_a_restart(prox
     for topic in ("/out", "/more", "/rosout"):
         reply = await node.call(proxy.master, "unregisterPublisher", topic, node.uri)
         assert reply[2] == 1, topic
-    for topic in ("/out", "/more", "/news"):
+    for topic in ("/out", "/more", "/update"):
         reply = await node.call(proxy.master, "unregisterSubscriber", topic, node.uri)
         assert reply[2] == 1, topic
     reply = await node.call(proxy.master, "unregisterService", "/add", node.service_api)

@@ -41,8 +41,8 @@ async def answers(uri: str) -> bool:
 
 
 def all_were_told(nodes: list[FakeNode], publisher: str) -> bool:
-    """Whether all know that one publisher, and no other, has news."""
-    return all(node.updates("/news")[-1:] == [[publisher]] for node in nodes)
+    """Whether all know that one publisher, and no other, has update."""
+    return all(node.updates("/update")[-1:] == [[publisher]] for node in nodes)
 
 
 def uri_of(master: Any, name: str) -> str:
@@ -58,7 +58,7 @@ async def populate(proxy: Any, *nodes: FakeNode) -> None:
     for node in nodes:
         await node.publish(proxy.master, "/rosout")
         await node.publish(proxy.master, f"{node.name}/out")
-        await node.subscribe(proxy.master, "/news")
+        await node.subscribe(proxy.master, "/update")
         await node.serve(proxy.master, f"{node.name}/add")
         await node.call(proxy.master, "subscribeParam", node.uri, "/p")
 
@@ -98,13 +98,13 @@ async def test_a_killed_proxy_serves_the_same_nodes_on_the_same_ports_before_any
 
 
 async def test_publishers_that_came_and_went_meanwhile_are_made_up_for(proxy, master, nodes):
-    await rpc(master.uri, "registerPublisher", "/old", "/news", "std_msgs/String", FAR)
+    await rpc(master.uri, "registerPublisher", "/old", "/update", "std_msgs/String", FAR)
     await populate(proxy, *nodes)
     near = f"http://{OUTSIDE}:4001/"
 
     async def change() -> None:
-        await rpc(master.uri, "unregisterPublisher", "/old", "/news", FAR)
-        await rpc(master.uri, "registerPublisher", "/new", "/news", "std_msgs/String", near)
+        await rpc(master.uri, "unregisterPublisher", "/old", "/update", FAR)
+        await rpc(master.uri, "registerPublisher", "/new", "/update", "std_msgs/String", near)
 
     await proxy.restart(change)
     await until(partial(all_were_told, nodes, near), "they are told")
@@ -154,19 +154,19 @@ async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
     await populate(proxy, *nodes)
     nodes[0].hang = True
 
-    async def news() -> None:
-        await rpc(master.uri, "registerPublisher", "/new", "/news", "std_msgs/String", FAR)
+    async def update() -> None:
+        await rpc(master.uri, "registerPublisher", "/new", "/update", "std_msgs/String", FAR)
 
     clock = asyncio.get_running_loop().time
     started = clock()
-    await proxy.restart(news)
+    await proxy.restart(update)
     await until(lambda: answers(uri_of(master, "/b")), "the others are served")
     assert clock() - started < 8
-    await until(lambda: nodes[1].updates("/news")[-1:] == [[FAR]], "the others are told")
+    await until(lambda: nodes[1].updates("/update")[-1:] == [[FAR]], "the others are told")
     assert await refuses(host_and_port(uri_of(master, "/a")))
     nodes[0].hang = False
     await until(lambda: answers(uri_of(master, "/a")), "it is served again")
-    await until(lambda: nodes[0].updates("/news")[-1:] == [[FAR]], "it is told as well")
+    await until(lambda: nodes[0].updates("/update")[-1:] == [[FAR]], "it is told as well")
 
 
 async def test_a_node_that_ended_meanwhile_is_cleaned_up(proxy, master, nodes):
@@ -219,11 +219,11 @@ async def test_registrations_are_made_again_at_a_master_without_memory(proxy, ma
     await populate(proxy, *nodes)
     before = everything(master)
     await master.restart()
-    await rpc(master.uri, "registerPublisher", "/new", "/news", "std_msgs/String", FAR)
+    await rpc(master.uri, "registerPublisher", "/new", "/update", "std_msgs/String", FAR)
     await until(lambda: everything(master)["params"] == before["params"], "all are back")
     after = everything(master)
     assert after["services"] == before["services"]
-    assert {k: sorted(v) for k, v in after["publishers"].items() if k != "/news"} == {
+    assert {k: sorted(v) for k, v in after["publishers"].items() if k != "/update"} == {
         k: sorted(v) for k, v in before["publishers"].items()
     }
     await until(partial(all_were_told, nodes, FAR), "they are told")

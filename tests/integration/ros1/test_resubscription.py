@@ -122,7 +122,7 @@ async def test_only_the_publisher_without_connection_is_withdrawn(proxy, talker,
         without = {proxy.uri(talker), far}
 
         def looks() -> int:
-            """At how many looks it was told; the first may still be news of the restart."""
+            """At how many looks it was told; the first may still be of the restart."""
             told = [{*some} for some in listener.updates()]
             return sum(pair == (without, uris) for pair in pairwise(told))
 

@@ -11,21 +11,21 @@ from hypothesis import strategies as st
 from rosproxy.admin.requests import (
     ArrivedContainer,
     BodyError,
-    ContainerNews,
+    ContainerUpdate,
     EmptyBody,
     MasterAddress,
     read_body,
 )
 
-GOOD: list[tuple[Any, ContainerNews]] = [
-    ({}, ContainerNews()),
-    ({"gone": []}, ContainerNews()),
-    ({"gone": ["172.18.0.5", "fd00::5"]}, ContainerNews(gone=("172.18.0.5", "fd00::5"))),
-    ({"gone": ["::ffff:172.18.0.5"]}, ContainerNews(gone=("172.18.0.5",))),
-    ({"moved": {"172.18.0.5": "172.18.0.9"}}, ContainerNews(moved={"172.18.0.5": "172.18.0.9"})),
+GOOD: list[tuple[Any, ContainerUpdate]] = [
+    ({}, ContainerUpdate()),
+    ({"gone": []}, ContainerUpdate()),
+    ({"gone": ["172.18.0.5", "fd00::5"]}, ContainerUpdate(gone=("172.18.0.5", "fd00::5"))),
+    ({"gone": ["::ffff:172.18.0.5"]}, ContainerUpdate(gone=("172.18.0.5",))),
+    ({"moved": {"172.18.0.5": "172.18.0.9"}}, ContainerUpdate(moved={"172.18.0.5": "172.18.0.9"})),
     (
         {"arrived": [{"address": "172.18.0.7", "names": ["Talker", "3f2a91c0b7de", "a.b-c_d"]}]},
-        ContainerNews(
+        ContainerUpdate(
             arrived=(
                 ArrivedContainer("172.18.0.7", frozenset({"talker", "3f2a91c0b7de", "a.b-c_d"})),
             )
@@ -33,16 +33,16 @@ GOOD: list[tuple[Any, ContainerNews]] = [
     ),
     (
         {"arrived": [{"address": "172.18.0.7"}]},
-        ContainerNews(arrived=(ArrivedContainer("172.18.0.7"),)),
+        ContainerUpdate(arrived=(ArrivedContainer("172.18.0.7"),)),
     ),
-    ({"selected": []}, ContainerNews(selected=())),
-    ({"selected": ["::ffff:172.18.0.5"]}, ContainerNews(selected=("172.18.0.5",))),
+    ({"selected": []}, ContainerUpdate(selected=())),
+    ({"selected": ["::ffff:172.18.0.5"]}, ContainerUpdate(selected=("172.18.0.5",))),
 ]
 
 
-@pytest.mark.parametrize(("body", "news"), GOOD)
-def test_news(body: Any, news: ContainerNews) -> None:
-    assert read_body(body, ContainerNews) == news
+@pytest.mark.parametrize(("body", "update"), GOOD)
+def test_update(body: Any, update: ContainerUpdate) -> None:
+    assert read_body(body, ContainerUpdate) == update
 
 
 BAD: list[tuple[Any, str]] = [
@@ -90,7 +90,7 @@ BAD: list[tuple[Any, str]] = [
 @pytest.mark.parametrize(("body", "complaint"), BAD)
 def test_a_mistake_names_its_field(body: Any, complaint: str) -> None:
     with pytest.raises(BodyError) as caught:
-        read_body(body, ContainerNews)
+        read_body(body, ContainerUpdate)
     assert str(caught.value).startswith(complaint)
 
 
@@ -111,7 +111,7 @@ def complaint_of(kind: type[msgspec.Struct], body: Any) -> str:
 
 @given(st.dictionaries(FIELDS, JSON) | JSON)
 def test_anything_else_is_a_mistake_in_one_short_line(body: Any) -> None:
-    for kind in (ContainerNews, MasterAddress, EmptyBody):
+    for kind in (ContainerUpdate, MasterAddress, EmptyBody):
         complaint = complaint_of(kind, json.loads(json.dumps(body)))
         assert "\n" not in complaint
         assert len(complaint) < 200

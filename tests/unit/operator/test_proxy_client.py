@@ -106,7 +106,7 @@ async def test_an_answer_without_a_bottom_is_no_answer(evil: Evil, client: Proxy
     assert [type(answer) for answer in page.values()] == [str, str]
 
 
-async def test_an_answer_to_news_is_short(evil: Evil, client: ProxyClient) -> None:
+async def test_an_answer_to_update_is_short(evil: Evil, client: ProxyClient) -> None:
     evil.answer = lambda: web.Response(text=f'{{"moved": "{"x" * proxy_client.LONGEST}"}}')
     with pytest.raises(ProxyError, match="with more than 65536 bytes"):
         await client.containers(evil.admin, "token", {})

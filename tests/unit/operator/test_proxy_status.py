@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rosproxy.admin.requests import ContainerNews, read_body
+from rosproxy.admin.requests import ContainerUpdate, read_body
 from rosproxy.admin.status_document import MOST_ROWS, read_status
 from rosproxy_operator.common.proxy_status import (
     MOST_LEASED,
@@ -69,7 +69,7 @@ def test_ports_that_the_next_proxy_would_refuse_are_not_kept() -> None:
     former = leases(status)
     assert former == {PREFIX: (0, 11401)}
     body = {"former": {prefix: list(ports) for prefix, ports in former.items()}}
-    assert read_body(body, ContainerNews).former == former
+    assert read_body(body, ContainerUpdate).former == former
 
 
 def test_ports_are_kept_up_to_a_bound() -> None:

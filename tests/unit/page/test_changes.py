@@ -16,9 +16,9 @@ DOCUMENTS = st.fixed_dictionaries({"nodes": ROWS, "links": ROWS, "left_out": st.
 def test_changes_make_the_new_document_of_the_old(
     before: dict[str, Any], after: dict[str, Any]
 ) -> None:
-    news = json.loads(json.dumps(changes(before, after)))
-    assert changed(before, news) == after
-    assert bool(news) == (before != after)
+    update = json.loads(json.dumps(changes(before, after)))
+    assert changed(before, update) == after
+    assert bool(update) == (before != after)
 
 
 def test_only_what_differs_is_told() -> None:

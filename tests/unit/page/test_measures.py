@@ -125,7 +125,7 @@ def test_where_nodes_alone_count_it_flows_if_it_came_often_between_two_questions
     assert read((1.0, 10, 10), (31.0, 310, 310), (61.0, 310, 310)).get(KEY).flows(90.0) is False
 
 
-def test_what_a_node_counted_that_answers_no_more_is_no_news() -> None:
+def test_counts_of_a_node_that_answers_no_more_are_not_shown() -> None:
     link = read((1.0, 10, 10), (31.0, 310, 310)).get(KEY)
     assert link.flows(90.0), "a round may take longer than the one before"
     assert not link.flows(95.0)

@@ -133,7 +133,7 @@ class ProxyPoller:
                     await self._wait_for_either(long_poll)
                     if long_poll.done():
                         long_poll = long_poll.result()  # None, or raises what it died of
-                        await self._wait_for_news(LEAST_INTERVAL)
+                        await self._wait_for_update(LEAST_INTERVAL)
                     continue
                 # Acting on that may take the proxy a moment: the next poll rechecks, not this one.
                 self._recheck = self._recheck and not told_gone
@@ -176,9 +176,9 @@ class ProxyPoller:
         pause = EVERY if answers or self._has_waited(EVERY * 20) else EVERY_STARTING
         if answers and not self._is_busy:
             pause = EVERY_FORMER
-        await self._wait_for_news(pause)
+        await self._wait_for_update(pause)
 
-    async def _wait_for_news(self, seconds: float) -> None:
+    async def _wait_for_update(self, seconds: float) -> None:
         """Wait for so long, or until there is something to send."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):

@@ -63,10 +63,10 @@ function watch() {
   listen();
 }
 
-function take(news) {
-  apply(state.nodes, news.nodes);
-  apply(state.links, news.links);
-  for (const key of ["proxy", "findings", "left_out"]) if (key in news) state[key] = news[key];
+function take(update) {
+  apply(state.nodes, update.nodes);
+  apply(state.links, update.links);
+  for (const key of ["proxy", "findings", "left_out"]) if (key in update) state[key] = update[key];
   draw();
 }
 

@@ -211,7 +211,7 @@ class Endpoint:
             self.topic_ports.pop(topic, None)
 
     def note_service_port(self, port: int) -> bool:
-        """Note a TCPROS port at which the node has a service; whether that is news."""
+        """Note a TCPROS port at which the node has a service; return whether it was unknown."""
         if port in self.service_ports:
             return False
         self.service_ports[port] = None

@@ -4,10 +4,10 @@
 anything that it sends is read. Programs on the proxy's own machine are always let in.
 
 An operator tells of a container some tenths of a second after its start, and the container's first
-call may be faster. So a call from an address that is not selected waits for news, up to
-NEWS_TIMEOUT. Right after a start nobody is known to be selected yet: where an operator runs, all
-calls wait for its first word, up to NEWS_TIMEOUT, and are let in if none comes, so that an operator
-that is away stops nobody (`Callers.await_operator`).
+call may be faster. So a call from an address that is not selected waits for an update, up to
+UPDATE_TIMEOUT. Right after a start nobody is known to be selected yet: where an operator runs, all
+calls wait for its first word, up to UPDATE_TIMEOUT, and are let in if none comes, so that an
+operator that is away stops nobody (`Callers.await_operator`).
 
 What is refused gets HTTP 403 with the reason, not an XML-RPC fault: roscpp takes a fault for the
 master's last word and never asks again (master.cpp, execute), but goes on trying after anything
@@ -28,11 +28,11 @@ from rosproxy.ros1.registry.client_kinds import ClientKind
 
 log = logging.getLogger(__name__)
 
-NEWS_TIMEOUT = 3.0
-"""Seconds that a call waits at most for the news that its source is selected."""
+UPDATE_TIMEOUT = 3.0
+"""Seconds that a call waits at most for an update that selects its source."""
 MOST_WAITING = 512
-"""Calls that wait for news at once; beyond that they are refused without. A node makes one call at
-a time, so that these are as many nodes that start in the same seconds."""
+"""Calls that wait for an update at once; beyond that they are refused without. A node makes one
+call at a time, so that these are as many nodes that start in the same seconds."""
 MOST_WAITING_EACH = 64
 """The same for one source: nobody takes all places."""
 LOG_INTERVAL = 10.0
@@ -45,7 +45,7 @@ class Callers:
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._news = asyncio.Event()
+        self._update = asyncio.Event()
         self._begun = asyncio.Event()
         """Set once callers are judged; until then they wait."""
         if not context.settings.admin_token_hash:
@@ -58,18 +58,18 @@ class Callers:
         self._context.selected = frozenset(addresses)
         self._begun.set()
         self._context.problems.solved(SUBJECT)
-        # Whoever waits now is woken; whoever comes to wait later waits for the next news.
-        news = self._news
-        self._news = asyncio.Event()
-        news.set()
+        # Calls that wait now are woken; later calls wait for the next update.
+        update = self._update
+        self._update = asyncio.Event()
+        update.set()
 
     async def await_operator(self) -> None:
-        """Have callers wait for an operator's first word, for NEWS_TIMEOUT at most from now on.
+        """Have callers wait for an operator's first word, for UPDATE_TIMEOUT at most from now on.
 
         None is waited for without the hash of a token, by which operators start their proxies.
         """
         try:
-            async with asyncio.timeout(NEWS_TIMEOUT):
+            async with asyncio.timeout(UPDATE_TIMEOUT):
                 await self._begun.wait()
         except TimeoutError:
             log.info("no operator has selected any address yet: the inside networks are let in")
@@ -85,7 +85,7 @@ class Callers:
             await self.wait_until_begun()
         if self._client_kind(source) is ClientKind.ADMITTED:
             return None
-        await self._wait_for_news(source)
+        await self._wait_for_update(source)
         kind = self._client_kind(source)
         if kind is ClientKind.ADMITTED:
             return None
@@ -100,20 +100,22 @@ class Callers:
         self._context.refresh_networks(source)
         return self._context.client_kind(source)
 
-    async def _wait_for_news(self, source: str) -> None:
-        """Wait until an operator has selected a source, up to NEWS_TIMEOUT.
+    async def _wait_for_update(self, source: str) -> None:
+        """Wait until an operator has selected a source, up to UPDATE_TIMEOUT.
 
         No operator is heard where the admin endpoint is on loopback, if none was heard so far.
         """
-        no_news = self._context.selected is None and is_loopback(self._context.settings.admin.host)
+        no_update = self._context.selected is None and is_loopback(
+            self._context.settings.admin.host
+        )
         waiting = self._waiting
-        if no_news or waiting.total() >= MOST_WAITING or waiting[source] >= MOST_WAITING_EACH:
+        if no_update or waiting.total() >= MOST_WAITING or waiting[source] >= MOST_WAITING_EACH:
             return
         waiting[source] += 1
         try:
-            async with asyncio.timeout(NEWS_TIMEOUT):
+            async with asyncio.timeout(UPDATE_TIMEOUT):
                 while self._client_kind(source) is not ClientKind.ADMITTED:
-                    await self._news.wait()
+                    await self._update.wait()
         except TimeoutError:
             log.debug("%s was not selected in time", source)
         finally:

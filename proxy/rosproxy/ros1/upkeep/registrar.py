@@ -32,7 +32,7 @@ FormerUris = Mapping[str, tuple[Endpoint, str]]
 JUDGED_AT_ONCE = 100
 """Registrations that the policy judges before other tasks have their turn: rules may be many."""
 SETTLE_TIME = 2.0
-"""Seconds in which the master's news of a publisher that is registered anew come in."""
+"""Seconds in which the master's updates about a publisher that is registered anew come in."""
 
 
 class Registrar:

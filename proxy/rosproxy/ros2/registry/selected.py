@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rosproxy.ros2.protocol.rtps import source_prefix
 
-NEWS_TIMEOUT = 3.0
+UPDATE_TIMEOUT = 3.0
 """Seconds from the start that an operator has to tell the first time."""
 MOST_HELD = 256
 MOST_HELD_EACH = 8

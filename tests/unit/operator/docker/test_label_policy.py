@@ -12,7 +12,7 @@ from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, with_bounded_rules
 from rosproxy_operator.docker.planner.labels.readers import MOST_LABEL_RULES
 from rosproxy_operator.docker.planner.model import Attachment, Key, Member
-from rosproxy_operator.docker.planner.proxy_news import ProxyNews, network_facts
+from rosproxy_operator.docker.planner.proxy_update import ProxyUpdate, network_facts
 from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint
 from rosproxy_operator.docker.planner.state import DockerMemory
 from tests.run_options import settings_of
@@ -139,12 +139,12 @@ def test_those_of_gone_containers_take_no_room_from_others() -> None:
 
 def test_the_same_look_is_the_same_policy() -> None:
     layers = [layer("b", B, A), layer("a", A), layer("a", B, rules=RULES * 2)]
-    first = ProxyNews()
-    second = ProxyNews()
-    for news, order in ((first, layers), (second, layers[::-1])):
+    first = ProxyUpdate()
+    second = ProxyUpdate()
+    for update, order in ((first, layers), (second, layers[::-1])):
         seen = observed(**both())
         facts = replace(network_facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
-        news.look(facts, 0.0)
+        update.look(facts, 0.0)
     assert first.policy == second.policy
     assert first.policy[0] == COMMON[0]
 

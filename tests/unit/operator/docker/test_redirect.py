@@ -21,7 +21,7 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.own_containers import forgery_reason
 from rosproxy_operator.docker.planner.plan import DockerPlan
-from rosproxy_operator.docker.planner.proxy_news import network_facts
+from rosproxy_operator.docker.planner.proxy_update import network_facts
 from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, read_own
 from rosproxy_operator.docker.planner.state import DockerMemory

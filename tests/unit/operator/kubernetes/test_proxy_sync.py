@@ -137,7 +137,7 @@ async def test_an_answer(talk: Talk) -> None:
     talk.all.follow([proxy()])
     await talk.asked()
     assert talk.all.reports[UID].master_up
-    assert talk.changes == 1  # the same answer is no news
+    assert talk.changes == 1  # the same answer is no update
 
 
 async def test_one_that_says_too_much_keeps_what_is_known_of_it(talk: Talk) -> None:
@@ -177,13 +177,13 @@ async def test_one_that_reports_changes_without_an_end_keeps_no_other_waiting(
 ) -> None:
     """It was asked again at once, as often as the operator could."""
     waits: list[float] = []
-    wait = proxy_sync.ProxyPoller._wait_for_news
+    wait = proxy_sync.ProxyPoller._wait_for_update
 
     async def noted(poller: proxy_sync.ProxyPoller, seconds: float) -> None:
         waits.append(seconds)
         await wait(poller, 0.0)
 
-    monkeypatch.setattr(proxy_sync.ProxyPoller, "_wait_for_news", noted)
+    monkeypatch.setattr(proxy_sync.ProxyPoller, "_wait_for_update", noted)
     talk.proxies.former = False
 
     async def changes(*_: Any) -> tuple[str, ProxyStatus]:
@@ -196,7 +196,7 @@ async def test_one_that_reports_changes_without_an_end_keeps_no_other_waiting(
     assert waits.count(proxy_sync.LEAST_INTERVAL) >= 15
 
 
-async def test_one_that_is_just_starting_is_no_news(talk: Talk) -> None:
+async def test_one_that_is_just_starting_is_not_told(talk: Talk) -> None:
     talk.all.follow([proxy()])
     await talk.asked()
     talk.proxies.says = DOWN  # it has not asked its master yet
@@ -233,7 +233,7 @@ async def test_one_unanswered_question_is_no_silence(talk: Talk) -> None:
     assert talk.changes == 2
 
 
-async def test_news_are_repeated_until_they_are_heard(talk: Talk) -> None:
+async def test_updates_are_repeated_until_they_are_heard(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.proxies.hears = False
     talk.all.follow([proxy()])

@@ -54,8 +54,8 @@ def test_the_ports_are_those_that_outside_sees() -> None:
 def test_so_many_ports_of_services_are_kept_the_newest() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    news = [endpoint.note_service_port(port) for port in range(1, 40)]
-    assert all(news)
+    update = [endpoint.note_service_port(port) for port in range(1, 40)]
+    assert all(update)
     assert not endpoint.note_service_port(39)
     text = remembered_leases.leases_text([endpoint], addressing.ports)
     (lease,) = read_leases(text, addressing.ports).values()

@@ -1,4 +1,4 @@
-"""Which nodes are gone or have moved, as the news of containers say and the nodes themselves."""
+"""Which nodes are gone or have moved, as updates of containers say and the nodes themselves."""
 
 from dataclasses import replace
 
@@ -45,13 +45,13 @@ def test_who_may_have_moved() -> None:
     add_node(addressing, "http://10.0.0.6:40001/")
     outside = add_node(addressing, "http://10.0.0.7:40001/")
     same = add_node(addressing, "http://10.0.0.8:40001/")
-    news = {
+    update = {
         moved.location.address: "10.0.0.9",
         outside.location.address: "192.168.0.9",  # in no inside network
         same.location.address: same.location.address,
         "10.0.0.99": "10.0.0.100",
     }
-    moves = liveness.movable(addressing.registry, news, addressing.networks)
+    moves = liveness.movable(addressing.registry, update, addressing.networks)
     assert moves == {moved: "10.0.0.9"}
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.admin.requests import BodyError, ContainerNews, read_body
+from rosproxy.admin.requests import BodyError, ContainerUpdate, read_body
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import BURST
@@ -246,19 +246,21 @@ def test_who_is_there_already_keeps_what_he_has() -> None:
     assert domain.inside.by_prefix[A].ports == before
 
 
-def test_news_of_peers_and_former_ports_are_read() -> None:
+def test_an_update_of_peers_and_former_ports_is_read() -> None:
     text = ".".join(f"{byte:02x}" for byte in A)
-    news = read_body({"peers": ["robot", "192.0.2.1:11400"], "former": {text: [1]}}, ContainerNews)
-    assert news.ros2_peers is not None
-    assert [str(peer.port) for peer in news.ros2_peers] == ["0", "11400"]
-    assert news.former_ports == {A: (1,)}
-    assert read_body({}, ContainerNews).ros2_peers is None
+    update = read_body(
+        {"peers": ["robot", "192.0.2.1:11400"], "former": {text: [1]}}, ContainerUpdate
+    )
+    assert update.ros2_peers is not None
+    assert [str(peer.port) for peer in update.ros2_peers] == ["0", "11400"]
+    assert update.former_ports == {A: (1,)}
+    assert read_body({}, ContainerUpdate).ros2_peers is None
 
 
 @pytest.mark.parametrize(
     "body",
     [{"peers": ["a b"]}, {"peers": ["a"] * 1025}, {"former": {"x": [1]}}, {"former": {"01": "a"}}],
 )
-def test_bad_news_are_refused(body: dict[str, object]) -> None:
+def test_bad_updates_are_refused(body: dict[str, object]) -> None:
     with pytest.raises(BodyError):
-        read_body(body, ContainerNews)
+        read_body(body, ContainerUpdate)

@@ -14,10 +14,10 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.proxy_news import (
+from rosproxy_operator.docker.planner.proxy_update import (
     AddressHistory,
     NetworkFacts,
-    ProxyNews,
+    ProxyUpdate,
     network_facts,
 )
 
@@ -121,9 +121,9 @@ def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
         (told(look(talker())), {"gone": ["172.18.0.6"]}),
         (replace(told(look(talker())), subnets=()), {}),
     ):
-        news = ProxyNews()
-        news.look(facts, 0.0)
-        assert news.body(nodes, 0.0) == addresses
+        update = ProxyUpdate()
+        update.look(facts, 0.0)
+        assert update.body(nodes, 0.0) == addresses
 
 
 OLD = "172.18.0.5"
@@ -209,44 +209,44 @@ def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> No
 
 
 def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None:
-    news = ProxyNews()
-    assert news.next_due(0.0) is None
-    news.look(told(look(talker()), member(talker())), 0.0)
-    (arrived,) = news.body(set(), 0.0)["arrived"]
+    update = ProxyUpdate()
+    assert update.next_due(0.0) is None
+    update.look(told(look(talker()), member(talker())), 0.0)
+    (arrived,) = update.body(set(), 0.0)["arrived"]
     assert arrived["address"] == OLD
     assert "talker" in arrived["names"]
-    news.mark_delivered(0.0)
-    assert news.next_due(0.0) == 1.0
-    assert news.body(set(), 0.5) == {}
+    update.mark_delivered(0.0)
+    assert update.next_due(0.0) == 1.0
+    assert update.body(set(), 0.5) == {}
     for when in (1.0, 3.0, 10.0):
-        news.look(told(look(talker()), member(talker())), when)
-        assert news.body(set(), when)["arrived"]
-        news.mark_delivered(when)
-    assert news.next_due(11.0) is None
+        update.look(told(look(talker()), member(talker())), when)
+        assert update.body(set(), when)["arrived"]
+        update.mark_delivered(when)
+    assert update.next_due(11.0) is None
 
 
 def test_what_was_not_heard_is_told_again() -> None:
-    news = ProxyNews()
-    news.look(told(look(talker()), member(talker())), 0.0)
-    assert news.body(set(), 0.0)["arrived"]
-    assert news.next_due(0.1) == 0.0
-    assert news.body(set(), 0.1)["arrived"]
+    update = ProxyUpdate()
+    update.look(told(look(talker()), member(talker())), 0.0)
+    assert update.body(set(), 0.0)["arrived"]
+    assert update.next_due(0.1) == 0.0
+    assert update.body(set(), 0.1)["arrived"]
 
 
 def test_nodes_of_a_container_that_is_no_more_are_gone() -> None:
-    news = ProxyNews()
-    news.look(HERE, 0.0)
-    assert news.body({OLD}, 0.0) == {}
-    news.look(replace(NOBODY, taken=frozenset(), subnets=()), 1.0)
-    assert news.body({OLD}, 1.0) == {"gone": [OLD]}  # also on a network that the proxy has left
+    update = ProxyUpdate()
+    update.look(HERE, 0.0)
+    assert update.body({OLD}, 0.0) == {}
+    update.look(replace(NOBODY, taken=frozenset(), subnets=()), 1.0)
+    assert update.body({OLD}, 1.0) == {"gone": [OLD]}  # also on a network that the proxy has left
 
 
 def test_a_move_is_told_until_the_proxy_knows() -> None:
-    news = ProxyNews()
-    news.look(HERE, 0.0)
-    news.body({OLD}, 0.0)
-    news.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # nobody has the old one: not gone
-    assert news.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
-    news.mark_delivered(1.0)
-    assert news.next_due(1.0) == 1.0
-    assert news.body({NEW}, 2.0) == {}
+    update = ProxyUpdate()
+    update.look(HERE, 0.0)
+    update.body({OLD}, 0.0)
+    update.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # nobody has the old one: not gone
+    assert update.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
+    update.mark_delivered(1.0)
+    assert update.next_due(1.0) == 1.0
+    assert update.body({NEW}, 2.0) == {}

@@ -1,4 +1,4 @@
-"""What of a proxy's status is news to an operator: not how long or how fast, but who and what.
+"""The version of a proxy's status: the same until nodes, ports or problems change, but no rates.
 
 Callers that wait for a change (``/status/changes``) are answered when the version differs.
 """
@@ -12,8 +12,8 @@ from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxySt
 
 
 def version_of(status: ProxyStatus) -> str:
-    """A text that stays the same until the status has news."""
-    news = (
+    """A text that stays the same until the status differs in what matters to an operator."""
+    told = (
         status.instance,
         status.retired,
         status.master.up,
@@ -23,7 +23,7 @@ def version_of(status: ProxyStatus) -> str:
         sorted((problem.subject, problem.text) for problem in status.problems),
         replace(status.range_probe, age=0.0) if status.range_probe else None,
     )
-    return hashlib.sha256(msgspec.json.encode(news)).hexdigest()[:16]
+    return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
 
 
 def _node(node: EndpointStatus) -> object:

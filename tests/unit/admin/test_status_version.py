@@ -1,11 +1,11 @@
-"""What is news of a proxy, and what is not."""
+"""Which changes of a status make another version."""
 
 from typing import Any
 
 import pytest
 
 from rosproxy.admin.status_document import read_status
-from rosproxy.admin.status_news import version_of
+from rosproxy.admin.status_version import version_of
 
 NODE = {"nodes": ["/talker"], "address": "10.0.0.5:40001", "publishes": ["/chatter"]}
 MEMBER = {
@@ -39,7 +39,7 @@ def version(**more: Any) -> str:
         {"range_probe": {"reached": True, "age": 300.0}},
     ],
 )
-def test_what_only_passes_is_no_news(change: dict[str, Any]) -> None:
+def test_what_only_passes_makes_no_version(change: dict[str, Any]) -> None:
     assert version(**change) == version()
 
 
@@ -62,5 +62,5 @@ def test_what_only_passes_is_no_news(change: dict[str, Any]) -> None:
         {"range_probe": None},
     ],
 )
-def test_who_and_what_is_news(change: dict[str, Any]) -> None:
+def test_each_change_of_nodes_and_ports_makes_a_version(change: dict[str, Any]) -> None:
     assert version(**change) != version()

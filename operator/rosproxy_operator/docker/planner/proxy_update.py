@@ -1,8 +1,8 @@
 """What a proxy is to be told of the containers on its networks.
 
-`network_facts` is what one look says to one proxy. `ProxyNews` compares it with what the proxy was
-told before and with the nodes that it has, and says what is new and when something is due again.
-Nothing is forgotten until the proxy has heard it. Times are seconds of a monotonic clock.
+`network_facts` is what one look says to one proxy. `ProxyUpdate` compares it with what the proxy
+was told before and with the nodes that it has, and says what is new and when something is due
+again. Nothing is forgotten until the proxy has heard it. Times are seconds of a monotonic clock.
 """
 
 import re
@@ -144,7 +144,7 @@ class AddressHistory:
         return {old: new for old, (new, _) in self._moves.items() if old in nodes}
 
 
-class ProxyNews:
+class ProxyUpdate:
     """What one run of a proxy has yet to be told. ``policy`` is all of its policy."""
 
     def __init__(self) -> None:
