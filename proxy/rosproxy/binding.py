@@ -44,14 +44,14 @@ def report_taken_ports(
     port_kind = "ports" if ros == "1" else "UDP ports"
     proxies = proxy_signs.overlapping_proxies(ros, ports.first, ports.last)
     holders = "; ".join(map(str, proxies))
-    cure = "give one of the two another range (ROSPROXY_PORT_RANGE), or end one"
+    fix = "give one of the two another range (ROSPROXY_PORT_RANGE), or end one"
     if len(taken) == len(ports):
         letter = "t" if ros == "1" else "u"
         show = f"ss -l{letter}np 'sport >= :{ports.first} and sport <= :{ports.last}'"
-        cause = f"held by {holders}: {cure}" if proxies else f"all are taken: {show} shows by whom"
+        cause = f"held by {holders}: {fix}" if proxies else f"all are taken: {show} shows by whom"
         raise SettingError(RANGE_OPTION, f"no port of {ports} can be bound; {cause}")
     text = f"{port_kind} of {RANGE_OPTION} {ports} held by other programs: {list(taken)}"
     if proxies:
-        text += f"; held by {holders}: {cure}"
+        text += f"; held by {holders}: {fix}"
     log.warning("%s", text)
     problems.add(RANGE_OPTION, text, holds=True)

@@ -357,16 +357,16 @@ class Settings:
             text = f"{self.port_range} is too short: each of {count} domains needs"
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
         # An announcement need not tell its domain: what has one port has one domain.
-        cure = "start a proxy for each domain"
+        fix = "start a proxy for each domain"
         if self.ros2_lan_relay and count > 1:
-            raise SettingError("--ros2-lan-relay", f"a LAN relay is for one domain: {cure}")
+            raise SettingError("--ros2-lan-relay", f"a LAN relay is for one domain: {fix}")
         if self.ros2_lan_relay and not self.ros2_lan_relay_secret:
             text = "missing; give this option and rosproxy lan-relay --secret the same secret"
             fix = "openssl rand -hex 16 makes one (ROSPROXY_ROS2_LAN_RELAY_SECRET)"
             raise SettingError("--ros2-lan-relay-secret", f"{text}: {fix}")
         for peer in self.ros2_peer:
             if peer.port and count > 1:
-                text = f"{peer} has a port, which is for one domain: {cure}"
+                text = f"{peer} has a port, which is for one domain: {fix}"
                 raise SettingError("--ros2-peer", text)
 
     @property

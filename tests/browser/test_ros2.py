@@ -137,19 +137,19 @@ def test_qos_that_does_not_match_is_red_at_its_pair_and_green_when_mended(
     other = label(lab, "c1", "/scan")
     scanner = label(lab, "out", "/scan")
     browser.open(URL)
-    cure = "make the publisher RELIABLE, or the subscription BEST_EFFORT"
-    broken = row(browser, "/scan", State="BROKEN", From=scanner, To=reader, fix=cure)
+    fix = "make the publisher RELIABLE, or the subscription BEST_EFFORT"
+    broken = row(browser, "/scan", State="BROKEN", From=scanner, To=reader, fix=fix)
     assert broken["text"].startswith("reliability differs: the publisher ")
     assert broken["Carried by"] == UNKNOWN
     assert broken["colour"].replace(" ", "") == colour(browser, "broken")
     row(browser, "/scan", State="ok", From=scanner, To=other)
     red = line(browser, scanner, reader)
     assert red["colour"] == colour(browser, "broken")
-    assert red["label"] == f"BROKEN: /scan\n{cure}"
-    assert cure in browser.run(CHOOSE, scanner, reader)
+    assert red["label"] == f"BROKEN: /scan\n{fix}"
+    assert fix in browser.run(CHOOSE, scanner, reader)
     told = trouble(browser)
     assert told.startswith(f"BROKEN: /scan from {scanner} to {reader}\n"), "and nothing twice"
-    assert told.count(cure) == 1
+    assert told.count(fix) == 1
     assert title(browser) == "(1 broken) rosproxy"
 
     hasty.stop()
@@ -157,7 +157,7 @@ def test_qos_that_does_not_match_is_red_at_its_pair_and_green_when_mended(
     row(browser, "/scan", State="ok", To=reader)
     assert line(browser, label(lab, "out", "/scan"), reader)["colour"] == colour(browser, "ok")
     wait_until("nothing is wrong", lambda: title(browser) == "rosproxy")
-    assert cure not in trouble(browser)
+    assert fix not in trouble(browser)
 
 
 def test_a_service_of_another_type_is_broken_between_its_ends(lab: Lab, browser: Browser) -> None:
@@ -189,13 +189,13 @@ def test_a_firewall_before_the_range_is_a_warning_until_it_is_gone(
         wait_until("it is told", lambda: trouble(browser).startswith("warning: "))
         (outsider,) = lab.domain().outside
         text = f"at {outsider.address} (Fast DDS, outside): nothing has come from it"
-        cure = "publish the range for UDP, and let it through firewalls"
+        fix = "publish the range for UDP, and let it through firewalls"
         assert text in trouble(browser)
-        assert cure in trouble(browser)
+        assert fix in trouble(browser)
         (warned,) = (cells for cells in browser.run(NODES) if cells[0] == "warning")
         assert warned[2] == "robot, outside"
         assert text in warned[-1]
-        assert cure in warned[-1]
+        assert fix in warned[-1]
         name = warned[1].removesuffix(" (participant)")
         assert box_colour(browser, name) == colour(browser, "warning")
     shown = row(browser, "/scan", State="ok", From=name)

@@ -128,17 +128,17 @@ def test_a_finding_that_is_there_is_not_said_again(browser: Browser, server: Pro
 
 
 @pytest.mark.parametrize(
-    "cure",
+    "fix",
     [
         "on the machine of /outside4: nc -vz 192.168.100.100 45001; a firewall or what not",
         "/a_name_without_a_blank" * 5,
     ],
 )
-def test_no_box_covers_a_cure(browser: Browser, server: Process, cure: str) -> None:
+def test_no_box_covers_a_fix(browser: Browser, server: Process, fix: str) -> None:
     seen: list[Json] = []
 
     def is_drawn() -> bool:
-        browser.run(BREAK, "/group4/node4/topic0", cure)
+        browser.run(BREAK, "/group4/node4/topic0", fix)
         box = browser.run(COVERED)
         seen[:] = [box] if box and box["width"] else []
         return bool(seen)

@@ -158,10 +158,10 @@ def test_a_misspelt_label(process: Process, net: Inside) -> None:
     assert "did you mean rosproxy.enable?" in process.once("status", check=False)
 
 
-def test_a_masters_name_that_leads_nowhere_and_its_cure(
+def test_a_masters_name_that_leads_nowhere_and_its_fix(
     tmp_path: Path, process: Process, net: Inside, named: Robot
 ) -> None:
-    """The cure names the name, and no label; done as it says, all is well."""
+    """The fix names the name, and no label; done as it says, all is well."""
     blind = Process(tmp_path, "--proxy-image", process.options[-1])
     blind._names.clear()
     blind._hosts.write_text("")
@@ -187,7 +187,7 @@ def test_a_masters_name_that_leads_nowhere_and_its_cure(
 
 
 def test_a_proxy_that_outside_does_not_reach(process: Process, net: Inside) -> None:
-    """192.0.2.1 is nobody's; the cure is said in the operator's words."""
+    """192.0.2.1 is nobody's; the fix is said in the operator's words."""
     net.idle(net.network(), labels=(ENABLE, "rosproxy.advertise-host=192.0.2.1"))
     try:
         process.once("--once")

@@ -25,16 +25,16 @@ def _nodes_end(lan: Outside) -> Iterator[None]:
     lan.end()
 
 
-def names(controller: Controller, variable: str, cure: str) -> bool:
+def names(controller: Controller, variable: str, fix: str) -> bool:
     """Whether a finding of the doctor names a variable, and what to do."""
     text = controller.command("doctor", "--json", check=False)
     findings = json.loads(text[text.index("{") :])["findings"]
     told = [f"{finding['text']}: {finding['fix']}" for finding in findings]
-    return any(variable in text and cure in text for text in told)
+    return any(variable in text and fix in text for text in told)
 
 
 @pytest.mark.parametrize(
-    ("vendor", "name", "value", "cure"),
+    ("vendor", "name", "value", "fix"),
     [
         ("jazzy", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
         ("kilted", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
@@ -49,23 +49,23 @@ def test_a_setting_that_leads_past_the_proxy(
     vendor: str,
     name: str,
     value: str,
-    cure: str,
+    fix: str,
     start_controller: Callable[..., Controller],
     lan: Outside,
     inside2: Inside2,
 ) -> None:
     """Without the LAN's multicast for ROS_STATIC_PEERS, which are there in its place."""
-    is_by_peers = cure == STATIC_PEERS
+    is_by_peers = fix == STATIC_PEERS
     controller = start_controller(*OPTIONS, *(("--ros2-lan", "none") if is_by_peers else ()))
     network = inside2.made.network()
     reader = lan.node("jazzy", "sub", "/out")
     node = inside2.node(network, vendor, "pub", "/out", options=("--env", f"{name}={value}"))
 
-    wait_until(lambda: names(controller, name, cure), 60, controller.logs)
+    wait_until(lambda: names(controller, name, fix), 60, controller.logs)
     assert "got hello" not in reader.log.read()
 
     docker("rm", "--force", node.name)
-    written = cure.partition("write ")[2]
+    written = fix.partition("write ")[2]
     options = ("--env", f"{name}={written}") if written else ()
     labels = (ENABLE, f"rosproxy.peers={THERE}") if is_by_peers else (ENABLE,)
     inside2.node(network, vendor, "pub", "/out", options=options, labels=labels)

@@ -39,7 +39,7 @@ def first_error(controller: Controller) -> dict[str, str]:
     return next((finding for finding in findings if finding["severity"] == "error"), {})
 
 
-def test_the_cause_is_named_and_its_cure_works(
+def test_the_cause_is_named_and_its_fix_works(
     start_controller: Callable[..., Controller], lan: Outside, inside2: Inside2
 ) -> None:
     """Without a LAN relay: that of a rootless engine hears no LAN."""
@@ -53,8 +53,8 @@ def test_the_cause_is_named_and_its_cure_works(
             lambda: first_error(controller).get("subject", "").endswith("hidden source"), 60,
             lambda: docker("logs", proxy.name),
         )  # fmt: skip
-        cure = first_error(controller)["fix"]
-        assert "DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns" in cure
+        fix = first_error(controller)["fix"]
+        assert "DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns" in fix
         assert "got hello" not in reader.log.read()
 
     wait_for_line(reader.log, "^got hello ")

@@ -8,7 +8,7 @@ from tests.kubernetes.rosproxies import rosproxy
 from tests.kubernetes.test_doctor import doctor
 
 
-def test_a_network_plug_in_without_host_ports_is_told_with_the_cure(
+def test_a_network_plug_in_without_host_ports_is_told_with_the_fix(
     net: Namespace, robot: Robot
 ) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=4)
@@ -31,7 +31,7 @@ def test_a_network_plug_in_without_host_ports_is_told_with_the_cure(
     code, findings = doctor(net.name)
     assert code == 1
     assert findings[0]["text"].startswith(f"PortsReachable is False: {text}")
-    # The node has the plug-in again. The cure is that of the message.
+    # The node has the plug-in again. The fix is that of the message.
     cut_off.remove()
     made.wait_for("PortsReachable", seconds=60)
     made.wait_for("Degraded", "False")

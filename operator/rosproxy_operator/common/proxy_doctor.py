@@ -23,11 +23,11 @@ def command(names: Sequence[str]) -> tuple[str, ...]:
     return ("rosproxy", "doctor", "--json", "--", *names)
 
 
-def read_findings(proxy: str, output: bytes, cures: Mapping[str, str]) -> list[DoctorFinding]:
-    """The findings in what a proxy's doctor has printed; ``cures`` by checks stand for its own."""
+def read_findings(proxy: str, output: bytes, fixes: Mapping[str, str]) -> list[DoctorFinding]:
+    """The findings in what a proxy's doctor has printed; ``fixes`` by checks stand for its own."""
     try:
         rows = json.loads(output)["findings"]
-        return [_finding(proxy, row, cures) for row in rows[:MOST_FINDINGS]]
+        return [_finding(proxy, row, fixes) for row in rows[:MOST_FINDINGS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         text = "its own doctor says nothing that can be read: its image may be of another release"
         return [warning("proxy", proxy, text)]
@@ -60,11 +60,11 @@ def _words(finding: DoctorFinding) -> set[str]:
     return {*finding.subject.split()}
 
 
-def _finding(proxy: str, row: Mapping[str, Any], cures: Mapping[str, str]) -> DoctorFinding:
+def _finding(proxy: str, row: Mapping[str, Any], fixes: Mapping[str, str]) -> DoctorFinding:
     severity = _SEVERITIES[row["severity"]]
     check, subject, text, fix = (
         brief(str(row[key]), LONGEST_TEXT) for key in ("check", "subject", "text", "fix")
     )
     if severity >= Severity.WARNING:
-        fix = cures.get(check, fix)
+        fix = fixes.get(check, fix)
     return DoctorFinding(severity, check, f"{proxy}: {subject}" if subject else proxy, text, fix)

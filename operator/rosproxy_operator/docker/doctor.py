@@ -25,7 +25,7 @@ _CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
 _BEING_MADE = ("absent", "created")
 """States of a proxy's container while an operator makes the proxy."""
 _ADDRESS = "label rosproxy.advertise-host=ADDRESS on its containers, or --advertise-host"
-CURES = {
+FIXES = {
     "advertised host": _ADDRESS,
     "published range": f"let its ports through this host's firewall; or {_ADDRESS}",
     "ports": "label rosproxy.ports=N on its containers, or --ports N",
@@ -50,7 +50,7 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
             except EngineError as failure:
                 text = f"its own doctor could not be asked: {failure}"
                 return [warning("proxy", f"proxy {name}", text, f"docker logs {name}")]
-        return read_findings(f"proxy {name}", output, CURES)
+        return read_findings(f"proxy {name}", output, FIXES)
 
     told = {problem["subject"] for problem in status["problems"]}
     running = [proxy for proxy in status["proxies"] if proxy["state"] == "running"]

@@ -209,9 +209,9 @@ class Executor:
                 self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
-                cure = f"; {group.cure}" if group.cure else ""
+                fix = f"; {group.fix}" if group.fix else ""
                 subject = _subject((group.key, group.subject))
-                problem = Problem(subject, f"{action}: {error}{cure}", group.fatal)
+                problem = Problem(subject, f"{action}: {error}{fix}", group.fatal)
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem

@@ -26,16 +26,16 @@ from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import event_findings
-from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_CURE, PORTS_CURE
+from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_FIX
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""
 WITHIN = 60
 """Seconds that a doctor has: it tries what may not answer."""
-CURES = {
-    "advertised host": ADDRESS_CURE,
-    "published range": PORTS_CURE,
+FIXES = {
+    "advertised host": ADDRESS_FIX,
+    "published range": PORTS_FIX,
     "ports": "a larger spec.ports",
 }
 """What mends what proxies find about themselves, by their checks."""
@@ -76,7 +76,7 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
         fix = "may you create pods/exec? kubectl auth can-i create pods/exec -n "
         yield warning("proxy", subject, text, fix + namespace)
         return
-    yield from read_findings(subject, output, CURES)
+    yield from read_findings(subject, output, FIXES)
 
 
 def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:

@@ -58,7 +58,7 @@ def _summary(findings: Sequence[DoctorFinding]) -> str:
         return "Nothing wrong was found."
     counts = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
     worst = [f for f in findings if f.severity is max(severities)]
-    # With one cure for all there is nothing to begin with.
+    # With one fix for all there is nothing to begin with.
     if len({f.fix for f in findings if f.severity >= Severity.WARNING}) == 1:
         return counts
     first = clean(worst[0].subject or worst[0].check)

@@ -35,7 +35,7 @@ second. With names of 50 characters, and nothing wrong, all of them have 2 MB.""
 LONGEST = 300
 """Characters of a name."""
 LONGEST_TEXT = 1000
-"""Characters of what is wrong, and of its cure."""
+"""Characters of what is wrong, and of its fix."""
 QUIET = frozenset({"/rosout", "/rosout_agg", "/tf", "/tf_static", "/parameter_events"})
 """Topics that nearly every node has: hidden until they are asked for."""
 _QUIET_SERVICES = ("/get_loggers", "/set_logger_level")
@@ -194,7 +194,7 @@ def shown_name(name: str) -> str:
 
 
 def shown_text(text: str) -> str:
-    """What is wrong, or a cure, as it is shown."""
+    """What is wrong, or a fix, as it is shown."""
     return brief(text, LONGEST_TEXT)
 
 

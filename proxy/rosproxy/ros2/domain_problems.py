@@ -1,4 +1,4 @@
-"""What keeps participants of a domain from meeting, as its status tells: the cause, and the cure.
+"""What keeps participants of a domain from meeting, as its status tells: the cause, and the fix.
 
 ``rosproxy doctor`` reports it when it is run; the proxy, once it is so, in its log and in
 ``rosproxy status``. Only the first cause is given for a participant: the others follow from it.
@@ -16,7 +16,7 @@ from rosproxy.telemetry.text import plural
 
 
 class DomainProblem(msgspec.Struct, frozen=True):
-    """A cause: the ``check`` that found it, the participant or name it is about, and its cure.
+    """A cause: the ``check`` that found it, the participant or name it is about, and its fix.
 
     ``grave``: it keeps participants apart for certain. ``owner`` is the participant's address, and
     of a pair the address inside.
@@ -55,15 +55,15 @@ _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     ),
 }
 _LONGER_RANGE = "give a longer --port-range, and publish it"
-_SHORTAGE_CURES = {
+_SHORTAGE_FIXES = {
     ShortageKind.BOUND.value: (
         "where it runs: fewer addresses (the interface list of its profile, or CYCLONEDDS_URI), "
         "fewer readers and writers with ports of their own (unique network flows), or several "
         "processes; a longer range does not help"
     ),
 }
-_DEFAULT_CURE = "give both the same {policy}"
-_CURES = {
+_DEFAULT_FIX = "give both the same {policy}"
+_FIXES = {
     "type": "use the same type in both programs, or remap the name in one of them",
     "reliability": "make the publisher RELIABLE, or the subscription BEST_EFFORT",
     "durability": "make the publisher TRANSIENT_LOCAL (latched), or the subscription VOLATILE",
@@ -146,7 +146,7 @@ def _problems(
     if is_inside or domain.direction == "both":
         yield from _security(participant, label, is_inside)
     if participant.problem:
-        fix = _SHORTAGE_CURES.get(participant.shortage, _LONGER_RANGE)
+        fix = _SHORTAGE_FIXES.get(participant.shortage, _LONGER_RANGE)
         yield DomainProblem(
             "ports", participant.guid_prefix, f"{label}: {participant.problem}", fix
         )
@@ -188,6 +188,6 @@ def _mismatch(pair: MismatchStatus, writer: str, reader: str) -> DomainProblem:
         f"{pair.policy} differs: the {sides[0]} {pair.writer} {writer} offers {pair.offered}, "
         f"the {sides[1]} {pair.reader} {reader} requests {pair.requested}"
     )
-    fix = _CURES.get(pair.policy, _DEFAULT_CURE.format(policy=pair.policy))
+    fix = _FIXES.get(pair.policy, _DEFAULT_FIX.format(policy=pair.policy))
     check = "type" if pair.policy == "type" else "qos"
     return DomainProblem(check, f"{pair.kind} {pair.name}", text, fix)

@@ -13,7 +13,7 @@ from itertools import pairwise
 from rich.cells import cell_len
 
 LONGEST_QUOTED = 120
-"""Characters of a name in a cure. Five of them fit where a cure is shortened (`brief`), which would
+"""Characters of a name in a fix. Five of them fit where a fix is shortened (`brief`), which would
 otherwise take a closing quote."""
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 _UNITS = ("B", "kB", "MB", "GB", "TB")

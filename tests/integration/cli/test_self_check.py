@@ -106,7 +106,7 @@ async def test_a_second_proxy_of_ros2_on_the_range_names_the_first(start_process
 async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
     make_proxy: MakeProxy, proxy: Proxy, node, master
 ) -> None:
-    """The other one has the same host and range, as outside sees them; the cure was a clean-up."""
+    """The other one has the same host and range, as outside sees them; the fix was a clean-up."""
     await node.publish(proxy.master)
     port = proxy.settings.ports.listen.last
     uri = f"http://{proxy.settings.advertise_host}:{port}/{node.address}:{node.slave.address[1]}/"
@@ -120,7 +120,7 @@ async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
 
 
 @pytest.mark.parametrize(
-    ("host", "text", "cure"),
+    ("host", "text", "fix"),
     [
         ("nowhere.invalid", "the host name nowhere.invalid can't be resolved here", "ADDRESS"),
         ("127.0.0.1", "127.0.0.1 is a loopback address", "the address of this host"),
@@ -128,7 +128,7 @@ async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
     ],
 )
 async def test_an_advertised_host_that_leads_nowhere_is_told_and_ready_is_not(
-    start_process, host, text, cure
+    start_process, host, text, fix
 ):
     process: Process = start_process(advertise_host=host, master_uri="http://192.0.2.7:11311")
     log = process.text
@@ -139,7 +139,7 @@ async def test_an_advertised_host_that_leads_nowhere_is_told_and_ready_is_not(
         problem for problem in await problems(process) if problem.startswith("advertised host: ")
     ]
     assert text in told
-    assert cure in told
+    assert fix in told
     assert told.removeprefix("advertised host: ")[:40] in (
         await run("status", "--admin", admin_of(process))
     ).out.replace("\n    ", " ")

@@ -78,7 +78,7 @@ def test_another_proxy_on_the_range_is_named() -> None:
 
 
 def test_what_a_proxy_calls_its_range_is_no_command() -> None:
-    """A proxy in hostile hands ended the quote that stood in the cure, and began a command."""
+    """A proxy in hostile hands ended the quote that stood in the fix, and began a command."""
     ports = PortsStatus("1' ; touch pwned #-2", "1-9", free=5, blocked=4)
     told = next(iter(few_ports(ports)))
     command = told.fix.partition("; or another --port-range")[0]

@@ -198,7 +198,7 @@ def hostile(nodes: int = 10_000, links: int = 20_000) -> Document:
     return read_document(json.dumps(document))
 
 
-def test_texts_and_cures_of_a_proxy_are_shortened() -> None:
+def test_texts_and_fixes_of_a_proxy_are_shortened() -> None:
     node = {"lane": "container", "kind": HUGE, "label": HUGE, "text": HUGE, "fix": HUGE}
     link = {"kind": HUGE, "name": HUGE, "source": HUGE, "text": HUGE, "fix": HUGE}
     finding = dict.fromkeys(("severity", "subject", "text", "fix"), HUGE)

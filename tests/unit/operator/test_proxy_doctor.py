@@ -19,18 +19,18 @@ from rosproxy.admin.doctor_finding import (
 from rosproxy.doctor.presentation import as_json
 from rosproxy_operator.common.proxy_doctor import read_findings, without_names_of_others
 from rosproxy_operator.docker import doctor as docker_doctor
-from rosproxy_operator.docker.doctor import CURES, host_findings
+from rosproxy_operator.docker.doctor import FIXES, host_findings
 from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 
 
-def test_findings_carry_the_proxys_name_and_the_operators_cure() -> None:
+def test_findings_carry_the_proxys_name_and_the_operators_fix() -> None:
     said = [
         ok("admin", "proxy", "rosproxy 1"),
         error("advertised host", "advertised host", "leads nowhere", "--advertise-host ADDRESS"),
         error("node", "/talker", "is gone", "restart it"),
     ]
-    findings = read_findings("proxy a", json.dumps(as_json(said)).encode(), CURES)
+    findings = read_findings("proxy a", json.dumps(as_json(said)).encode(), FIXES)
     assert [finding.subject for finding in findings] == [
         "proxy a: proxy",
         "proxy a: advertised host",
@@ -131,7 +131,7 @@ def test_a_cluster_tells_the_cause_and_no_text_twice() -> None:
     assert findings[0].fix == "kubectl -n lab describe rosproxy robot"
 
 
-def test_each_reason_has_its_own_cure() -> None:
+def test_each_reason_has_its_own_fix() -> None:
     bad = {**condition("PortsAllocated", "False", "no ports"), "reason": "PortsExhausted"}
     dead = {**condition("PortsReachable", "False", "dead"), "reason": "PortsUnreachable"}
     findings = cluster_findings([rosproxy(conditions=[bad, dead])])

@@ -146,7 +146,7 @@ def test_a_participant_that_is_wrong_breaks_its_links() -> None:
     assert "passes on UDP" in document["links"][LINK]["text"]
 
 
-def test_a_service_of_a_participant_that_is_wrong_has_the_cure() -> None:
+def test_a_service_of_a_participant_that_is_wrong_has_the_fix() -> None:
     wrong = ParticipantStatus(
         "01.0f.aa", "172.30.0.5", "Fast DDS", services=("/add",), locator_fault="tcp"
     )

@@ -200,7 +200,7 @@ def test_before_anybody_was_asked_the_status_tells() -> None:
     }
 
 
-def test_a_service_of_a_node_that_is_wrong_has_the_cure() -> None:
+def test_a_service_of_a_node_that_is_wrong_has_the_fix() -> None:
     status = make_status(make_node(state="silent", services=["/add"]))
     facts = make_facts(status=status)
     link = made(judge(facts), status)["links"]["service /add /talker "]

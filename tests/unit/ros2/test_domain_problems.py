@@ -45,7 +45,7 @@ def test_nothing_is_wrong() -> None:
         ({"proven": False}, "reached", False, "10.0.0.1"),
     ],
 )
-def test_each_cause_has_its_cure(
+def test_each_cause_has_its_fix(
     changes: dict[str, object], check: str, grave: bool, said: str
 ) -> None:
     (problem,) = with_inside(**changes)
@@ -73,7 +73,7 @@ def test_outside_is_reached_by_its_own_addresses() -> None:
     assert list(domain_problems(replace(DOMAIN, outside=(secured,)))) == []
 
 
-def test_a_longer_range_is_no_cure_for_too_many_locators() -> None:
+def test_a_longer_range_is_no_fix_for_too_many_locators() -> None:
     (problem,) = with_inside(problem="has more than 16 locators", shortage="bound")
     assert "--port-range" not in problem.text + problem.fix
 

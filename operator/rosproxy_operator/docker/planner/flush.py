@@ -38,11 +38,11 @@ from rosproxy_operator.docker.settings import PlanSettings
 
 @dataclass(frozen=True, slots=True)
 class FlushSteps:
-    """The steps for the flush of one key. ``cure`` says what users can do where a step fails."""
+    """The steps for the flush of one key. ``fix`` says what users can do where a step fails."""
 
     key: Key
     actions: tuple[Action, ...]
-    cure: str = ""
+    fix: str = ""
 
 
 def flush_config(action: CreateFlush, settings: PlanSettings) -> dict[str, Any]:
@@ -80,7 +80,7 @@ def flush_steps(
             yield FlushSteps(key, tuple(gone))
         elif key in live and (sandbox := _published(key, observed)):
             steps = _steps(sandbox, existing, outdated, observed, settings)
-            yield FlushSteps(key, tuple(steps), _cure(sandbox))
+            yield FlushSteps(key, tuple(steps), _fix(sandbox))
 
 
 def _is_busy(key: Key, observed: HostState) -> bool:
@@ -125,7 +125,7 @@ def _is_current(record: FlushContainer, sandbox: Sandbox, outdated: Mapping[str,
     return record.done and is_later and outdated.get(record.container.id) != ran_at
 
 
-def _cure(sandbox: Sandbox) -> str:
+def _fix(sandbox: Sandbox) -> str:
     """How users delete the entries themselves."""
     ports = own_range(sandbox.key, sandbox.range)
     return (

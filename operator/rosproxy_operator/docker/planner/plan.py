@@ -43,14 +43,14 @@ class Group:
     One ``subject`` a container alone, for a redirect, and the key's other groups do not wait for
     each other. When an action fails, the rest of its group is left out, so that a proxy is only
     removed when its successor was created; but a failed Connect or Disconnect stops nothing else.
-    ``cure`` is what users can do where one fails again and again, in words; empty for nothing.
+    ``fix`` is what users can do where one fails again and again, in words; empty for nothing.
     ``fatal``: a failure keeps an object from what its user wants (`Problem`).
     """
 
     key: Key | None
     actions: tuple[Action, ...]
     subject: str = ""
-    cure: str = ""
+    fix: str = ""
     fatal: bool = True
 
 
@@ -170,7 +170,7 @@ def _possible_groups(
     groups = _groups(observed, settings.uplink, desired, planned, naming)
     yield from (group for group in groups if group.key not in busy)
     for steps in redirect_steps(observed, settings, desired):
-        yield Group(steps.key, steps.actions, f"container {steps.container}", steps.cure)
+        yield Group(steps.key, steps.actions, f"container {steps.container}", steps.fix)
     yield from flush_groups(observed, settings, desired, memory.outdated_flushes)
 
 
@@ -184,7 +184,7 @@ def flush_groups(
     for flush in flush_steps(observed, settings, desired, outdated):
         if flush.actions:
             subject = f"conntrack entries for {proxy_name(flush.key)}"
-            yield Group(flush.key, flush.actions, subject, flush.cure, fatal=False)
+            yield Group(flush.key, flush.actions, subject, flush.fix, fatal=False)
 
 
 def _groups(

@@ -70,13 +70,13 @@ RedirectSite = tuple[Key, str]
 class RedirectSteps:
     """What is to be done for one redirect; ``container`` names the one whose network it is in.
 
-    ``cure`` is what its user can do where that fails; empty where a redirect is taken away.
+    ``fix`` is what its user can do where that fails; empty where a redirect is taken away.
     """
 
     key: Key
     container: str
     actions: tuple[Action, ...]
-    cure: str = ""
+    fix: str = ""
 
 
 def redirect_config(action: CreateRedirect, settings: PlanSettings) -> dict[str, Any]:
@@ -123,8 +123,8 @@ def redirect_steps(
             steps = _removal_steps(site[1], existing, observed, settings)
         if steps and not _is_busy(existing, observed):
             name = names.get(site[1], site[1][:12])
-            cure = _by_name(site[0])
-            yield RedirectSteps(site[0], name, tuple(steps), cure if site in wanted else "")
+            fix = _by_name(site[0])
+            yield RedirectSteps(site[0], name, tuple(steps), fix if site in wanted else "")
 
 
 def _by_name(key: Key) -> str:

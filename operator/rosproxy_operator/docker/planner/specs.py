@@ -161,7 +161,7 @@ def _identity(key: Key) -> str:
 def unresolved_master(host: str) -> str:
     """What to do about a master whose host's name leads nowhere.
 
-    An address in its place is no cure: nodes that have one in ROS_MASTER_URI go around the proxy.
+    An address in its place is no fix: nodes that have one in ROS_MASTER_URI go around the proxy.
     """
     return (
         f"the name {host} can't be resolved where the operator runs: let it know the name, and "

@@ -6,7 +6,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
 from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
-from rosproxy_operator.kubernetes.status.cures import cure
+from rosproxy_operator.kubernetes.status.fixes import fix_for
 
 _WRONG = {
     "MasterReachable": "False",
@@ -45,7 +45,7 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
         message = text_at(condition, "message")
         if text_at(condition, "status") == bad and message not in messages:
             messages.add(message)
-            fix = cure(text_at(condition, "reason"), id)
+            fix = fix_for(text_at(condition, "reason"), id)
             yield error("rosproxy", subject, f"{kind} is {bad}: {message}", fix)
     if messages:
         return

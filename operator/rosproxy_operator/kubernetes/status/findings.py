@@ -160,7 +160,7 @@ def _answered(
 def _own_problems(answer: ProxyReport) -> list[str]:
     """The problems that a proxy tells, but those of its master and its range.
 
-    They would say the same again, and with the cures of Docker.
+    They would say the same again, and with the fixes of Docker.
     """
     told = ["master: "] if not answer.master_up else []
     told += [f"{RANGE}: "] if answer.range_probe else []

@@ -82,7 +82,7 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
     lacks_ca = not text_at(submap(our_webhook(configuration), "clientConfig"), "caBundle")
     if lacks_ca:
         text = "it has no caBundle, so that the API server trusts no operator: no pod is wired"
-        yield error(_CHECK, subject, text, f"{_ca_cure(metadata, service)}; {_ANEW}")
+        yield error(_CHECK, subject, text, f"{_ca_fix(metadata, service)}; {_ANEW}")
     if not service.name or service not in facts.ready:
         return
     ready = facts.ready[service]
@@ -96,7 +96,7 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
         yield ok(_CHECK, subject, text)
 
 
-def _ca_cure(metadata: Json, service: Name) -> str:
+def _ca_fix(metadata: Json, service: Name) -> str:
     if "cert-manager.io/inject-ca-from" in texts_at(metadata, "annotations"):
         source = f"kubectl -n {service.namespace} get certificates"
         return f"cert-manager has to set it: does its cainjector run? {source}"

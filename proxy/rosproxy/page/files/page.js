@@ -10,7 +10,7 @@ const AT_MOST_EVERY = 500;
 const MOST_ROWS = 400;
 const MOST_FINDINGS = 30;
 const MOST_LABELS = 80;
-const LONGEST_CURE = 120;
+const LONGEST_FIX = 120;
 const AGAIN = 5000;
 const SILENT = 40000; // the proxy says something every 15 s
 const LOST = "Not connected; what is shown may be old. Trying again…";
@@ -100,7 +100,7 @@ function showHead(found, items) {
   if (document.title !== title) document.title = title;
 }
 
-// All that is wrong, what is broken first: those with one text and one cure are one.
+// All that is wrong, what is broken first: those with one text and one fix are one.
 function troubles() {
   const told = new Map();
   const tell = (what, kind, text, fix) => {
@@ -209,7 +209,7 @@ function showGraph(found) {
   const places = positions(boxes);
   const wanted = new Map();
   const now = Date.now() / 1000 + clock;
-  let cures = 0;
+  let fixes = 0;
   for (const box of boxes.values()) {
     const count = box.fold ? ` (${box.count})` : "";
     wanted.set(box.id, { group: "nodes", position: places.get(box.id),
@@ -218,7 +218,7 @@ function showGraph(found) {
   for (const line of lines.values()) {
     const same = boxes.get(line.from).lane === boxes.get(line.to).lane ? "yes" : "no";
     const wrong = line.state === "broken" || line.state === "warning";
-    const labelled = wrong ? (cures += 1) <= MOST_LABELS : lines.size <= MOST_LABELS;
+    const labelled = wrong ? (fixes += 1) <= MOST_LABELS : lines.size <= MOST_LABELS;
     wanted.set(line.id, { group: "edges", data: { id: line.id, source: line.from, target: line.to, state: line.state,
       same, flows: line.flows ? "yes" : "no", label: labelled ? lineLabel(line, now) : "" } });
   }
@@ -242,7 +242,7 @@ function showGraph(found) {
   showFolds(spaces);
 }
 
-// What stands at a line: what is wrong first with its cure; else what is known of its one link.
+// What stands at a line: what is wrong first with its fix; else what is known of its one link.
 function lineLabel(line, now) {
   const { link } = line.links[0]; // the worst: see visibleLinks
   const more = line.links.length > 1 ? ` and ${line.links.length - 1} more` : "";
@@ -256,7 +256,7 @@ function lineLabel(line, now) {
 }
 
 function short(text = "") {
-  return text.length > LONGEST_CURE ? `${text.slice(0, LONGEST_CURE)}…` : text;
+  return text.length > LONGEST_FIX ? `${text.slice(0, LONGEST_FIX)}…` : text;
 }
 
 function showFolds(spaces) {

@@ -233,7 +233,7 @@ class StandIns:
             self.by_local[stand_in.local] = self.by_local.pop(stand_in.local)
 
     def advice(self, target: HostPort, reason: str, address: str) -> str:
-        """What is wrong where no port can stand in, and the cure; ``address`` is the master's."""
+        """What is wrong where no port can stand in, and the fix; ``address`` is the master's."""
         if self.is_bidirectional:
             return f"inside nodes can't reach it: no port stands in for {target}; the last {reason}"
         return (

@@ -1,7 +1,7 @@
 """A subscriber that hears nothing though its publisher is there: having it connect again.
 
 After the proxy was away, or a port has refused for a time, subscribers may have given up for good
-(see `decisions.resubscription`). There is one cure for roscpp and rospy: a ``publisherUpdate``
+(see `decisions.resubscription`). There is one fix for roscpp and rospy: a ``publisherUpdate``
 without the publisher, then one with it. The proxy sends the first itself (`_withdraw`), and only
 to subscribers without a connection, since it costs the others theirs. For the second, one publisher
 of each topic is registered again, which makes the master tell all of the topic's subscribers.

@@ -99,7 +99,7 @@ async def test_a_key_that_takes_long_holds_up_no_other(host: Host) -> None:
 
 async def test_what_fails_ends_its_group_and_is_tried_again_later(host: Host) -> None:
     host.does[Start("a")] = EngineError("no")
-    group = Group(ONE, (Start("a"), Start("b")), cure="do this")
+    group = Group(ONE, (Start("a"), Start("b")), fix="do this")
     await host.start(group, Group(OTHER, (Start("c"),)))
     while host.work.busy:
         await asyncio.sleep(0.01)

@@ -193,7 +193,7 @@ def test_where_it_fails_users_are_told_the_command_and_nothing_else_waits() -> N
     (group,) = groups(published())
     assert group.subject == f"conntrack entries for {proxy_name(KEY)}"
     assert not group.fatal
-    assert group.cure.endswith(
+    assert group.fix.endswith(
         f"for port in $(seq {RANGE.first} {RANGE.last - 1}); "
         "do conntrack -D -p udp --orig-port-dst $port; done"
     )
@@ -201,7 +201,7 @@ def test_where_it_fails_users_are_told_the_command_and_nothing_else_waits() -> N
 
 def test_the_doctor_prints_the_command_as_a_warning() -> None:
     (group,) = groups(published())
-    text = f"{group.actions[-1]}: ended with 1; {group.cure}"
+    text = f"{group.actions[-1]}: ended with 1; {group.fix}"
     problem = {"subject": group.subject, "text": text, "fatal": group.fatal}
     status: dict[str, Any] = {"problems": [problem], "proxies": [], "actions": []}
     status |= {"containers": [], "operator": None}

@@ -107,7 +107,7 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
 
 
 @pytest.mark.parametrize(
-    ("variables", "cure"),
+    ("variables", "fix"),
     [
         ({"ROS_DISCOVERY_SERVER": "10.0.0.9:11811"}, "unset it"),
         ({"ROS_LOCALHOST_ONLY": "1"}, "unset it"),
@@ -119,12 +119,12 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
     ],
 )
 def test_a_variable_is_named_where_no_participant_is_heard(
-    variables: dict[str, str], cure: str
+    variables: dict[str, str], fix: str
 ) -> None:
     (text,) = told_of_talker(variables)
     ((name, value),) = variables.items()
     assert f"its variable {name}={value}: " in text
-    assert cure in text
+    assert fix in text
     assert not told_of_talker(variables, inside=[TALKER.address]), "all is well"
     assert not told_of_talker(variables, age=1.0), "it has just started"
     assert not told_of_talker(variables, uptime=1.0), "its proxy has just started"

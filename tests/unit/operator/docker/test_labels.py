@@ -301,7 +301,7 @@ def test_an_address_that_is_not_known() -> None:
     assert "--advertise-host" in text
 
 
-def test_a_masters_name_that_leads_nowhere_is_the_cause_and_its_cure_the_whole() -> None:
+def test_a_masters_name_that_leads_nowhere_is_the_cause_and_its_fix_the_whole() -> None:
     text = refusal(container(), PlanSettings(), masters={"robot": ""})
     assert text.startswith("its master is not found: the name robot can't be resolved")
     assert "--add-host robot:ADDRESS" in text

@@ -132,10 +132,10 @@ def test_it_is_not_set_without_a_proxy_and_stays_while_that_is_away() -> None:
         assert steps(replace(state, redirects=(record(made),))) == []
 
 
-def test_where_it_can_not_be_set_a_name_is_the_cure() -> None:
+def test_where_it_can_not_be_set_a_name_is_the_fix() -> None:
     state = observed(node(), **nodes_proxy())
     (group,) = (g for g in look(state).groups if g.subject == "container talker")
-    assert group.cure.endswith(f"set ROS_MASTER_URI=http://{proxy_name(KEY)}:11311 and the label "
+    assert group.fix.endswith(f"set ROS_MASTER_URI=http://{proxy_name(KEY)}:11311 and the label "
                                f"rosproxy.master-uri={MASTER}")  # fmt: skip
     made = wanted(state)
     (undo,) = (
@@ -143,7 +143,7 @@ def test_where_it_can_not_be_set_a_name_is_the_cure() -> None:
         for g in look(replace(state, redirects=(record(made),)), OFF).groups
         if g.subject == "container talker"
     )
-    assert undo.cure == ""
+    assert undo.fix == ""
 
 
 def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:

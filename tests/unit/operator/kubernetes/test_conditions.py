@@ -121,7 +121,7 @@ def test_a_proxy_that_does_not_answer_the_controller():
 
 
 @pytest.mark.parametrize(
-    ("from_proxy", "from_master", "cause", "cure"),
+    ("from_proxy", "from_master", "cause", "fix"),
     [
         ("refused", "missed", "nothing listens there", "hostPorts (CNI: the plug-in portmap)"),
         ("silent", "missed", "there is no answer", "the node's firewall"),
@@ -130,7 +130,7 @@ def test_a_proxy_that_does_not_answer_the_controller():
         ("of a later release", "missed", "the try failed", "portmap"),
     ],
 )
-def test_ports_that_outside_does_not_reach(from_proxy, from_master, cause, cure):
+def test_ports_that_outside_does_not_reach(from_proxy, from_master, cause, fix):
     probe = RangeProbeStatus(False, from_proxy, from_master, "tcp")
     said = ("published range: 192.0.2.11, port 11400: docker run -p", "/a: hangs")
     dead = answer("/a", range_probe=probe, problems=said)
@@ -143,7 +143,7 @@ def test_ports_that_outside_does_not_reach(from_proxy, from_master, cause, cure)
         f"{proxy_name}: outside does not reach ports 11400-11431 of 192.0.2.11 ("
     )
     assert cause in text
-    assert cure in text
+    assert fix in text
     assert judged(rosproxy_status, "Ready") == ("True", "Serving")
     assert judged(rosproxy_status, "Degraded") == ("True", "PortsUnreachable")
     assert "docker" not in message(rosproxy_status, "Degraded")

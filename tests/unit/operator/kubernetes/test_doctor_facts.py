@@ -68,7 +68,7 @@ CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}
 
 
 @pytest.mark.parametrize(
-    ("webhook", "ready", "text", "cure"),
+    ("webhook", "ready", "text", "fix"),
     [
         ({"ca": ""}, (True,), "no caBundle", "within 20 s"),
         ({"ca": "", "annotations": CERT_MANAGER}, (True,), "no caBundle", "its cainjector run?"),
@@ -78,7 +78,7 @@ CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}
     ],
 )
 async def test_a_webhook_that_can_not_work(
-    server: ApiServer, api: Api, webhook: Obj | None, ready: Any, text: str, cure: str
+    server: ApiServer, api: Api, webhook: Obj | None, ready: Any, text: str, fix: str
 ) -> None:
     put_operator(server, "--webhook-bind=x:1")
     if webhook is not None:
@@ -88,7 +88,7 @@ async def test_a_webhook_that_can_not_work(
     (finding,) = await about_webhook(api)
     assert finding.severity is Severity.ERROR
     assert text in finding.text
-    assert cure in finding.fix
+    assert fix in finding.fix
     assert "rollout restart" in finding.fix
 
 

@@ -233,7 +233,7 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
         ),
     ],
 )
-def test_the_cure_is_told(spec, text):
+def test_the_fix_is_told(spec, text):
     with pytest.raises(InvalidField, match=re.escape(text)):
         rosproxy(rosproxy_obj(spec))
 

@@ -1,4 +1,4 @@
-"""Cures are pasted into a shell: no name that a node has chosen is a command there."""
+"""Fixes are pasted into a shell: no name that a node has chosen is a command there."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -62,14 +62,14 @@ def facts_of_all_kinds() -> Iterator[DoctorFacts]:
 
 
 def bare(fix: str) -> str:
-    """A cure without the words that are quoted."""
+    """A fix without the words that are quoted."""
     for name in (NODE, OTHER, TOPIC, SERVICE, f"/a{TOPIC}", *URIS, f"10.0.0.5{COMMAND}"):
         fix = fix.replace(quoted(name), "")
     return fix
 
 
 def test_no_rule_has_a_name_as_a_command() -> None:
-    """``rostopic info /scan;reboot`` was the cure for a topic of that name."""
+    """``rostopic info /scan;reboot`` was the fix for a topic of that name."""
     fixes = {f.fix for facts in facts_of_all_kinds() for f in diagnose(facts)}
     assert {fix for fix in fixes if "pwned" in bare(fix)} == set()
     assert sum("pwned" in fix for fix in fixes) > 10

@@ -5,7 +5,7 @@ The message of the condition names the object and says the same in full.
 
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, INJECT, PROXY_OF
-from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_CURE, PORTS_CURE
+from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_FIX
 
 _EDIT = "kubectl -n {of.namespace} edit rosproxy {of.name}"
 _DESCRIBE = "kubectl -n {of.namespace} describe rosproxy {of.name}"
@@ -21,7 +21,7 @@ _BY_REASON = {
     "MasterUnreachable": f"start the master; or {_EDIT}: spec.master, with spec.master.address "
     "where the cluster does not know its name",
     "NameTaken": "delete or rename the object that the message names",
-    "NoAdvertiseHost": ADDRESS_CURE,
+    "NoAdvertiseHost": ADDRESS_FIX,
     "NodeLeftOut": f"{_EDIT}: spec.nodeSelector",
     "NodeNotReady": "kubectl get nodes; kubectl describe node NODE",
     "NotAllowed": f"{_EDIT}: the field that the message names; or allow it, by the chart's allow…",
@@ -30,7 +30,7 @@ _BY_REASON = {
     "PolicyRefused": f"{_EDIT}: another spec.image, or none",
     "PortConflict": f"{_EDIT}: leave the ports that others take out of spec.portWindow",
     "PortsExhausted": f"{_EDIT}: fewer spec.ports, or a wider spec.portWindow",
-    "PortsUnreachable": PORTS_CURE,
+    "PortsUnreachable": PORTS_FIX,
     "ProxiesStarting": f"wait a moment; {_PODS}",
     "ProxyStuck": _PODS,
     "ProxyUnreachable": f"let the operator's pods connect to port {ADMIN_PORT} of pods with the "
@@ -41,6 +41,6 @@ _BY_REASON = {
 }
 
 
-def cure(reason: str, of: Name) -> str:
+def fix_for(reason: str, of: Name) -> str:
     """What mends a condition with this reason; where that is not known, where to look."""
     return _BY_REASON.get(reason, _DESCRIBE).format(of=of)
