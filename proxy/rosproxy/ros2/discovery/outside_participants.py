@@ -37,7 +37,7 @@ from rosproxy.ros2.discovery.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
-from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_vendor
@@ -266,7 +266,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         alone.
         """
         is_met = self.find(message.prefix, source) is not None
-        return is_met or destination(message.datagram) == observer or self.settings.is_peer(source)
+        is_named = is_destination(message.datagram, observer)
+        return is_met or is_named or self.settings.is_peer(source)
 
     def allowed_questions(
         self, outsider: OutsideParticipant, questions: Iterable[bytes]

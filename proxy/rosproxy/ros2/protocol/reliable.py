@@ -15,9 +15,9 @@ from collections.abc import Collection, Iterator, Sequence
 
 import msgspec
 
-from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.rtps import (
     LAST_NUMBER,
+    PREFIX,
     Overwrite,
     RtpsError,
     Sample,
@@ -72,13 +72,16 @@ def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> byt
 def acknowledged(datagram: bytes, prefix: bytes, writer: int) -> list[int]:
     """The numbers that a message's readers expect next of a writer of the participant ``prefix``.
 
-    Raises RtpsError if a length leads outside.
+    Cyclone DDS puts answers to several participants at one locator into one message. Each answer is
+    for the participant of the INFO_DST before it. Raises RtpsError if a length leads outside.
     """
-    if destination(datagram) != prefix:
-        return []
     numbers = []
+    addressee = b""
     for kind, flags, body in submessages(datagram):
-        if kind == SubmessageId.ACKNACK and body.end - body.start >= 16:
+        if kind == SubmessageId.INFO_DST:
+            addressee = datagram[body.start : body.start + PREFIX]
+        is_answer = kind == SubmessageId.ACKNACK and addressee == prefix
+        if is_answer and body.end - body.start >= 16:
             acked_writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
             order = "<" if flags & _LITTLE else ">"
             base = _number(*struct.unpack_from(order + "iI", datagram, body.start + 8))

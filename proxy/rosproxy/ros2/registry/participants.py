@@ -14,7 +14,7 @@ import msgspec
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.qos import EndpointQos
 from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS, NO_VENDOR, RTI
 
@@ -344,7 +344,7 @@ class OutsideParticipant(Participant):
         A message to ``addressee`` answers one of the proxy's. A forger on the LAN can send it too,
         where it hears the same announcements. Raises RtpsError.
         """
-        if not self.has_answered and destination(datagram) == addressee:
+        if not self.has_answered and is_destination(datagram, addressee):
             self.has_answered = True
         self.credit += size * (ANSWERED_FACTOR if self.has_answered else 1)
 

@@ -17,7 +17,7 @@ from rosproxy.ros2.discovery.port_store import (
 )
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import heartbeats
-from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.protocol.rtps import HEADER, source_prefix
 from tests.unit.ros2.discovery.domains import kept_halves, kept_number
 
 RANGE = PortRange(11400, 11463)
@@ -235,3 +235,19 @@ def test_it_asks_and_reminds_by_heartbeats() -> None:
                 port_store.prefix,
                 port_store.witness,
             ]
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_answers_to_both_in_one_message(is_first: bool) -> None:
+    """Cyclone DDS packs them so. The numbers of the one counted for the other, and it kept none."""
+    port_store = make_port_store()
+    ports = [11405]
+    answers = [
+        kept_halves(port_store.prefix, PEER, port_store.number(ports), port_store.port_bits),
+        kept_halves(port_store.witness, PEER, port_store.proof(PEER, ports), HALF_BITS),
+    ]
+    first, second = answers if is_first else answers[::-1]
+    assert port_store.take(PEER, first + second[HEADER:])
+    assert port_store.keeps(PEER, ports)
+    assert port_store.former_ports(PEER) == ports
+    assert port_store.proven_count(PEER) == 1
