@@ -45,14 +45,16 @@ def test_messages_flow_again_by_the_second(lab: Lab, vendor: str, is_told: bool)
     for reader in readers:
         reader.wait_for_count("^got hello ", 5)
     c1 = lab.place("c1")
-    served_at = {participant.address for participant in lab.domain().inside}
+    # Each participant is served at the address that was heard first, which may differ.
+    served_at = [participant.address for participant in lab.domain().inside]
     gateways = ["172.30.1.1", "172.30.2.1"]
-    first = c1.addresses.index(served_at.pop())
+    first = c1.addresses.index(served_at[0])
     second = 1 - first
     ip("-n", c1.namespace, "link", "set", f"eth{first}", "down")
     ip("-n", c1.namespace, "route", "replace", "default", "via", gateways[second])
     if is_told:
-        assert lab.tell("/containers", gone=[c1.addresses[first]])["unregistered"] == 2
+        told = lab.tell("/containers", gone=[c1.addresses[first]])
+        assert told["unregistered"] == served_at.count(served_at[0])
     for reader in readers:
         reader.wait_for_count("^got hello ", 10, since=reader.mark())
     assert {p.address for p in lab.domain().inside} == {c1.addresses[second]}
