@@ -43,7 +43,7 @@ from rosproxy_operator.kubernetes.settings import (
 
 
 def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
-    """``host:port`` to listen on; ``none`` is None where ``optional``. Raises ValueError."""
+    """``host:port`` to listen on; if ``optional``, ``none`` is None. Raises ValueError."""
     listener = parse_host_port(text)
     if listener is None and not (optional and text == "none"):
         raise ValueError(f"{text!r} is not of the form {example}")
@@ -53,18 +53,22 @@ def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
 def _bind_option(
     name: str, example: HostPort, text: str, optional: bool = False
 ) -> Callable[[Command], Command]:
-    """Where to listen: by default at the example, or if that is ``optional`` nowhere."""
+    """An option with an address and port; the default is the example, or none if ``optional``."""
     kind = Parsed("address:port", partial(_read_bind, example, optional))
     return click.option(name, type=kind, default="none" if optional else str(example), help=text)
 
 
 _resync_option = click.option(
-    "--resync", type=Seconds(1.0), default=30.0, metavar="S", help="Longest time between two looks."
+    "--resync",
+    type=Seconds(1.0),
+    default=30.0,
+    metavar="S",
+    help="Longest time between two looks at the host.",
 )
 
 
 class OperatorCommands(Commands):
-    """Commands whose usage errors begin with this program's name."""
+    """Commands whose usage errors begin with ``rosproxy-operator``."""
 
     program = "rosproxy-operator"
 
@@ -72,7 +76,7 @@ class OperatorCommands(Commands):
 @click.group(cls=OperatorCommands, context_settings=GROUP_SETTINGS)
 @click.version_option(__version__, prog_name="rosproxy-operator")
 def main() -> None:
-    """Sets up rosproxy by itself for the containers of a host or the pods of a cluster."""
+    """Set up proxies for the labelled containers of a host or the labelled pods of a cluster."""
 
 
 @main.group(
@@ -85,14 +89,16 @@ def main() -> None:
 @policy_options
 @_resync_option
 @_bind_option(
-    "--admin-bind", DEFAULT_ADMIN, "Where /healthz, /readyz, /metrics and the live page are served."
+    "--admin-bind",
+    DEFAULT_ADMIN,
+    "Address and port of /healthz, /readyz, /metrics and the live page of all proxies.",
 )
 @log_options
 @config_option
 @click.option(
     "--once",
     is_flag=True,
-    help="Do what is to be done now and exit: with 0 if all is as wanted, with 1 if not.",
+    help="Do once what the labels ask for, and exit: with 0 if nothing is wrong, else with 1.",
 )
 @click.pass_context
 def docker(
@@ -100,8 +106,8 @@ def docker(
 ) -> None:
     """Look after the labelled containers of a Docker engine.
 
-    The engine is the one that DOCKER_HOST names, else this host's. Every option has an
-    environment variable: ROSPROXY_ and its name (ROSPROXY_PORTS); the master's is also
+    The engine is that of DOCKER_HOST, else that of this host. Every option has an environment
+    variable: ROSPROXY_ and the option's name, such as ROSPROXY_PORTS. --master-uri also has
     ROS_MASTER_URI.
     """
     from rosproxy.telemetry import logs
@@ -114,7 +120,8 @@ def docker(
     unknown = _unknown_variables(log=not runs)
     with setting_errors():
         settings = make_plan_settings(options)
-    # Who gives options asks what an operator with these would do, whatever the running one does.
+    # A command with options tells what an operator with these options would do, whatever the
+    # running operator does.
     sources = (context.get_parameter_source(name) for name in options if name != "admin_bind")
     context.obj = docker_commands.CommandContext(
         settings, options["admin_bind"], ParameterSource.COMMANDLINE in sources, options["resync"]
@@ -127,12 +134,12 @@ def docker(
 
 
 def _unknown_variables(log: bool = True) -> list[UnknownVariable]:
-    # The proxy's variables have the same prefix, ROSPROXY_, and are no mistake here.
+    # The proxy's variables have the same prefix, ROSPROXY_: here they are no mistake.
     return unknown_variables(main, proxy_main, log=log)
 
 
 def _need(library: str, extra: str) -> None:
-    """Say how to install a library that one kind of controller needs, if it is not there."""
+    """Exit if a library that an operator needs is missing, and print how to install it."""
     if importlib.util.find_spec(library) is None:
         fail(
             f"the Python package {library} is not installed here: "
@@ -176,7 +183,7 @@ for command in (
 @_bind_option(
     "--webhook-bind",
     DEFAULT_WEBHOOK,
-    "Where the admission webhook is served that wires pods; none: it is not.",
+    "Address and port of the admission webhook that wires pods. none: no webhook.",
     optional=True,
 )
 @settings_options(WebhookSettings)
@@ -186,8 +193,8 @@ for command in (
 def kubernetes(context: click.Context, /, log_format: str, log_level: str, **options: Any) -> None:
     """Look after the RosProxies of a Kubernetes cluster.
 
-    The cluster is the one that this runs in, else the one that KUBECONFIG names. Every option has
-    an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
+    The cluster is that of the pod in which this program runs, else that of KUBECONFIG. Every option
+    has an environment variable: ROSPROXY_ and the option's name, such as ROSPROXY_PROXY_IMAGE.
     """
     for library in ("kubernetes", "kopf", "cryptography"):
         _need(library, "kubernetes")
@@ -226,5 +233,5 @@ def health() -> None:
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        # With an HTTP status the operator has answered, and its text says what is wrong with it.
+        # With an HTTP status the operator has answered, and the text says what is wrong.
         fail(error if "HTTP" in str(error) else f"no operator answers at {url}")

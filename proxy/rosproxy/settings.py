@@ -1,8 +1,8 @@
 """The settings of a proxy: plain data, checked.
 
-Each is written once, in `Settings`: its field, type, default, and the `Option` from which come the
-option of ``rosproxy run``, its variable, its key in the file of ``--config``, its help, its bounds
-and its row in docs/reference/options.md.
+Each setting is written once, in `Settings`: field, type, default and `Option`. From these come the
+option of ``rosproxy run``, the variable, the key in the file of ``--config``, the help, the bounds
+and the row in docs/reference/options.md.
 """
 
 from dataclasses import dataclass, field
@@ -17,26 +17,27 @@ from rosproxy.setting_kinds import DataPlane, Direction, Option, SettingError, S
 
 MEBIBYTE = 1024 * 1024
 LEAST_PER_DOMAIN = 4
-"""Ports of the range for a domain of ROS 2: one to be found at, three for a participant."""
+"""Ports of the range for a domain of ROS 2: one for discovery, three for a participant."""
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DEFAULT_RANGE = PortRange(11000, 11099)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Everything that ``rosproxy run`` can be told. Times are in seconds.
+    """All settings of ``rosproxy run``. Times are in seconds.
 
-    ``inside_networks`` empty means: the networks of the proxy's own interfaces. If there are
-    others, ROS 1 with ``direction`` ``both`` leaves out that of the default route, and ROS 2 leaves
-    out that of the advertised host. A ``ros2_peer`` with port 0 is told at the well-known ports.
-    Raises SettingError where two of them don't go together.
+    Without ``inside_networks``, the networks of the proxy's own interfaces are inside. If the proxy
+    has several networks, two are left out: by ROS 1 with ``direction`` ``both`` the network of the
+    default route, by ROS 2 the network of the advertised host. The proxy announces participants to
+    a ``ros2_peer`` with port 0 at the well-known ports. Raises SettingError if two settings exclude
+    each other.
     """
 
     ros: Annotated[
         tuple[Literal["1", "2"], ...],
         Option(
-            "Version of ROS that the proxy is for. Repeatable: one process for both, with one "
-            "range, which ROS 1 uses for TCP and ROS 2 for UDP.",
+            "ROS version that the proxy serves. Repeatable: one process then serves both "
+            "versions with one range. ROS 1 uses the range for TCP, ROS 2 for UDP.",
             repeatable=True,
             note="`1 2` for both",
         ),
@@ -44,7 +45,8 @@ class Settings:
     master_uri: Annotated[
         str,
         Option(
-            "The real master, e.g. `http://robot:11311`. It need not be up when the proxy starts.",
+            "The real master, for example `http://robot:11311`. The proxy also starts while "
+            "the master is down.",
             kinds.MASTER_URI,
             variables=("ROSPROXY_MASTER_URI", "ROS_MASTER_URI"),
             default="required for ROS 1",
@@ -53,40 +55,42 @@ class Settings:
     master_address: Annotated[
         str | None,
         Option(
-            "IP address of the master's host, to connect to instead of resolving its name; the "
-            "name may then be [one of the proxy itself](../guide/by-hand.md#keep-the-masters-name)."
-            " It can be changed at run time.",
+            "IP address of the master's host. The proxy connects to this address instead of "
+            "resolving the host name. Inside, the name can then be [an alias of the "
+            "proxy](../guide/by-hand.md#keep-the-masters-name). The address can be changed at "
+            "run time.",
             kinds.ADDRESS,
-            default="where its name leads",
+            default="the address of the master's name",
         ),
     ] = None
     advertise_host: Annotated[
         str,
         Option(
             "Name or address under which outside nodes and the master reach this host. All of "
-            "them must be able to resolve it.",
+            "them must be able to resolve the name.",
             kinds.HOST,
         ),
     ]
     master_port: Annotated[
         int,
         Option(
-            "Where inside nodes find their master: `ROS_MASTER_URI=http://<proxy>:11311`.",
+            "Port at which inside nodes find their master: `ROS_MASTER_URI=http://<proxy>:11311`.",
             kinds.PORT,
         ),
     ] = 11311
     port_range: Annotated[
         PortRange,
         Option(
-            "Ports that the proxy listens on. [One for each node inside]"
-            "(../guide/by-hand.md#how-many-ports); publish exactly these.",
+            "Ports that the proxy listens on: [one port for each inside "
+            "node](../guide/by-hand.md#how-many-ports). Publish exactly these ports.",
             kinds.PORT_RANGE,
         ),
     ] = DEFAULT_RANGE
     advertise_port_range: Annotated[
         PortRange | None,
         Option(
-            "The same ports as outside sees them, if that differs: as many, in the same order.",
+            "The same ports as outside sees them, if outside sees other numbers. Both ranges "
+            "need the same number of ports, in the same order.",
             kinds.PORT_RANGE,
             default="as `--port-range`",
         ),
@@ -94,22 +98,24 @@ class Settings:
     publish_master: Annotated[
         int | None,
         Option(
-            "Where the master itself runs inside: offers it to outside on this port (publish it "
-            "too). It calls nodes at the advertised address, so it must itself reach the host's "
-            "published ports; Docker's own port proxy sees to that, NAT without hairpin does not.",
+            "For a master that runs inside: port on which the proxy offers this master to "
+            "outside. Publish this port, too. The master calls nodes at the advertised "
+            "address, so the master must reach the host's published ports. Docker's own port "
+            "proxy makes that possible; NAT without hairpin does not.",
             kinds.PORT,
             default="off",
         ),
     ] = None
     bind: Annotated[
         str,
-        Option("Address to listen on; `::` for IPv4 and IPv6.", kinds.BIND_ADDRESS),
+        Option("Address to listen on. `::` listens on IPv4 and IPv6.", kinds.BIND_ADDRESS),
     ] = "0.0.0.0"
     admin: Annotated[
         HostPort,
         Option(
-            "The admin endpoint ([API](admin-api.md)) and the live page. To let Prometheus scrape, "
-            "bind it to an address that only your monitoring reaches.",
+            "Address and port of the [admin endpoint](admin-api.md) and of the live page. To "
+            "let Prometheus scrape the metrics, bind the endpoint to an address that only your "
+            "monitoring reaches.",
             kinds.HOST_PORT,
             name="--admin-bind",
         ),
@@ -117,10 +123,11 @@ class Settings:
     admin_token: Annotated[
         str | None,
         Option(
-            "What callers that are not on loopback must send to change anything at the admin "
-            "endpoint, and give to see the [live page](../guide/live-page.md#who-may-look): 8 to "
-            "200 printable ASCII characters without spaces. Better given as a variable: a command "
-            "line can be seen by all.",
+            "Token for callers that are not on loopback. Such a caller needs the token to "
+            "change anything at the admin endpoint, and to see the [live "
+            "page](../guide/live-page.md#who-may-look). 8 to 200 printable ASCII characters "
+            "without spaces. Prefer the variable: all users of the machine can see a command "
+            "line.",
             kinds.TOKEN,
             default="none",
         ),
@@ -128,10 +135,9 @@ class Settings:
     admin_token_hash: Annotated[
         str | None,
         Option(
-            "The same for a proxy that is not to hold the token: its SHA-256 in 64 hex digits "
-            "(`printf %s \"$TOKEN\" | sha256sum`). Whoever reads the proxy's environment can't "
-            "call it then, as long as the token can't be guessed: make it of `openssl rand -hex "
-            "16`.",
+            'SHA-256 of the token in 64 hex digits (`printf %s "$TOKEN" | sha256sum`), in '
+            "place of `--admin-token`. The proxy's environment then does not contain the "
+            "token. Choose a token that cannot be guessed: `openssl rand -hex 16`.",
             kinds.TOKEN_HASH,
             default="none",
         ),
@@ -139,8 +145,10 @@ class Settings:
     inside_networks: Annotated[
         tuple[Network, ...],
         Option(
-            "A network of nodes inside. Only addresses in one, or selected by an operator, may use "
-            "the proxy as their master; there nodes reach each other directly. Repeatable.",
+            "Network of inside nodes. Only addresses in an inside network may use the proxy as "
+            "their master. Once an operator has selected addresses, only the selected "
+            "addresses may. Nodes in the same inside network reach each other directly. "
+            "Repeatable.",
             kinds.NETWORK,
             name="--inside-network",
             variables=("ROSPROXY_INSIDE_NETWORKS",),
@@ -152,39 +160,41 @@ class Settings:
     probe_interval: Annotated[
         float,
         Option(
-            "Time between probes of an idle node. One that ends is noticed at once.",
+            "Time between two probes of an idle node. The proxy notices the end of a node at "
+            "once, without a probe.",
             kinds.time(0.05),
         ),
     ] = 5.0
-    probe_timeout: Annotated[float, Option("Time that a node has to answer.", kinds.time(0.05))] = (
-        3.0
-    )
+    probe_timeout: Annotated[
+        float, Option("Time in which a node must answer.", kinds.time(0.05))
+    ] = 3.0
     cleanup_after: Annotated[
         float,
         Option(
-            "Time after which a node that is gone is unregistered at the master. 0: never.",
+            "Time after which the proxy unregisters a dead node at the master. 0: never.",
             kinds.time(0),
         ),
     ] = 30.0
     linger: Annotated[
         float,
-        Option("Time for which a port is kept after its node has ended.", kinds.time(0)),
+        Option("Time for which the proxy keeps a port after the end of its node.", kinds.time(0)),
     ] = 30.0
     master_interval: Annotated[
-        float, Option("Time between looks at the master.", kinds.time(0.05))
+        float, Option("Time between two checks of the master.", kinds.time(0.05))
     ] = 2.0
     slave_control: Annotated[
         SlaveControl,
         Option(
-            "Who may call `shutdown`, `publisherUpdate` and `paramUpdate` at inside nodes. With "
-            "`master`, `rosnode kill` works from the master's host only."
+            "Which outside hosts may call `shutdown`, `publisherUpdate` and `paramUpdate` at "
+            "inside nodes: `any`, or only the `master`'s host. With `master`, `rosnode kill` "
+            "works from the master's host only."
         ),
     ] = "any"
     policy_rules: Annotated[
         tuple[tuple[Rule, ...], ...],
         Option(
-            "What outside may see and do, and what inside may take from outside: [rules]"
-            "(policy.md) such as `deny publish /camera/*`. Repeatable.",
+            "[Rules](policy.md) about what outside may see and do, and what inside may take "
+            "from outside, for example `deny publish /camera/*`. Repeatable.",
             kinds.POLICY_RULES,
             name="--policy",
             repeatable=True,
@@ -194,12 +204,16 @@ class Settings:
     ] = ()
     policy_mode: Annotated[
         Literal["enforce", "audit"],
-        Option("Whether the rules of `--policy` and `--policy-file` are enforced, or only told."),
+        Option(
+            "`enforce`: the proxy enforces the rules of `--policy` and `--policy-file`. "
+            "`audit`: the proxy only reports what the rules would deny."
+        ),
     ] = "enforce"
     policy_file: Annotated[
         str | None,
         Option(
-            "A file with more such rules, a line each; it is read again when it changes.",
+            "File with more such rules, one per line. The proxy reads the file again when the "
+            "file changes.",
             kinds.FILE,
             default="none",
         ),
@@ -207,8 +221,8 @@ class Settings:
     policy_layers: Annotated[
         tuple[PolicyLayer, ...],
         Option(
-            "For operators: the layers of rules at the start, as [`POST /policy`]"
-            "(admin-api.md#policy) takes them.",
+            "For operators: the layers of rules at the start, in the form of [`POST "
+            "/policy`](admin-api.md#policy).",
             kinds.POLICY_LAYERS,
             default="none",
         ),
@@ -216,70 +230,83 @@ class Settings:
     await_policy: Annotated[
         float,
         Option(
-            "For operators: time at the start without registrations before `POST /policy` comes.",
+            "For operators: longest time that the proxy waits for `POST /policy` after the "
+            "start. Meanwhile the proxy accepts no registrations.",
             kinds.time(0),
         ),
     ] = 0.0
     direction: Annotated[
         Direction,
         Option(
-            "`both`: nodes inside reach those outside through the proxy, too, at [ports on its "
-            "inside addresses](../guide/by-hand.md#no-way-out-but-the-proxy)."
+            "`out`: only outside nodes reach nodes through the proxy. `both`: inside nodes "
+            "reach outside nodes through the proxy, too, at [ports on its inside "
+            "addresses](../guide/by-hand.md#no-way-out-but-the-proxy)."
         ),
     ] = "out"
     udp: Annotated[
         bool,
         Option(
-            "With `--direction both`: the range is published for UDP, too, so that UDPROS of a "
-            "publisher outside comes in. Without, a subscriber gets TCPROS if it offers that."
+            "With `--direction both`: the host also publishes the range for UDP, so that "
+            "UDPROS from an outside publisher arrives. Without this option, a subscriber gets "
+            "TCPROS if the subscriber offers TCPROS."
         ),
     ] = False
     data_plane: Annotated[
-        DataPlane, Option("How topics' bytes are forwarded, see [data plane](#data-plane).")
+        DataPlane,
+        Option(
+            "How topics are forwarded. `kernel`: by the kernel. `splice`, `copy`: by the "
+            "proxy. `auto`: by the kernel if possible, else as `splice`. See [Data "
+            "plane](#data-plane) in the reference of options."
+        ),
     ] = "auto"
     max_lease_call: Annotated[
         int,
         Option(
-            "Longest call of outside to a node, with 10,000 XML elements for each MiB. This and "
-            "the next five: [bounds](limits.md).",
+            "Longest call from outside to a node, with 10,000 XML elements for each MiB. For "
+            "the bounds of this option and the next five, see "
+            "[docs/reference/limits.md](limits.md).",
             kinds.MEBIBYTES,
         ),
     ] = 1
     max_master_call: Annotated[
         int,
         Option(
-            "Longest call with addresses of a node to the master; 5,000 elements for each MiB.",
+            "Longest call with addresses from a node to the master, with 5,000 XML elements "
+            "for each MiB.",
             kinds.MEBIBYTES,
         ),
     ] = 4
     max_body: Annotated[
         int,
         Option(
-            "Longest parameter, or other call or reply without addresses, that passes.",
+            "Longest parameter, or other call or reply without addresses.",
             kinds.MEBIBYTES,
         ),
     ] = 64
     max_buffered: Annotated[
         int,
         Option(
-            "Memory for all calls and replies that are read; one source gets half of it.",
+            "Memory for all calls and replies that the proxy is reading. One source gets at "
+            "most half of this memory.",
             kinds.MEBIBYTES,
         ),
     ] = 32
     max_connections_per_source: Annotated[
         int,
         Option(
-            "Connections from one address; behind NAT or Docker's port proxy many share one.",
+            "Most connections from one address. Behind NAT or Docker's port proxy, many "
+            "machines share one address.",
             kinds.CONNECTIONS,
         ),
     ] = 4096
     max_connections_per_lease: Annotated[
-        int, Option("Connections to one port of the range.", kinds.CONNECTIONS)
+        int, Option("Most connections to one port of the range.", kinds.CONNECTIONS)
     ] = 2048
     ros2_domain: Annotated[
         tuple[int, ...],
         Option(
-            "[ROS 2](../guide/ros2.md): a domain. Repeatable; they share out the range equally.",
+            "[ROS 2](../guide/ros2.md): domain that the proxy serves. Repeatable: the domains "
+            "share the range equally.",
             kinds.DOMAIN,
             variables=("ROSPROXY_ROS2_DOMAINS", "ROS_DOMAIN_ID"),
             repeatable=True,
@@ -289,9 +316,10 @@ class Settings:
     ros2_peer: Annotated[
         tuple[HostPort, ...],
         Option(
-            "ROS 2: a host outside that is told of participants inside, at the well-known ports of "
-            "its first 32 participants; or another proxy, with the first port of its range, where "
-            "this one has a single domain. Repeatable.",
+            "ROS 2: outside host to which the proxy announces inside participants, at the "
+            "well-known ports of the host's first participants (at least 32). Or another "
+            "proxy, with the first port of that proxy's range: possible with a single domain "
+            "only. Repeatable.",
             kinds.PEER,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,
@@ -302,8 +330,8 @@ class Settings:
     ros2_lan_relay: Annotated[
         HostPort | None,
         Option(
-            "ROS 2: where [`rosproxy lan-relay`](../guide/ros2.md#the-lan) listens, for a single "
-            "domain.",
+            "ROS 2: address and port at which [`rosproxy lan-relay`](../guide/ros2.md#the-lan) "
+            "listens. Possible with a single domain only.",
             kinds.HOST_PORT,
             default="none",
         ),
@@ -311,9 +339,9 @@ class Settings:
     ros2_lan_relay_secret: Annotated[
         str | None,
         Option(
-            "The secret that `rosproxy lan-relay` has as `--secret`: both programs prove by it "
-            "what they send each other. Better given as a variable: a command line can be seen by "
-            "all.",
+            "Secret that `rosproxy lan-relay` has as `--secret`. With this secret, each of the "
+            "two programs proves that its messages are genuine. Prefer the variable: all users "
+            "of the machine can see a command line.",
             kinds.TOKEN,
             default="none",
         ),
@@ -356,7 +384,7 @@ class Settings:
         if len(self.port_range) < LEAST_PER_DOMAIN * count:
             text = f"{self.port_range} is too short: each of {count} domains needs"
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
-        # An announcement need not tell its domain: what has one port has one domain.
+        # An announcement need not name its domain, so that one port can serve one domain alone.
         fix = "start a proxy for each domain"
         if self.ros2_lan_relay and count > 1:
             raise SettingError("--ros2-lan-relay", f"a LAN relay is for one domain: {fix}")
@@ -371,23 +399,23 @@ class Settings:
 
     @property
     def ports(self) -> PortMap:
-        """What the proxy listens on, and what outside sees."""
+        """The listen range and the advertised range."""
         return PortMap(self.port_range, self.advertise_port_range or self.port_range)
 
     @property
     def policy(self) -> tuple[PolicyLayer, ...]:
-        """The layer of the options' own rules; none without rules."""
+        """The layer with the rules of the options; empty without rules."""
         rules = tuple(rule for given in self.policy_rules for rule in given)
         return (PolicyLayer("--policy", rules, PolicyMode(self.policy_mode)),) if rules else ()
 
     @property
     def for_ros1(self) -> bool:
-        """Whether it is for ROS 1."""
+        """Whether the proxy serves ROS 1."""
         return "1" in self.ros
 
     @property
     def for_ros2(self) -> bool:
-        """Whether it is for ROS 2."""
+        """Whether the proxy serves ROS 2."""
         return "2" in self.ros
 
     @property
@@ -397,8 +425,8 @@ class Settings:
 
     @property
     def token_hash(self) -> str | None:
-        """The hash of what callers that are not on loopback must know; None: they may do nothing.
+        """The hash of the token for callers that are not on loopback; None: there is no token.
 
-        It is that of the token where that was given: the admin endpoint holds a hash in any case.
+        The admin endpoint holds a hash, also if the setting is the token.
         """
         return kinds.hash_token(self.admin_token) if self.admin_token else self.admin_token_hash

@@ -1,6 +1,6 @@
-"""Options of both operators by which an administrator says what all proxies do.
+"""Options of both operators with which an administrator sets policy and bounds of all proxies.
 
-They are those of ``rosproxy run``, but for the words.
+They have the values of the options of ``rosproxy run``.
 """
 
 import click
@@ -15,14 +15,16 @@ _POLICY = (
         "--policy",
         type=click_type(POLICY_RULES),
         multiple=True,
-        help='What outside may see and do at all proxies, and inside take, such as "deny publish '
-        '/camera/*" (repeatable; several separated by ;). Others can only narrow it.',
+        help="Rules for all proxies about what outside may see and do, and what inside may take "
+        'from outside, for example "deny publish /camera/*". Repeatable; ; separates rules. '
+        "Other policies can only narrow these rules.",
     ),
     click.option(
         "--policy-mode",
         type=click.Choice(["enforce", "audit"]),
         default="enforce",
-        help="Whether that is enforced, or the proxies only tell what it would deny.",
+        help="enforce: the proxies enforce the rules of --policy. audit: the proxies only report "
+        "what the rules would deny.",
     ),
 )
 _BOUNDS = [
@@ -33,7 +35,7 @@ _BOUNDS = [
 
 
 def proxy_bound_options(command: Command) -> Command:
-    """What each proxy may take."""
+    """The bounds of each proxy."""
     return with_options(command, _BOUNDS)
 
 

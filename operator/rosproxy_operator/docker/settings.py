@@ -1,4 +1,4 @@
-"""The settings of ``rosproxy-operator docker``: plain data, each written once.
+"""The settings of ``rosproxy-operator docker``: plain data, each setting written once.
 
 See `rosproxy.settings`.
 """
@@ -28,27 +28,27 @@ from rosproxy_operator.docker import option_values
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 GIBIBYTE = 1024 * 1024 * 1024
 WINDOW = PortRange(11412, 65535)
-"""Where ports are looked for: above the master's, the admin endpoint's, and rosserial's (11411)."""
+"""Ports for ranges: above those of the master, the admin endpoint and rosserial (11411)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """The operator's options that decide what is planned.
+    """The options of the operator that decide the plan.
 
     ``master_uri``, ``advertise_host``, ``data_plane``, ``direction`` and ``udp`` are for containers
-    without a label of their own. ``grace`` is in seconds. ``proxy_memory``, in bytes, and
-    ``proxy_pids`` are by default several times what a thousand connections take at full rate
-    (docs/performance.md): 32 MiB and 50 KiB for each in the process, 64 MiB of pipes and, where the
-    kernel counts them in, 0.7 MiB of socket buffers for each; two threads for each.
-    ``proxy_bounds`` are what else each proxy may take, ``policy`` is the administrator's, for all
-    proxies: one layer or none. ``secret`` is what the proxies' tokens are made of; empty: the one
-    that the uplink network has.
+    without such a label. ``grace`` is in seconds. ``proxy_memory`` (bytes) and ``proxy_pids`` are
+    by default several times the need of a thousand connections at full rate (docs/performance.md).
+    The process has 32 MiB, and 50 KiB and two threads for each connection. Pipes take 64 MiB. Where
+    the kernel counts socket buffers, these take 0.7 MiB for each connection. ``proxy_bounds`` are
+    further bounds of each proxy. ``policy`` is the administrator's policy for all proxies: one
+    layer or none. The operator makes the proxies' tokens from ``secret``; if ``secret`` is empty,
+    from the secret of the uplink network.
     """
 
     master_uri: Annotated[
         str | None,
         Option(
-            "The real ROS master of containers that name none.",
+            "The real ROS master of containers that name no master.",
             option_values.SHARED_MASTER_URI,
             variables=("ROSPROXY_MASTER_URI", "ROS_MASTER_URI"),
             default="none",
@@ -57,23 +57,31 @@ class PlanSettings:
     advertise_host: Annotated[
         str | None,
         Option(
-            "Name or address under which outside nodes and masters reach this host. Needed unless "
-            "the operator is in the host's network.",
+            "Name or address under which outside nodes and masters reach this host. Required "
+            "unless the operator runs in the host's network.",
             kinds.HOST,
             default="the host's address towards the master",
         ),
     ] = None
     ports: Annotated[
-        int, Option("Ports of a proxy, one per node behind it.", option_values.PORTS)
+        int,
+        Option(
+            "Number of ports of each proxy: one for each ROS 1 node behind the proxy.",
+            option_values.PORTS,
+        ),
     ] = 32
     port_window: Annotated[
-        PortRange, Option("Where ranges of ports are looked for.", kinds.PORT_RANGE)
+        PortRange,
+        Option(
+            "Ports of this host among which the operator chooses the ranges of the proxies.",
+            kinds.PORT_RANGE,
+        ),
     ] = WINDOW
     publish_address: Annotated[
         tuple[str, ...],
         Option(
-            "Address of this host on which ports are published. One of a single interface keeps "
-            "them off the others. Repeatable.",
+            "Address of this host on which the operator publishes ports. The address of one "
+            "interface keeps the ports off all other interfaces. Repeatable.",
             kinds.BIND_ADDRESS,
             repeatable=True,
         ),
@@ -81,44 +89,47 @@ class PlanSettings:
     proxy_image: Annotated[
         str,
         Option(
-            "The proxies' image. A new image of that name replaces them, one after the other.",
+            "Image of the proxies. When this name stands for a new image, the operator "
+            "replaces the proxies, one after the other.",
             IMAGE,
         ),
     ] = "rosproxy:latest"
     data_plane: Annotated[
         DataPlane,
         Option(
-            "How proxies forward topics whose containers have no label for it; `kernel`: they get "
-            "the capability NET_ADMIN for it."
+            "How proxies forward topics, for containers without a label about the data plane. "
+            "With `kernel`, the proxies get the capability NET_ADMIN."
         ),
     ] = "auto"
     direction: Annotated[
         Direction,
         Option(
-            "`both`: nodes reach those outside through the proxy, too. Proxies with a container on "
-            "an internal network do so in any case, unless its label says `out`."
+            "`both`: inside nodes reach outside nodes through the proxy, too. A proxy with a "
+            "container on an internal network always does `both`, unless the container's label "
+            "says `out`."
         ),
     ] = "out"
     udp: Annotated[
         bool,
         Option(
-            "Proxies of both directions publish their ports for UDP as well: [UDPROS]"
-            "(../guide/docker.md#udpros) of nodes outside reaches containers."
+            "Proxies of both directions also publish their ports for UDP, so that "
+            "[UDPROS](../guide/docker.md#udpros) from outside nodes reaches containers."
         ),
     ] = False
     slave_control: Annotated[
         SlaveControl,
         Option(
-            "Who may call shutdown, publisherUpdate and paramUpdate at the nodes of all proxies; a "
-            "label can only narrow it."
+            "Which outside hosts may call `shutdown`, `publisherUpdate` and `paramUpdate` at "
+            "the nodes of all proxies: `any`, or only the `master`'s host. A label can only "
+            "narrow this option."
         ),
     ] = "any"
     allow_master: Annotated[
         tuple[str, ...],
         Option(
-            "A master that containers may name by label or `ROS_MASTER_URI`. `*` and `?` stand for "
-            "other characters: `robot*:11311`, `*.lab.example`. Without a port: at any. "
-            "`--master-uri` is allowed in any case. Repeatable.",
+            "Master that containers may name by label or `ROS_MASTER_URI`. `*` and `?` are "
+            "wildcards: `robot*:11311`, `*.lab.example`. An entry without a port allows any "
+            "port. `--master-uri` is always allowed. Repeatable.",
             option_values.HOST_PATTERN,
             repeatable=True,
             default="any, from port 1024 on",
@@ -128,9 +139,9 @@ class PlanSettings:
     allow_alias: Annotated[
         tuple[str, ...],
         Option(
-            "A name that a label or `ROS_MASTER_URI` may [give a proxy](labels.md#names) on the "
-            "container's networks: the host name of its master. `*` and `?` stand for other "
-            "characters: `robot*`, `*.lab.example`. That of `--master-uri` is allowed in any case. "
+            "Host name of a master that a label or `ROS_MASTER_URI` may [give the "
+            "proxy](labels.md#names) on the container's networks. `*` and `?` are wildcards: "
+            "`robot*`, `*.lab.example`. The host name of `--master-uri` is always allowed. "
             "Repeatable.",
             option_values.NAME_PATTERN,
             repeatable=True,
@@ -141,22 +152,22 @@ class PlanSettings:
     redirect: Annotated[
         bool,
         Option(
-            "Whether a master that a container's `ROS_MASTER_URI` gives by address [leads to the "
-            "proxy](../guide/docker.md#a-master-given-by-address), by a rule in that container's "
-            "network."
+            "Redirect a master that a container's `ROS_MASTER_URI` gives by address: a rule in "
+            "the container's network [leads that address to the "
+            "proxy](../guide/docker.md#a-master-given-by-address)."
         ),
     ] = True
     max_ports: Annotated[
         int,
         Option(
-            "Most ports that a label may ask for. What `--ports` says they get anyway.",
+            "Most ports that a label may ask for. If `--ports` is higher, that number counts.",
             option_values.PORTS,
         ),
     ] = 100
     allow_data_plane: Annotated[
         tuple[DataPlane, ...],
         Option(
-            "A data plane that labels may ask for. That of `--data-plane` is allowed in any case. "
+            "Data plane that labels may ask for. The one of `--data-plane` is always allowed. "
             "Repeatable.",
             repeatable=True,
             default="all but kernel",
@@ -165,9 +176,9 @@ class PlanSettings:
     proxy_memory: Annotated[
         int,
         Option(
-            "Most memory of each proxy (`512m`, `1g`, from 64m on; 0: no bound). A thousand "
-            "connections at full rate take 0.2 GiB, and where the kernel counts socket buffers in "
-            "(cgroup v2) 0.8.",
+            "Most memory of each proxy, such as `512m` or `1g`: at least 64m, or 0 for no "
+            "bound. A thousand connections at full rate take 0.2 GiB. Where the kernel counts "
+            "socket buffers, too (cgroup v2), they take 0.8 GiB.",
             option_values.MEMORY,
             default="1g",
         ),
@@ -175,8 +186,9 @@ class PlanSettings:
     proxy_pids: Annotated[
         int,
         Option(
-            "Most threads and processes of each proxy, from 256 on; 0: no bound. A connection "
-            "takes one or two: that is for 4,000 that talk both ways.",
+            "Most threads and processes of each proxy: at least 256, or 0 for no bound. A "
+            "connection takes one or two. The default is for 4,000 connections that carry data "
+            "both ways.",
             option_values.PIDS,
         ),
     ] = 8192
@@ -185,9 +197,9 @@ class PlanSettings:
     secret: Annotated[
         str,
         Option(
-            "A file with the secret that the proxies' tokens are made of: at least 32 characters "
-            "(`openssl rand -hex 32`). If it changes, proxies are made anew on their ports; nodes "
-            "go on.",
+            "File with the secret from which the operator makes the tokens of the proxies: at "
+            "least 32 characters (`openssl rand -hex 32`). If the secret changes, the operator "
+            "makes the proxies anew on the same ports, and the nodes keep running.",
             option_values.SECRET,
             name="--secret-file",
             default="a random secret, kept as a label of the uplink network",
@@ -196,9 +208,9 @@ class PlanSettings:
     allow_peer: Annotated[
         tuple[str, ...],
         Option(
-            "ROS 2: a host that the label `rosproxy.peers` may name, written as `--allow-master`. "
-            "Without a port: at any, and at the well-known ones. `--ros2-peer` is allowed in any "
-            "case. Repeatable.",
+            "ROS 2: host that the label `rosproxy.peers` may name, written as for "
+            "`--allow-master`. An entry without a port allows any port, and the well-known "
+            "ports. `--ros2-peer` is always allowed. Repeatable.",
             option_values.HOST_PATTERN,
             repeatable=True,
             default="any",
@@ -207,8 +219,8 @@ class PlanSettings:
     ros2_peer: Annotated[
         tuple[str, ...],
         Option(
-            "ROS 2: a host outside that every proxy tells of its participants, or another proxy, "
-            "with the first port of its range. Repeatable.",
+            "ROS 2: outside host to which every proxy announces its participants. Or another "
+            "proxy, with the first port of that proxy's range. Repeatable.",
             option_values.PEER_NAME,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,
@@ -219,35 +231,37 @@ class PlanSettings:
     ros2_lan: Annotated[
         str,
         Option(
-            "ROS 2: this host's IPv4 address on the LAN whose multicast the [LAN relays]"
-            "(../guide/docker.md#ros-2) hear; `none`: no LAN relays.",
+            "ROS 2: this host's IPv4 address on the LAN whose multicast the [LAN "
+            "relays](../guide/docker.md#ros-2) receive. `none`: no LAN relays.",
             option_values.LAN,
-            default="the advertised address, else that towards hosts far away",
+            default="the advertised address, else the address towards distant hosts",
         ),
     ] = ""
     expose_by_default: Annotated[
         bool,
         Option(
-            "Containers with `ROS_MASTER_URI`, or of ROS 2 by `ROS_VERSION` or `ROS_DISTRO`, count "
-            "without a label."
+            "Containers without the label `rosproxy.enable` also get a proxy, if they have "
+            "`ROS_MASTER_URI`, or if `ROS_VERSION` or `ROS_DISTRO` states ROS 2."
         ),
     ] = False
     grace: Annotated[
-        float, Option("Time for which a proxy outlives its last container.", time(0))
+        float,
+        Option("Time for which a proxy keeps running after its last container has gone.", time(0)),
     ] = 60.0
     uplink: Annotated[
         str,
         Option(
-            "Network that is created for the proxies; it has to sort before all others.",
+            "Network that the operator creates for the proxies. Its name must sort before the "
+            "names of all other networks.",
             option_values.NETWORK,
         ),
     ] = "0-rosproxy"
 
 
 def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
-    """Settings from the values of the command line's options, by their names.
+    """Settings from the values of the command line's options, by name.
 
-    Raises SettingError if they don't go together.
+    Raises SettingError if two values exclude each other.
     """
     settings = make_settings(
         PlanSettings,

@@ -1,7 +1,7 @@
-"""The settings of ``rosproxy-operator kubernetes``: plain data, each written once.
+"""The settings of ``rosproxy-operator kubernetes``: plain data, each setting written once.
 
-See `rosproxy.settings`. Only what decides whether the webhook is served has its option in
-`rosproxy_operator.cli`: without it there is none.
+See `rosproxy.settings`. One option is in `rosproxy_operator.cli`: ``--webhook-bind``, without which
+there is no webhook.
 """
 
 from collections.abc import Mapping
@@ -36,21 +36,23 @@ NODE_PORTS = PortRange(30000, 32767)
 EPHEMERAL = PortRange(32768, 60999)
 """Linux's own default of net.ipv4.ip_local_port_range."""
 EVERY_PORT = PortRange(1024, 65535)
-"""Where the custom resource definition lets hostPorts lie."""
+"""Ports that the custom resource definition allows for hostPorts."""
 
 
 class Bounds(msgspec.Struct, frozen=True):
-    """What a RosProxy may ask for: the administrator's word, which no RosProxy can widen.
+    """The administrator's bounds of all RosProxies; no RosProxy can widen a bound.
 
-    ``masters``, ``images`` and ``peers`` are globs; ``window`` is where hostPorts may lie, all of
+    ``masters``, ``images`` and ``peers`` are globs. ``window`` must contain all hostPorts:
     ``spec.portWindow`` and ``spec.master.publish``.
     """
 
     masters: Annotated[
         tuple[str, ...],
         Option(
-            "Masters that a RosProxy may name, as `http://192.0.2.*:11311`. [How they are compared]"
-            "(permissions.md#what-rosproxies-may-ask-for). Repeatable.",
+            "Masters that a RosProxy may name, for example `http://192.0.2.*:11311`. For the "
+            "comparison, see "
+            "[docs/reference/permissions.md](permissions.md#what-rosproxies-may-ask-for). "
+            "Repeatable.",
             option_values.GLOB,
             name="--allow-master",
             repeatable=True,
@@ -59,14 +61,13 @@ class Bounds(msgspec.Struct, frozen=True):
     ] = ()
     max_ports: Annotated[
         int,
-        Option(
-            "Most ports that a RosProxy may ask for: the highest `spec.ports`.", option_values.PORTS
-        ),
+        Option("Most ports that a RosProxy may ask for in `spec.ports`.", option_values.PORTS),
     ] = MOST_PORTS
     window: Annotated[
         PortRange,
         Option(
-            "Where a RosProxy may have hostPorts: `spec.portWindow` and `spec.master.publish`.",
+            "Ports from which a RosProxy may have hostPorts: `spec.portWindow` and "
+            "`spec.master.publish` must lie in this range.",
             kinds.PORT_RANGE,
             name="--allow-port-window",
         ),
@@ -74,7 +75,8 @@ class Bounds(msgspec.Struct, frozen=True):
     data_planes: Annotated[
         tuple[DataPlane, ...],
         Option(
-            "What `spec.dataPlane` may be; kernel takes NET_ADMIN. Repeatable.",
+            "Data plane that `spec.dataPlane` may ask for. `kernel` takes the capability "
+            "NET_ADMIN. Repeatable.",
             name="--allow-data-plane",
             repeatable=True,
         ),
@@ -82,7 +84,7 @@ class Bounds(msgspec.Struct, frozen=True):
     images: Annotated[
         tuple[str, ...],
         Option(
-            "Images that `spec.image` may name besides `--proxy-image`. Repeatable.",
+            "Images that `spec.image` may name, in addition to `--proxy-image`. Repeatable.",
             option_values.GLOB,
             name="--allow-image",
             repeatable=True,
@@ -92,15 +94,16 @@ class Bounds(msgspec.Struct, frozen=True):
     slave_control: Annotated[
         SlaveControl,
         Option(
-            "As the option of `rosproxy run`, for all proxies; `spec.policy.slaveControl` may only "
-            "narrow it."
+            "Which outside hosts may call `shutdown`, `publisherUpdate` and `paramUpdate` at "
+            "the nodes of all proxies: `any`, or only the `master`'s host. "
+            "`spec.policy.slaveControl` can only narrow this option."
         ),
     ] = "any"
     peers: Annotated[
         tuple[str, ...],
         Option(
-            "ROS 2: hosts that `spec.peers` may name, as `192.0.2.*`. A pattern without letters "
-            "fits addresses only. Repeatable.",
+            "ROS 2: hosts that `spec.peers` may name, for example `192.0.2.*`. A pattern "
+            "without letters matches addresses only. Repeatable.",
             option_values.GLOB,
             name="--allow-peer",
             repeatable=True,
@@ -110,32 +113,37 @@ class Bounds(msgspec.Struct, frozen=True):
     multicast: Annotated[
         bool,
         Option(
-            "ROS 2: whether `spec.multicast` may be true: pods in the nodes' own network, which "
-            "hear the LAN.",
+            "ROS 2: whether a RosProxy may set `spec.multicast` to true. The operator then "
+            "starts pods in the network of the cluster's nodes, which receive the LAN's "
+            "multicast.",
             name="--allow-multicast",
         ),
     ] = True
 
 
 class ClusterSettings(msgspec.Struct, frozen=True):
-    """The operator's options that decide what is planned.
+    """The options of the operator that decide the plan.
 
-    An empty ``image_pull_policy`` leaves it to Kubernetes. ``proxy_bounds`` are what each proxy may
-    take, ``policy`` is the administrator's, for all proxies: one layer or none.
+    With an empty ``image_pull_policy``, Kubernetes decides. ``proxy_bounds`` are the bounds of each
+    proxy. ``policy`` is the administrator's policy for all proxies: one layer or none.
     """
 
     image: Annotated[
         str,
-        Option("The proxies' image, where a RosProxy names none.", IMAGE, name="--proxy-image"),
+        Option("Image of the proxies whose RosProxy names no image.", IMAGE, name="--proxy-image"),
     ] = "rosproxy:latest"
     image_pull_policy: Annotated[
         Literal["", "Always", "IfNotPresent", "Never"],
-        Option("Its imagePullPolicy.", name="--proxy-image-pull-policy", default="Kubernetes' own"),
+        Option(
+            "The imagePullPolicy of that image.",
+            name="--proxy-image-pull-policy",
+            default="Kubernetes' own",
+        ),
     ] = ""
     node_ports: Annotated[
         PortRange,
         Option(
-            "The API server's `--service-node-port-range`: no proxy gets a port of it.",
+            "The API server's `--service-node-port-range`. No proxy gets a port of this range.",
             kinds.PORT_RANGE,
             name="--node-port-range",
         ),
@@ -143,8 +151,8 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     ephemeral: Annotated[
         PortRange,
         Option(
-            "The nodes' `net.ipv4.ip_local_port_range`, from which their kernels take ports for "
-            "connections: no proxy gets a port of it.",
+            "The `net.ipv4.ip_local_port_range` of the cluster's nodes, from which their "
+            "kernels take ports for connections. No proxy gets a port of this range.",
             kinds.PORT_RANGE,
             name="--ephemeral-range",
         ),
@@ -153,15 +161,17 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     network_policy: Annotated[
         bool,
         Option(
-            "Whether each RosProxy's proxies get [a NetworkPolicy](permissions.md#networkpolicy)."
+            "Whether the proxies of each RosProxy get [a "
+            "NetworkPolicy](permissions.md#networkpolicy)."
         ),
     ] = True
     admin_from: Annotated[
         tuple[Json, ...] | None,
         Option(
-            "Whom it lets reach the proxies' admin port: a JSON list of NetworkPolicyPeers.",
+            "Sources that this NetworkPolicy admits to the proxies' admin port: a JSON list of "
+            "NetworkPolicyPeers.",
             option_values.NETWORK_PEERS,
-            default="everybody",
+            default="all",
         ),
     ] = None
     proxy_bounds: ProxyBounds = OWN_BOUNDS
@@ -169,18 +179,20 @@ class ClusterSettings(msgspec.Struct, frozen=True):
 
 
 class WebhookSettings(msgspec.Struct, frozen=True):
-    """How the admission webhook is served, and with which certificate.
+    """How the operator serves the admission webhook, and with which certificate.
 
-    Either the operator makes the certificate, for the names of ``service``, keeps it in
-    ``secret`` and writes its CA into ``configuration`` (each may be None or empty: it is left
-    out); or somebody else puts it into ``directory`` (tls.crt, tls.key).
+    The certificate can be in ``directory`` (tls.crt, tls.key). Else the operator makes the
+    certificate for the names of ``service``, keeps the certificate in ``secret``, and writes the CA
+    into ``configuration``. Without ``secret`` or ``configuration``, the operator leaves out that
+    step.
     """
 
     bind: HostPort = DEFAULT_WEBHOOK
     service: Annotated[
         Name | None,
         Option(
-            "The webhook's Service, for whose names its certificate is made.",
+            "The webhook's Service. The operator makes the webhook's certificate for the names "
+            "of this Service.",
             option_values.NAME,
             name="--webhook-service",
             default="none",
@@ -189,8 +201,8 @@ class WebhookSettings(msgspec.Struct, frozen=True):
     secret: Annotated[
         Name | None,
         Option(
-            "An existing Secret in which the certificate is kept. Without it a new one is made at "
-            "each start.",
+            "Existing Secret in which the operator keeps the certificate. Without this option, "
+            "the operator makes a new certificate at each start.",
             option_values.NAME,
             name="--webhook-secret",
             default="none",
@@ -199,7 +211,8 @@ class WebhookSettings(msgspec.Struct, frozen=True):
     configuration: Annotated[
         str,
         Option(
-            "The MutatingWebhookConfiguration that is given its authority.",
+            "MutatingWebhookConfiguration into which the operator writes the certificate's "
+            "authority (CA).",
             option_values.OBJECT_NAME,
             name="--webhook-configuration",
             default="none",
@@ -208,7 +221,8 @@ class WebhookSettings(msgspec.Struct, frozen=True):
     directory: Annotated[
         str,
         Option(
-            "`tls.crt` and `tls.key` of somebody else's making, instead of the last three; read "
+            "Directory with a certificate that the operator does not make: `tls.crt` and "
+            "`tls.key`, in place of the last three options. The operator reads both files "
             "again when they change.",
             option_values.DIRECTORY,
             name="--webhook-cert-dir",
@@ -218,17 +232,18 @@ class WebhookSettings(msgspec.Struct, frozen=True):
 
 
 class KubernetesSettings(msgspec.Struct, frozen=True):
-    """Everything that ``rosproxy-operator kubernetes`` can be told.
+    """All settings of ``rosproxy-operator kubernetes``.
 
-    ``resync`` is in seconds. Without ``webhook`` pods are not wired. Without ``key_secret`` the key
-    of the proxies' tokens is made anew with each start; without ``lease`` it is the only operator.
+    ``resync`` is in seconds. Without ``webhook`` the operator wires no pods. Without ``key_secret``
+    the operator makes a new key of the proxies' tokens at each start. Without ``lease`` it is the
+    only operator.
     """
 
     plan: ClusterSettings = ClusterSettings()
     namespaces: Annotated[
         tuple[str, ...],
         Option(
-            "Namespaces whose RosProxies are looked after. Repeatable.",
+            "Namespace whose RosProxies the operator looks after. Repeatable.",
             option_values.NAMESPACE,
             name="--namespace",
             repeatable=True,
@@ -238,8 +253,8 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     key_secret: Annotated[
         Name | None,
         Option(
-            "An existing Secret in which the key of the proxies' tokens is kept. Without it a new "
-            "one is made at each start, and the proxies anew.",
+            "Existing Secret in which the operator keeps the key of the proxies' tokens. "
+            "Without this option, the operator makes a new key and new proxies at each start.",
             option_values.NAME,
             default="none",
         ),
@@ -247,21 +262,23 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     lease: Annotated[
         Name | None,
         Option(
-            "The Lease by which several operators [choose the one that acts]"
-            "(../guide/kubernetes.md#two-operators). They share `--key-secret` and "
-            "`--webhook-secret`.",
+            "The Lease object by which several operators [choose the one that "
+            "acts](../guide/kubernetes.md#two-operators). All of them must have the same "
+            "`--key-secret` and `--webhook-secret`.",
             option_values.NAME,
-            default="there is no other",
+            default="none: a single operator",
         ),
     ] = None
-    resync: Annotated[float, Option("Longest time between two looks.", time(1.0))] = 30.0
+    resync: Annotated[
+        float, Option("Longest time between two looks at the cluster.", time(1.0))
+    ] = 30.0
     webhook: WebhookSettings | None = None
     admin: Annotated[
         HostPort,
         Option(
-            "Where `/healthz`, `/readyz`, `/metrics` and the [live page of all proxies]"
-            "(../guide/live-page.md#all-proxies-of-a-host-or-a-cluster) are, which is for callers "
-            "on loopback (`kubectl port-forward`).",
+            "Address and port of `/healthz`, `/readyz`, `/metrics` and the [live page of all "
+            "proxies](../guide/live-page.md#all-proxies-of-a-host-or-a-cluster). The live page "
+            "is for callers on loopback (`kubectl port-forward`).",
             kinds.host_port(DEFAULT_ADMIN),
             name="--admin-bind",
         ),
@@ -269,7 +286,8 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     liveness: Annotated[
         HostPort,
         Option(
-            "Where `/healthz` is served for the kubelet: it fails when any part hangs.",
+            "Address and port of `/healthz` for the kubelet. The check fails when any part of "
+            "the operator hangs.",
             kinds.host_port(DEFAULT_LIVENESS),
             name="--liveness-bind",
         ),
@@ -277,9 +295,9 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
 
 
 def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
-    """Settings from the values of the command line's options, by their names.
+    """Settings from the values of the command line's options, by name.
 
-    Raises SettingError if they don't go together.
+    Raises SettingError if two values exclude each other.
     """
     _check_shared(options)
     plan = make_settings(
@@ -294,7 +312,7 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
 
 
 def _check_shared(options: Mapping[str, Any]) -> None:
-    """Raise SettingError if several operators could not share what they have to."""
+    """Raise SettingError if several operators have no key or certificate to share."""
     if options["lease"] is None:
         return
     if options["key_secret"] is None:

@@ -27,20 +27,20 @@ def main() -> None:
     "--check",
     is_flag=True,
     allow_from_autoenv=False,
-    help="Validate the options and the policy's file, and exit.",
+    help="Check the options and the file of --policy-file, and exit.",
 )
 @click.option(
     "--deep",
     is_flag=True,
     allow_from_autoenv=False,
-    help="With --check: also look up the hosts, bind the ports, ask the master, and have the range "
-    "tried from outside; exit with 1 if something is wrong.",
+    help="With --check: also look up the hosts, bind the ports, ask the master, and try the range "
+    "from outside. Exit with 0 if no error was found, else with 1.",
 )
 def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) -> None:
     """Run the proxy.
 
-    What is given twice counts as on the command line, else as in the variable, else as in the file
-    of --config.
+    The command line overrides the environment variable, and the variable overrides the file of
+    --config.
     """
     from rosproxy.telemetry import logs
 
@@ -59,7 +59,7 @@ def run(check: bool, deep: bool, log_format: str, log_level: str, **given: Any) 
 
 
 def _check(settings: Any, deep: bool) -> None:
-    """Say what is wrong with settings before anything runs. Raises SettingError."""
+    """Print what is wrong with settings before anything runs. Raises SettingError."""
     from rosproxy.app.policy_sources import read_policy_file
 
     read_policy_file(settings)
@@ -72,7 +72,7 @@ def _check(settings: Any, deep: bool) -> None:
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY_LAN_RELAY", "show_default": True})
 @click.option(
-    "--domain", type=options.click_type(kinds.DOMAIN), default=0, help="The domain of DDS."
+    "--domain", type=options.click_type(kinds.DOMAIN), default=0, help="The ROS 2 domain."
 )
 @click.option(
     "--lan",
@@ -84,26 +84,27 @@ def _check(settings: Any, deep: bool) -> None:
     "--bind",
     type=options.click_type(kinds.HOST_PORT),
     required=True,
-    help="Address and port that the proxy reaches, its --ros2-lan-relay.",
+    help="Address and port at which the proxy reaches this program: the proxy's --ros2-lan-relay.",
 )
 @click.option(
     "--proxy",
     type=options.click_type(kinds.HOST_PORT),
     required=True,
-    help="The proxy's address, as this host reaches it, and the first port of its range.",
+    help="Address of the proxy, as this host reaches it, and the first port of the proxy's range.",
 )
 @click.option(
     "--secret",
     type=options.click_type(kinds.TOKEN),
     required=True,
-    help="The secret that the proxy has as --ros2-lan-relay-secret. Better given as a variable.",
+    help="Secret that the proxy has as --ros2-lan-relay-secret. Prefer the variable: all users of "
+    "the machine can see a command line.",
 )
 @options.log_options
 @options.config_option
 def lan_relay(log_format: str, log_level: str, **given: Any) -> None:
-    """Carry announcements of ROS 2 between a LAN and the proxy; runs in the host's network.
+    """Pass ROS 2 discovery on between a LAN and the proxy. Run it in the host's network.
 
-    Nothing else: what users send goes through the ports that the host publishes.
+    It carries discovery alone: user data goes through the ports that the host publishes.
     """
     from rosproxy.app.lan_relay_program import run_lan_relay
     from rosproxy.ros2.servers.lan_relay import LanRelaySettings

@@ -178,19 +178,22 @@ def with_options(command: Command, options: Sequence[Callable[[Command], Command
 def log_options(command: Command) -> Command:
     """The options ``--log-format`` and ``--log-level``."""
     form = click.option(
-        "--log-format", type=click.Choice(["text", "json"]), default="text", help="Log format."
+        "--log-format",
+        type=click.Choice(["text", "json"]),
+        default="text",
+        help="Format of the log.",
     )
     level = click.option(
         "--log-level",
         type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
         default="info",
-        help="Least severe messages to log.",
+        help="Lowest severity that is logged.",
     )
     return form(level(command))
 
 
 def config_option(command: Command) -> Command:
-    """The option ``--config``: a file for what neither the command line nor a variable gives."""
+    """The option ``--config``: a file that the command line and the variables override."""
     return click.option(
         "--config",
         metavar="FILE",
@@ -198,7 +201,7 @@ def config_option(command: Command) -> Command:
         is_eager=True,
         expose_value=False,
         callback=_use_config,
-        help='A file in TOML with options by their names: port-range = "11000-11099".',
+        help='File in TOML with options by name, for example port-range = "11000-11099".',
     )(command)
 
 

@@ -15,14 +15,13 @@ from rosproxy import setting_kinds as kinds
 from rosproxy.cli import options
 
 WAIT_INTERVAL = 0.5
-"""Seconds between two questions of ``status --wait``."""
+"""Seconds between two requests of ``status --wait``."""
 
 
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
     from rosproxy.admin.admin_client import AdminClient, default_url
 
-    # As for the proxy itself, what is given on the command line or in a variable comes before the
-    # file.
+    # As for the proxy itself, the command line and the variable override the file.
     bound = None if url or "ROSPROXY_ADMIN_BIND" in os.environ else _bound_by_file()
     try:
         return AdminClient(url or default_url(bound))
@@ -31,7 +30,7 @@ def _admin_client(context: click.Context, option: click.Parameter, url: str | No
 
 
 def _bound_by_file() -> str | None:
-    """The admin endpoint in the file of ROSPROXY_CONFIG, which the proxy reads, too."""
+    """The ``admin-bind`` in the file of ROSPROXY_CONFIG; None or empty if there is none."""
     path = os.environ.get("ROSPROXY_CONFIG")
     if not path:
         return None
@@ -41,7 +40,7 @@ def _bound_by_file() -> str | None:
         with open(path, "rb") as file:
             return str(tomllib.load(file).get("admin-bind", ""))
     except (OSError, ValueError):
-        return None  # `run` says what is wrong with it
+        return None  # `rosproxy run` reports what is wrong with the file
 
 
 _admin_option = click.option(
@@ -50,7 +49,7 @@ _admin_option = click.option(
     show_envvar=True,
     callback=_admin_client,
     metavar="URL",
-    help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
+    help="The proxy's admin endpoint. Default: the address in ROSPROXY_ADMIN_BIND, else "
     "http://127.0.0.1:11312.",
 )
 
@@ -58,19 +57,19 @@ _admin_option = click.option(
 @click.command(cls=options.CommandShowingVariables)
 @_admin_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state as JSON.")
-@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
+@click.option("--watch", is_flag=True, help="Show the state again every two seconds, until Ctrl-C.")
 @click.option(
     "--wait",
     type=options.Seconds(0),
     default=0,
-    help="Time in which the proxy may become ready, before it is shown.",
+    help="Time to wait until the proxy is ready, before the state is shown.",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the live page in a browser instead.")
 def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> None:
     """Show the master, the ports, and the nodes behind the proxy.
 
-    Exits with 0 if the proxy is ready for nodes, with 1 if it does not answer or its master does
-    not.
+    Exits with 0 if the proxy is ready for nodes. Exits with 1 if the proxy or its master does not
+    answer.
     """
     if as_json + watch + opens > 1:
         raise click.UsageError("--json, --watch and --open exclude each other; give one of them")
@@ -91,7 +90,7 @@ def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> 
 
 
 def _open_page(admin: Any) -> None:
-    """Print where the live page is, and have a browser show it if there is one."""
+    """Print the address of the live page, and open a browser if there is one."""
     import webbrowser
 
     url = admin.page()
@@ -105,7 +104,7 @@ def _open_page(admin: Any) -> None:
 
 
 def _why_not_ready(admin: Any) -> str:
-    """Why nodes can't use the proxy; empty if they can."""
+    """The reason why nodes can't use the proxy; empty if nodes can."""
     from rosproxy.admin.admin_client import AdminError
 
     try:
@@ -129,24 +128,24 @@ def health(admin: Any) -> None:
     "--master-uri",
     type=options.click_type(kinds.MASTER_URI),
     envvar="ROS_MASTER_URI",
-    help="The master to look at if the proxy can't be asked for its own.",
+    help="Master to examine if the proxy does not answer, or with --outside.",
 )
 @click.option(
     "--advertise-host",
     type=options.click_type(kinds.HOST),
     envvar="ROSPROXY_ADVERTISE_HOST",
-    help="The advertised host if the proxy can't be asked for it.",
+    help="Advertised host of the proxy if the proxy does not answer, or with --outside.",
 )
 @click.option(
     "--master-address",
     type=options.click_type(kinds.ADDRESS),
     envvar="ROSPROXY_MASTER_ADDRESS",
-    help="The IP address of the master's host if the proxy can't be asked for it.",
+    help="IP address of the master's host if the proxy does not answer.",
 )
 @click.option(
     "--outside",
     is_flag=True,
-    help="Look from here as a machine outside does, for example from a robot; ask no proxy.",
+    help="Examine from this machine as an outside machine, for example on a robot. Ask no proxy.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
 def doctor(
@@ -158,15 +157,15 @@ def doctor(
     outside: bool,
     as_json: bool,
 ) -> None:
-    """Find out why A can't hear B, and say what mends it.
+    """Find out why A can't hear B, and print the fix.
 
-    Looks at the proxy, its ports, the master and all nodes. With names: who publishes and who
-    subscribes to that topic; that node's topics; or what two nodes have to say to each other,
-    and which of them are not connected, and why.
+    Examines the proxy, its ports, the master and all nodes. With a topic: its publishers and
+    subscribers. With a node: the topics of that node. With two nodes: the topics between them.
+    The report shows which pairs are not connected, and why.
 
-    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. What outside machines see
-    is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
-    something is.
+    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. To see what an outside
+    machine sees, run it on that machine with --outside. Exits with 0 if no error was found, else
+    with 1.
     """
     import asyncio
 
@@ -179,7 +178,7 @@ def doctor(
         None if outside else admin,
         master_uri or "",
         advertise_host or "",
-        # Names are global in what the master says; people leave the slash out.
+        # The master's names are global; users leave the slash out.
         tuple(f"/{name.strip('/')}" for name in names),
         master_address,
     )
@@ -189,7 +188,7 @@ def doctor(
 
 
 def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
-    """Print findings, and exit with 1 if something is wrong."""
+    """Print findings, and exit with 1 if one of them is an error."""
     import json
 
     from rosproxy.admin.doctor_finding import failed
@@ -204,7 +203,7 @@ def print_findings(diagnosis: Any, as_json: bool) -> NoReturn:
 
 
 def _or_exit(ask: Callable[[], object]) -> None:
-    """Do something that may find the proxy absent, and say so in one line."""
+    """Call a function; if no proxy answers, print that in one line and exit with 1."""
     from rosproxy.admin.admin_client import AdminError
 
     try:
