@@ -17,13 +17,14 @@ from prometheus_client import (
 
 from rosproxy import __version__
 
-# The second series of each counter, the time of its creation, is of no use.
+# prometheus_client adds a second series for each counter, with its start time: no alert and no
+# dashboard uses these series.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 OUTCOMES = ("ok", "unavailable", "failed")
 """How a look ends."""
 STATES = ("created", "restarting", "running", "paused", "exited", "dead", "removing")
-"""The states of a container, in the engine's words."""
+"""The states of a container, as the engine names them."""
 POD_STATES = ("ready", "starting", "stuck")
 """The states of a proxy's pod."""
 _PREFIX = "rosproxy_operator"
@@ -32,10 +33,11 @@ _BEFORE_CAPITAL = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 class CommonMetrics:
-    """The metrics for any engine, in a registry of their own.
+    """The metrics of both operators, in a separate registry.
 
-    ``source`` is what is looked at, and the gauge named ``up`` says whether it answers; ``site`` is
-    what is acted on; ``states`` are those that a proxy can be in.
+    ``source`` names the API that the operator reads; the gauge ``up`` says whether this API
+    answers. ``site`` names what the operator changes. ``states`` are the possible states of a
+    proxy.
     """
 
     def __init__(self, source: str, site: str, states: Sequence[str], up: str) -> None:
@@ -49,18 +51,18 @@ class CommonMetrics:
         )
         text = f"Looks at the {source} by outcome (ok, unavailable, failed)."
         self.looks = self._counter("looks", text, ["outcome"])
-        for outcome in OUTCOMES:  # one that begins with 1 has no increase, for an alert
+        for outcome in OUTCOMES:  # Prometheus sees no increase in a series that begins with 1
             self.looks.labels(outcome)
-        text = "Time for a look: listing everything and planning."
+        text = "Duration of a look in seconds: listing everything, and planning."
         self.look_time = Histogram(
             "look_seconds", text, namespace=_PREFIX, registry=registry, buckets=_BUCKETS
         )
-        text = f"What was done to the {site} by action and outcome (ok, failed, taken: a port was)."
+        text = f"Actions on the {site} by outcome (ok, failed, taken: the port was in use)."
         self.actions = self._counter("actions", text, ["action", "outcome"])
         self.up = self._gauge(up, f"Whether the {source} answers.")
-        self.problems = self._gauge("problems", "Problems that are there now.")
+        self.problems = self._gauge("problems", "Current problems.")
         self.proxies = self._gauge("proxies", "Proxies by state.", ["state"])
-        text = "What is to be done, by state (busy, failed: it is tried again)."
+        text = "Jobs by state (busy, failed: the operator tries again)."
         self._jobs = self._gauge("jobs", text, ["state"])
 
     def show_proxies(self, states: Iterable[str]) -> None:
@@ -70,7 +72,7 @@ class CommonMetrics:
             self.proxies.labels(state).set(tally[state])
 
     def watch_jobs(self, busy: Callable[[], int], failed: Callable[[], int]) -> None:
-        """Call these for the numbers of jobs whenever the metrics are read."""
+        """Call ``busy`` and ``failed`` for the numbers of jobs at each reading of the metrics."""
         self._jobs.labels("busy").set_function(busy)
         self._jobs.labels("failed").set_function(failed)
 
@@ -85,7 +87,7 @@ class DockerMetrics(CommonMetrics):
 
     def __init__(self) -> None:
         super().__init__("engine", "host", STATES, up="engine_up")
-        self.containers = self._gauge("containers", "Containers that a proxy is there for.")
+        self.containers = self._gauge("containers", "Running containers that get a proxy.")
 
 
 class ClusterMetrics(CommonMetrics):
@@ -93,21 +95,21 @@ class ClusterMetrics(CommonMetrics):
 
     def __init__(self) -> None:
         super().__init__("API server", "cluster", POD_STATES, up="api_up")
-        self.rosproxies = self._gauge("rosproxies", "RosProxies that can be read.")
+        self.rosproxies = self._gauge("rosproxies", "RosProxies that the operator can read.")
         self.pods = self._gauge("pods", "Running pods that a RosProxy selects.")
-        text = "Participants of ROS 2 behind the proxies, by domain."
+        text = "ROS 2 participants behind the proxies, by domain."
         self.participants = self._gauge("participants", text, ["domain"])
         text = "Pods at admission by outcome (wired, left, failed)."
         self.admissions = self._counter("admissions", text, ["outcome"])
         text = "When the admission webhook's certificate expires, in seconds of Unix time."
         self.certificate_expiry = self._gauge("certificate_expiry_seconds", text)
-        text = "Whether this operator leads: of several, one acts."
+        text = "Whether this operator leads. Of several operators, only the leader acts."
         self.leader = self._gauge("leader", text)
-        text = "How often another operator was seen to lead than before."
+        text = "Changes of the leader that this operator has seen."
         self.leader_changes = self._counter("leader_changes", text)
-        text = "How often a watch was lost, or had to begin anew."
+        text = "Watches that were lost, or had to begin again."
         self.watch_restarts = self._counter("watch_restarts", text)
-        text = "Objects of which the watches had told something else than a full list."
+        text = "Objects for which a full list differed from the reports of the watches."
         self.view_corrections = self._counter("view_corrections", text)
 
     def show_participants(self, domains: Mapping[int, int]) -> None:

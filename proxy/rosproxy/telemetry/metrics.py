@@ -1,8 +1,8 @@
 """Prometheus metrics: the counters that the proxy keeps.
 
-Its state, with the bytes of connections, is in `ros1.status` and `ros2.status`. Counters of few
-outcomes begin with 0: Prometheus sees no increase in a series that begins with 1, and no alert
-would tell of what happened once.
+`ros1.status` and `ros2.status` have the metrics of the proxy's state, with the bytes of
+connections. Counters with few outcomes begin with 0. Prometheus sees no increase in a series that
+begins with 1, so that an alert would miss the first event.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -20,20 +20,21 @@ from prometheus_client import (
 
 from rosproxy import __version__
 
-# A second series for each counter: when it began, which nobody asks for.
+# prometheus_client adds a second series for each counter, with its start time: no alert and no
+# dashboard uses these series.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 MOST_NAMES = 1000
-"""Topics and services with byte counters of their own; the bytes of all others are summed up.
+"""Topics and services with separate byte counters; one counter has the bytes of all others.
 
-Nodes that are down, by name, likewise.
+The same bound holds for the names of nodes that are down.
 """
 BOUNDS = (
     *("long_body", "slow_body", "compressed", "over_budget", "long_name", "too_many_names"),
     *("connections_per_source", "connections_per_lease", "silent_connections"),
     *("malformed", "participants", "rate", "stand_ins"),
 )
-"""Reasons of refusals (docs/reference/limits.md) that a well-behaved system does not meet."""
+"""Reasons of refusals (docs/reference/limits.md) that do not occur in a well-behaved system."""
 RELAY_ERRORS = ("bad header", "denied", "node unreachable", "not offered")
 STRANGERS = ("outside", "unselected")
 
@@ -41,8 +42,8 @@ STRANGERS = ("outside", "unselected")
 class Traffic:
     """Bytes relayed per topic or service, summed over ended connections.
 
-    ``sent`` went outside, ``received`` came from there. Anonymous nodes bring new names for ever,
-    so that only the first MOST_NAMES are kept apart.
+    ``sent`` went outside, ``received`` came from outside. Anonymous nodes bring new names without
+    end, so that only the first MOST_NAMES have separate sums.
     """
 
     def __init__(self) -> None:
@@ -65,13 +66,13 @@ class Traffic:
 
 
 class NamedNodes:
-    """Numbers of nodes by name, of which only the first MOST_NAMES are kept apart."""
+    """Numbers of nodes by name; only the first MOST_NAMES have separate numbers."""
 
     def __init__(self) -> None:
         self._names: set[str] = set()
 
     def tally(self, names: Iterable[str]) -> Mapping[str, int]:
-        """How often each name is there."""
+        """How often each name occurs."""
         counts: dict[str, int] = {}
         for name in names:
             if len(self._names) < MOST_NAMES:
@@ -82,9 +83,9 @@ class NamedNodes:
 
 
 class Metrics:
-    """All metrics of a proxy, in a registry of their own.
+    """All metrics of a proxy, in a separate registry.
 
-    Calls are counted by method for ``known_methods``, those of other names together.
+    Calls of ``known_methods`` are counted by method, and all other calls together.
     """
 
     known_methods: Collection[str] = ()
@@ -103,15 +104,15 @@ class Metrics:
         self._of_calls = cache(self.calls.labels)
         errors = "TCPROS connections that could not be relayed."
         self.relay_errors = counter("relay_errors", errors, "reason")
-        gone = "Nodes unregistered at the master because they were gone."
+        gone = "Dead nodes that the proxy unregistered at the master."
         self.cleanups = counter("cleanups", gone)
-        refused = "Registrations refused because no port was left."
+        refused = "Registrations refused because no port was free."
         self.exhausted = counter("range_exhausted", refused)
-        bounds = "Requests and connections refused because they were over a bound."
+        bounds = "Requests and connections above a bound, refused, by reason."
         self.refused = counter("refused", bounds, "reason")
-        denied = "What the policy denied, or would deny in audit mode, by kind of rule."
+        denied = "Denials by the policy, or in audit mode would-be denials, by kind of rule."
         self.policy_denied = counter("policy_denied", denied, "kind", "mode")
-        strangers = "Calls refused for the address that they came from, by what that is."
+        strangers = "Calls refused because of their source address, by standing of the address."
         self.strangers = counter("strangers", strangers, "standing")
         for family, values in (
             (self.relay_errors, RELAY_ERRORS),
@@ -120,16 +121,16 @@ class Metrics:
         ):
             for value in values:
                 family.labels(value)
-        faults = "What the proxy finds wrong with its own setting-up: address, range."
+        faults = "Faults that the proxy finds in its own address and range."
         self.setup_faults = Gauge("rosproxy_setup_faults", faults, registry=self.registry)
         self.master_round_trip = Histogram(
             "rosproxy_master_round_trip_seconds",
-            "Time for a call of the proxy's own to the master.",
+            "Duration of the proxy's own calls to the master, in seconds.",
             registry=self.registry,
             buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1, 5),
         )
 
     def count(self, api: str, method: str, outcome: str) -> None:
-        """Count a call; method names that nobody defined share one label."""
+        """Count a call; unknown method names share one label."""
         label = method if method in self.known_methods else "other"
         self._of_calls(api, label, outcome).inc()
