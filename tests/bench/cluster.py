@@ -82,7 +82,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
     for _ in range(rounds):
         for size in QUICK_SIZES if quick else SIZES:
             _apart(book, size, QUICK_SECONDS if quick else SECONDS)
-    book.note(f"{PODS_A_NODE} pods a node, one of them labelled; nodes and proxies are made up")
+    book.note(f"{PODS_A_NODE} pods a node, one of them labelled; nodes and proxies are simulated")
 
 
 def _apart(book: Book, size: int, seconds: float) -> None:
@@ -182,8 +182,8 @@ async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
         own, _, asked = await bench.over(seconds)
         add("others' pods come and go: operator, % of a core", own * 100)
         tries = [await bench.reaction(f"newer{number}") for number in range(TRIES)]
-        add("the same while others' pods come and go: median, s", median(tries))
-        add("the same while others' pods come and go: longest, s", max(tries))
+        add("others' pods come and go: proxy's pod made: median, s", median(tries))
+        add("others' pods come and go: proxy's pod made: longest, s", max(tries))
     finally:
         churning.cancel()
 

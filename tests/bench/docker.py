@@ -89,10 +89,10 @@ def _measure_size(book: Book, size: int, seconds: float, folder: Path) -> None:
         add("half of the containers started, s", time.monotonic() - since)
         _rest(operator)
         looks = [look.seconds for look in _looks(operator)[seen:]]
-        add("that: CPU of the operator, s", cpu_seconds(pid) - cpu)
-        add("that: looks", len(looks))
-        add("that: one look, median, s", median(looks))
-        add("that: one look, longest, s", max(looks))
+        add("half start: CPU of the operator, s", cpu_seconds(pid) - cpu)
+        add("half start: looks", len(looks))
+        add("half start: one look, median, s", median(looks))
+        add("half start: one look, longest, s", max(looks))
 
         seen = len(_looks(operator))
         cpu = cpu_seconds(pid)

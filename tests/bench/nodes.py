@@ -40,7 +40,9 @@ def run(book: Book, rounds: int, quick: bool) -> None:
                     book.add("registration, s", DIRECT, registered(machines, MASTER, size), size)
                 with machines.master():
                     measure(book, machines, size, QUICK_IDLE_SECONDS if quick else IDLE_SECONDS)
-    book.note("clean-up includes the 5 s for which a dead node is waited for (--cleanup-after 5)")
+    book.note(
+        "Clean-up includes the 5 s for which the proxy waits for a dead node (--cleanup-after 5)"
+    )
 
 
 def registered(machines: World, master: str, size: int) -> float:

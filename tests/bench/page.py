@@ -39,7 +39,7 @@ def run(book: Book, rounds: int, quick: bool) -> None:
         for size in QUICK_SIZES if quick else SIZES:
             with world() as machines:
                 measure(book, machines, size, QUICK_WATCHED if quick else WATCHED)
-    book.note("a document is made each second; frames without a graphics card, on these processors")
+    book.note("The proxy makes a document each second. Frames are painted without a graphics card")
 
 
 def measure(book: Book, machines: World, size: int, seconds: float) -> None:

@@ -86,9 +86,9 @@ def run(book: Book, rounds: int, quick: bool) -> None:
             book.add("discovery, s", DIRECT, discovered(size), size)
             measure_crowd(book, size, QUICK_IDLE_SECONDS if quick else IDLE_SECONDS)
     book.note(
-        "discovery is from the making of the first participant until a reader outside has found a "
-        "writer of each; the proxy has been up for half a minute; participants are of Cyclone DDS, "
-        "up to fifty in one process"
+        "Discovery is the time from the start of the first participant until an outside reader has "
+        "found a writer of each participant. The proxy has run for half a minute before. "
+        "Participants are of Cyclone DDS, up to fifty in one process"
     )
 
 
