@@ -104,7 +104,7 @@ def main() -> None:
 def docker(
     context: click.Context, /, once: bool, log_format: str, log_level: str, **options: Any
 ) -> None:
-    """Look after the labelled containers of a Docker engine.
+    """Run proxies for the labelled containers of a Docker engine.
 
     The engine is that of DOCKER_HOST, else that of this host. Every option has an environment
     variable: ROSPROXY_ and the option's name, such as ROSPROXY_PORTS. --master-uri also has
@@ -191,7 +191,7 @@ for command in (
 @config_option
 @click.pass_context
 def kubernetes(context: click.Context, /, log_format: str, log_level: str, **options: Any) -> None:
-    """Look after the RosProxies of a Kubernetes cluster.
+    """Run the proxies of the RosProxies in a Kubernetes cluster.
 
     The cluster is that of the pod in which this program runs, else that of KUBECONFIG. Every option
     has an environment variable: ROSPROXY_ and the option's name, such as ROSPROXY_PROXY_IMAGE.

@@ -239,7 +239,7 @@ class Settings:
         Direction,
         Option(
             "`out`: only outside nodes reach nodes through the proxy. `both`: inside nodes "
-            "reach outside nodes through the proxy, too, at [ports on its inside "
+            "reach outside nodes through the proxy, too, at [ports on the proxy's inside "
             "addresses](../guide/by-hand.md#no-way-out-but-the-proxy)."
         ),
     ] = "out"
@@ -339,9 +339,9 @@ class Settings:
     ros2_lan_relay_secret: Annotated[
         str | None,
         Option(
-            "Secret that `rosproxy lan-relay` has as `--secret`. With this secret, each of the "
-            "two programs proves that its messages are genuine. Prefer the variable: all users "
-            "of the machine can see a command line.",
+            "Secret that `rosproxy lan-relay` has as `--secret`. With this secret, the two "
+            "programs authenticate each other's messages. Prefer the variable: all users of "
+            "the machine can see a command line.",
             kinds.TOKEN,
             default="none",
         ),

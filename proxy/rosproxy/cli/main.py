@@ -102,9 +102,10 @@ def _check(settings: Any, deep: bool) -> None:
 @options.log_options
 @options.config_option
 def lan_relay(log_format: str, log_level: str, **given: Any) -> None:
-    """Pass ROS 2 discovery on between a LAN and the proxy. Run it in the host's network.
+    """Pass ROS 2 discovery on between a LAN and the proxy.
 
-    It carries discovery alone: user data goes through the ports that the host publishes.
+    Run this command in the host's network. User data does not pass the LAN relay, but the ports
+    that the host publishes.
     """
     from rosproxy.app.lan_relay_program import run_lan_relay
     from rosproxy.ros2.servers.lan_relay import LanRelaySettings

@@ -163,9 +163,9 @@ def doctor(
     subscribers. With a node: the topics of that node. With two nodes: the topics between them.
     The report shows which pairs are not connected, and why.
 
-    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. To see what an outside
-    machine sees, run it on that machine with --outside. Exits with 0 if no error was found, else
-    with 1.
+    Run this command where the proxy runs: docker exec CONTAINER rosproxy doctor. To see what an
+    outside machine sees, run the command on that machine with --outside. Exits with 0 if no
+    error was found, else with 1.
     """
     import asyncio
 
