@@ -6,13 +6,28 @@ import signal
 
 import pytest
 
+from rosproxy.admin.status_document import EndpointStatus, parse_status
 from tests.clients.matrix import CALL, LIBRARIES, PEERS, SERVE, able, each_client
 from tests.ros.lab import Lab
 from tests.ros.processes import Process, wait_until
 
 
+def nodes_of(lab: Lab) -> tuple[EndpointStatus, ...]:
+    return parse_status(lab.read("/status")).nodes
+
+
+def is_new(node: EndpointStatus) -> bool:
+    """Whether a node has not answered the proxy yet."""
+    return node.state == "new"
+
+
 def restart_proxy(lab: Lab) -> None:
+    """Kill the proxy and start it again, once it has asked all nodes what they are.
+
+    A roslisp node ends if its caller dies before the node has answered, and a new node is asked.
+    """
     assert lab.proxy is not None
+    wait_until("all nodes have answered", lambda: not any(is_new(node) for node in nodes_of(lab)))
     lab.proxy.kill()
     lab.start_proxy()
 
