@@ -9,7 +9,7 @@ import socket
 import subprocess
 from collections.abc import Iterator
 
-from rosproxy.ros2.servers.groups import GROUP, GroupLanRelays, send_through
+from rosproxy.ros2.servers.groups import GROUP, GroupSockets, send_through
 from tests.integration.net import PATIENCE
 
 PORT = 7400
@@ -28,8 +28,8 @@ class Hearing:
         self.sources = list[str]()
         self.ends = list[str]()
         self.opened = 0
-        self.lan_relays = GroupLanRelays(PORT, self._begin, self._end)
-        self.lan_relays.open([socket.AF_INET])
+        self.groups = GroupSockets(PORT, self._begin, self._end)
+        self.groups.open([socket.AF_INET])
 
     def _begin(self, sock: socket.socket) -> None:
         self.opened += 1
@@ -75,21 +75,21 @@ async def main() -> None:
     hearing = Hearing()
     coming = networks()
     present = [next(coming) for _ in range(AT_ONCE)]
-    joined = [len(hearing.lan_relays.join(present))]
+    joined = [len(hearing.groups.join(present))]
     first = await hearing.heard(present)
     sockets = [hearing.opened]
     for number, address in enumerate(coming):
         ip(f"link del d{number}")
         present = [*present[1:], address]
-        joined.append(len(hearing.lan_relays.join(present)))
+        joined.append(len(hearing.groups.join(present)))
     last = await hearing.heard(present)
     sockets.append(hearing.opened)
     second_address = "10.60.59.2"
     ip(f"addr add {second_address}/24 dev d59")
-    hearing.lan_relays.join([present[-1], second_address])
-    hearing.lan_relays.join([second_address])
+    hearing.groups.join([present[-1], second_address])
+    hearing.groups.join([second_address])
     by_second = await hearing.heard([second_address])
-    hearing.lan_relays.close()
+    hearing.groups.close()
     print(json.dumps({"joined": joined, "heard": [len(first), len(last), len(by_second)],
                       "twice": [len(s) - len(set(s)) for s in (first, last, by_second)],
                       "sockets": sockets}))  # fmt: skip

@@ -140,7 +140,7 @@ def _parse(tokens: list[str]) -> Rule:
     globs = [by] if kind is RuleKind.SLAVE else [tokens[2], by]
     for glob in globs:
         if glob[0] not in "/*?":  # it would never match: names that the master knows begin so
-            raise ValueError(f"{glob[:40]!r} must begin with / or *, as ROS names do")
+            raise ValueError(f"{glob[:40]!r} must begin with /, * or ?, as ROS names do")
     return Rule(action, kind, tokens[2], by)
 
 

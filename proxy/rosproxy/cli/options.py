@@ -266,6 +266,9 @@ def _usage_text(error: click.UsageError) -> str:
     if isinstance(error, click.MissingParameter):
         prefix = error.ctx.auto_envvar_prefix if error.ctx else None
         variable = option.envvar or f"{prefix}_{str(option.name).upper()}"
-        return f"{name}: missing; give {str(option.help).partition('. ')[0]} ({variable})"
+        meaning = str(option.help).partition(". ")[0]
+        if meaning[1:2].islower():  # no abbreviation, as in "IP address"
+            meaning = meaning[0].lower() + meaning[1:]
+        return f"{name}: missing; give {meaning} ({variable})"
     has_example = isinstance(option.default, int | float) and not isinstance(option.default, bool)
     return f"{name}: {message}" + (f"; for example {option.default:g}" if has_example else "")

@@ -46,7 +46,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 
 _TEMPORARY = r"(-\d+)?(-old(-\d+)?)?"
-"""What stands behind a name while another container takes over, or has it: `selection.free_name`"""
+"""What follows a name while another container takes over or has it (`duplicates.free_name`)."""
 _NEVER = (
     *("Privileged", "Binds", "Mounts", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
     *("PidMode", "UTSMode", "UsernsMode"),

@@ -189,7 +189,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             return []
         near = newcomer.proxy_address
         settings = self.settings
-        lan_relays = {HostPort(near, p) for p in (settings.unicast_port, settings.multicast_port)}
+        own = {HostPort(near, p) for p in (settings.unicast_port, settings.multicast_port)}
         announcement = for_all(message.datagram)
         return [
             Outgoing(p.metatraffic, announcement)
@@ -198,7 +198,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             and p is not newcomer
             # Cyclone DDS has one locator for all participants of a process, which know each other.
             and p.metatraffic
-            and p.metatraffic not in {newcomer.metatraffic, *lan_relays}
+            and p.metatraffic not in {newcomer.metatraffic, *own}
         ]
 
     def forget(self, participant: InsideParticipant) -> None:

@@ -8,10 +8,10 @@ kept *apart* for a moment: both are told that the other has ended, nothing of di
 only then are they introduced.
 
 This is for participants whose policy has changed, and for those that knew the proxy at another
-address, as `Returning` says. The latter wait until the LAN relay has been heard, which starts after
-the proxy: before that, outside would not hear that they have ended. Participants are told again,
-with each announcement from outside, until they send something to where outside is found now: while
-so many meet, not every datagram arrives.
+address, as `ReturningParticipants` says. The latter wait until the LAN relay has been heard, which
+starts after the proxy: before that, outside would not hear that they have ended. Participants are
+told again, with each announcement from outside, until they send something to where outside is found
+now: while so many meet, not every datagram arrives.
 
 Hundreds inside may have to meet hundreds outside, which takes many seconds. So dispose messages and
 introductions wait, and are made a few at a time (`next_datagrams`). Addresses inside take turns.

@@ -38,7 +38,7 @@ from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
 from rosproxy.ros2.registry.selected import SelectedAddresses
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
-from rosproxy.ros2.servers.groups import GroupLanRelays, family_of, groups_of, send_through
+from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class DomainServer:
         self._sockets: list[socket.socket] = []
         self._stand_ins: dict[int, socket.socket] = {}
         self._synced_changes = 0
-        self._groups = GroupLanRelays(settings.multicast_port, self._read_group, self._stop_reading)
+        self._groups = GroupSockets(settings.multicast_port, self._read_group, self._stop_reading)
         self._secret = b""
         self._heard = asyncio.Event()
         self._reader = DiscoveryReader()

@@ -66,7 +66,7 @@ class _Network:
     memberships: list[Membership] = field(default_factory=list)
 
 
-class GroupLanRelays:
+class GroupSockets:
     """Sockets that hear the groups of a port. ``begin`` is called with each, ``end`` closes it."""
 
     def __init__(

@@ -33,7 +33,7 @@ from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
-from rosproxy.ros2.servers.groups import GroupLanRelays, family_of, groups_of, send_through
+from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class LanRelay:
         self._proof = RelayProof(settings.secret, time.time)
         self._sockets: list[socket.socket] = []
         self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
-        self._groups = GroupLanRelays(self._port, self._begin, self._end)
+        self._groups = GroupSockets(self._port, self._begin, self._end)
         self._sources = LanSources()
         # A machine on the LAN may forge the proxy's address, but not its proof.
         self._proxy_rates = DiscoveryRates(PER_SECOND, BURST)

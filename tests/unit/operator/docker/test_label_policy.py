@@ -67,7 +67,7 @@ def test_the_rules_of_a_label(text: str, rules: int) -> None:
     ("text", "told"),
     [
         ("hide /camera", "label rosproxy.policy: rule 'hide /camera': must be ACTION KIND GLOB"),
-        ("deny publish camera", "'camera' must begin with / or *"),
+        ("deny publish camera", "'camera' must begin with /, * or ?"),
         ("; ".join(["deny publish /a"] * (MOST_LABEL_RULES + 1)), "has 101 rules, more than 100"),
         ("#" * 20_000, "has more than 16384 characters: join rules by globs"),
     ],
