@@ -615,7 +615,9 @@ class Domain:
         The proxy may be killed before the next round; what is lost on its way comes again then.
         """
         has_more = len(insider.leases) > former_count
-        return self.returning.reminders(insider, now) if has_more else []
+        if not has_more or insider not in self.inside.port_keepers(self.inside.at(insider.address)):
+            return []
+        return self.returning.reminders(insider, now)
 
     def _imported(
         self,

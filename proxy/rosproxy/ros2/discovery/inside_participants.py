@@ -1,7 +1,7 @@
 """The participants inside, and the ports of the range that lead to their locators."""
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -136,6 +136,21 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             for p in self.by_prefix.values()
             if self.proofs.has_answered(p.address, p.prefix) is has_answered
         ]
+
+    def port_keepers(self, participants: Iterable[InsideParticipant]) -> list[InsideParticipant]:
+        """The participants that can keep their ports: one of each process of Cyclone DDS.
+
+        The participants of a process have the same locator for metatraffic, and the same number of
+        the sample that they expect next of a writer, whichever of them a heartbeat is for
+        (ddsi_receive.c, handle_Heartbeat). The first that has answered keeps its ports; one that
+        has not may have been forged.
+        """
+        ordered = list(participants)
+        keepers = dict[tuple[str, HostPort | None], InsideParticipant]()
+        for participant in ordered:
+            if self.proofs.has_answered(participant.address, participant.prefix):
+                keepers.setdefault((participant.address, participant.metatraffic), participant)
+        return [p for p in ordered if keepers.get((p.address, p.metatraffic), p) is p]
 
     def exported(
         self,

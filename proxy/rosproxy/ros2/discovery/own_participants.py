@@ -94,7 +94,7 @@ class OwnParticipants:
 
     def port_reminders(self, now: float) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
-        participants = self.inside.by_prefix.values()
+        participants = self.inside.port_keepers(self.inside.by_prefix.values())
         return [sent for p in participants for sent in self.returning.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:

@@ -14,7 +14,7 @@ from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.domain_settings import MOST_LEASES, MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
-from rosproxy.ros2.protocol.addressing import destination
+from rosproxy.ros2.protocol.addressing import destination, destinations
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
@@ -347,6 +347,28 @@ def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
     numbers = reminded()
     assert numbers == [*port_store.numbers(A, domain.inside.by_prefix[A].ports).values()]
     assert reminded() == []  # not by each announcement
+
+
+def reminded(domain: Domain) -> set[bytes]:
+    """The participants that are told again which ports to keep."""
+    sent = [out.datagram for out in domain.own.port_reminders(NOW)]
+    told = [destinations(datagram) for datagram in sent if any(heartbeats(datagram))]
+    return set[bytes]().union(*told)
+
+
+def test_one_participant_of_a_process_keeps_its_ports() -> None:
+    """Those of Cyclone DDS have one number together: the two took turns, and had the rest ask."""
+    domain = make_domain()
+    meet(domain, A)
+    meet(domain, B)
+    assert reminded(domain) == {A, B}  # neither has proved to be there
+    prove(domain, INSIDE, prefixes=[B])
+    assert reminded(domain) == {B}
+    prove(domain, INSIDE, prefixes=[A])
+    assert reminded(domain) == {A}
+    in_other_process = bytes(range(12))
+    domain.heard_inside(spdp(in_other_process, INSIDE, 7500), INSIDE, NOW)
+    assert reminded(domain) == {A, in_other_process}
 
 
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
