@@ -3,6 +3,8 @@
 import asyncio
 from collections.abc import Callable, Sequence
 
+import pytest
+
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import Standing
 from rosproxy.ros2.discovery.domain_settings import Outgoing
@@ -56,6 +58,38 @@ async def test_short_datagrams_share_a_round() -> None:
     assert len(names) == 20
 
 
+async def test_what_comes_while_none_waits_is_read_at_once() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    for name in ("robot", "laptop"):
+        assert reader.read(name, Standing.PROVEN, 0, reading(names, name))
+    assert names == ["robot", "laptop"]
+
+
+async def test_what_comes_after_a_full_round_waits_for_its_turn() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 8
+    reader.read("announces", Standing.PROVEN, 0, reading(names, "announces", copies))
+    reader.read("announces", Standing.PROVEN, 0, reading(names, "announces"))
+    reader.read("robot", Standing.PROVEN, 0, reading(names, "robot"))
+    assert names == ["announces"]
+    await until_read(names, 3)
+    assert names == ["announces", "announces", "robot"]
+    reader.read("robot", Standing.PROVEN, 0, reading(names, "robot"))
+    assert len(names) == 4
+
+
+async def test_what_comes_behind_a_datagram_that_waits_waits_as_well() -> None:
+    reader = DiscoveryReader()
+    names = list[str]()
+    reader.put("robot", Standing.PROVEN, 0, reading(names, "first"))
+    reader.read("robot", Standing.PROVEN, 0, reading(names, "second"))
+    assert names == []
+    await until_read(names, 2)
+    assert names == ["first", "second"]
+
+
 async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
     reader = DiscoveryReader()
     names = list[str]()
@@ -71,6 +105,10 @@ async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
     reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     await until_read(names, 1)
     assert failures == ["evil broke it"]
+    with pytest.raises(RuntimeError, match="evil broke it"):
+        reader.read("evil", Standing.PROVEN, 0, fail)
+    reader.read("robot", Standing.PROVEN, 0, reading(names, "robot"))
+    assert names == ["robot", "robot"]
 
 
 async def test_nothing_is_read_after_the_end() -> None:

@@ -10,7 +10,7 @@ lack.
 """
 
 from dataclasses import dataclass, field
-from enum import Enum, auto
+from enum import IntEnum, auto
 
 PER_SECOND = 10_000.0
 BURST = 50_000.0
@@ -22,7 +22,7 @@ MOST_SOURCES = 4096
 """Sources that are remembered. Of more, the source is forgotten that was remembered first."""
 
 
-class Standing(Enum):
+class Standing(IntEnum):
     """What is known of a source.
 
     PROVEN: its address is a peer's, or lies inside and has proved to receive. STRANGER: its address

@@ -112,7 +112,9 @@ class FragmentStores:
         GUID prefix of the participant that is to get them.
         """
         if not message.fragments:
-            return PassedFragments([rewrite(message)], [])
+            # Most messages announce nothing: acknowledgements and heartbeats.
+            is_rewritten = bool(message.announcements)
+            return PassedFragments([rewrite(message) if is_rewritten else message.datagram], [])
         store = self.by_prefix.setdefault(message.prefix, FragmentStore())
         before = store.size
         try:

@@ -1,7 +1,8 @@
 """Reads the discovery that has come in, a little in each round of the event loop.
 
 User data and the admin endpoint come first: sockets are read at once, and what is discovery waits
-(`DiscoveryQueue`). Between two rounds the event loop serves whatever else is ready.
+(`DiscoveryQueue`), unless no other discovery waits and the round has bytes left. Between two rounds
+the event loop serves whatever else is ready.
 """
 
 import asyncio
@@ -25,6 +26,19 @@ class DiscoveryReader:
         self._queue = DiscoveryQueue[Read]()
         self._loop = asyncio.get_running_loop()
         self._round: asyncio.Handle | None = None
+        self._spent = 0
+        """Bytes that were read and sent in this round."""
+
+    def read(self, source: str, standing: Standing, size: int, read: Read) -> bool:
+        """Read a datagram of so many bytes now if none waits, or when the turn of its source comes.
+
+        Return False if it is lost.
+        """
+        if self._queue or self._spent >= ROUND:
+            return self.put(source, standing, size, read)
+        self._schedule()
+        self._spent += size + OVERHEAD + _size_of(read())
+        return True
 
     def put(self, source: str, standing: Standing, size: int, read: Read) -> bool:
         """Have a datagram of so many bytes read when the turn of its source comes.
@@ -42,17 +56,23 @@ class DiscoveryReader:
         self._queue = DiscoveryQueue()
 
     def _schedule(self) -> None:
-        if self._round is None and self._queue:
-            self._round = self._loop.call_soon(self._read_some)
+        """Have another round begin, unless one is to begin already."""
+        if self._round is None:
+            self._round = self._loop.call_soon(self._begin_round)
 
-    def _read_some(self) -> None:
+    def _begin_round(self) -> None:
         self._round = None
+        self._spent = 0
         try:
-            spent = 0
-            while spent < ROUND and (waiting := self._queue.pop()):
-                sent = waiting.item()
-                led_to = sum(len(out.datagram) + OVERHEAD for out in sent)
+            while self._spent < ROUND and (waiting := self._queue.pop()):
+                led_to = _size_of(waiting.item())
                 self._queue.charge(waiting.source, led_to)
-                spent += waiting.size + led_to
+                self._spent += waiting.size + led_to
         finally:
-            self._schedule()
+            if self._spent or self._queue:
+                self._schedule()
+
+
+def _size_of(sent: Sequence[Outgoing]) -> int:
+    """The bytes that datagrams count for."""
+    return sum(len(out.datagram) + OVERHEAD for out in sent)

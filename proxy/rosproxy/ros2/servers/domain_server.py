@@ -362,19 +362,19 @@ class DomainServer:
                 source = plain_address(sender[0])
                 if must_read(datagram, source):
                     weight = 1 / QUEUED_FOR_PASSED
-                    self._queue(take, datagram, source)
+                    self._read_in_turn(take, datagram, source)
                 else:
                     weight = 1.0
                     self._carry_out(take, datagram, source)
                 spent += weight
                 spent_bytes += weight * len(datagram)
 
-    def _queue(self, take: Take, datagram: bytes, source: str) -> None:
-        """Have discovery read when the turn of its source comes."""
+    def _read_in_turn(self, take: Take, datagram: bytes, source: str) -> None:
+        """Have discovery read, at the latest when the turn of its source comes."""
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
-        if not self._reader.put(heard_at, standing, len(datagram), read):
+        if not self._reader.read(heard_at, standing, len(datagram), read):
             text = "more discovery waits to be read than has room"
             self.domain.refused("rate", heard_at, text)
 
