@@ -44,7 +44,9 @@ static int status(const actionlib::SimpleClientGoalState& state) {
   return -1;
 }
 
-// Sends one goal; with `--cancel 1` takes it back when feedback comes.
+// Sends one goal; with `--cancel 1` takes it back when feedback comes. Only once the status has named
+// the goal: until then a status of before the goal may arrive, and a client that has cancelled its
+// goal takes the goal for lost.
 void actionClient(const Options& options) {
   typedef actionlib::SimpleActionClient<actionlib::TwoIntsAction> Client;
   Client client(options.text("action"), true);
@@ -60,7 +62,9 @@ void actionClient(const Options& options) {
       goal, Client::SimpleDoneCallback(), Client::SimpleActiveCallback(),
       [&](const actionlib::TwoIntsFeedbackConstPtr&) {
         say("feedback");
-        if (cancel) client.cancelGoal();
+        if (cancel && client.getState() == actionlib::SimpleClientGoalState::ACTIVE) {
+          client.cancelGoal();
+        }
       });
   bool finished = client.waitForResult(ros::Duration(20));
   auto result = client.getResult();

@@ -16,6 +16,7 @@ from pathlib import Path
 import actionlib
 import rospy
 from actionlib.msg import TwoIntsAction, TwoIntsFeedback, TwoIntsGoal, TwoIntsResult
+from actionlib_msgs.msg import GoalStatus
 from std_msgs.msg import String
 from topic_tools.srv import MuxSelect, MuxSelectResponse
 
@@ -171,7 +172,11 @@ def action_server(options: Options) -> None:
 
 
 def action_client(options: Options) -> None:
-    """Sends one goal; with `--cancel 1` takes it back when feedback comes."""
+    """Sends one goal; with `--cancel 1` takes it back when feedback comes.
+
+    Only once the status has named the goal: until then a status of before the goal may arrive, and
+    a client that has cancelled its goal takes the goal for lost.
+    """
     client = actionlib.SimpleActionClient(options.text("action"), TwoIntsAction)
     if not client.wait_for_server(rospy.Duration(20)):
         say("no server")
@@ -180,7 +185,7 @@ def action_client(options: Options) -> None:
 
     def feedback(_: object) -> None:
         say("feedback")
-        if cancel:
+        if cancel and client.get_state() == GoalStatus.ACTIVE:
             client.cancel_goal()
 
     goal = TwoIntsGoal(int(options.number("a", 1)), int(options.number("b", 2)))
