@@ -46,5 +46,5 @@ def test_it_gets_the_socket_of_the_new_engine(engine: PrivateEngine, controller_
 
     wait_until(lambda: "the mounted /var/run/docker.sock is the former one" in logs(), 60, logs)
     wait_until(is_well, 60, logs)
-    count = docker("inspect", "--format", "{{.RestartCount}}", NAME, engine=engine.url)
-    assert count == "1", logs()
+    # The engine's own RestartCount leaves out a container that ended before the new engine saw it.
+    assert logs().count("health and metrics at") == 2, logs()
