@@ -278,9 +278,11 @@ class Hosts(Invariants):
             failed = self.carry_out(plan)
             assert all(isinstance(error, Refused) for _, error in failed), failed
             self.check()
-            for box in self.boxes("removing"):
+            removed = self.boxes("removing")
+            for box in removed:
                 self.engine.boxes.remove(box)
-            if not plan.actions and plan.again_in is None:
+            # A container that has gone makes the operator look again.
+            if not plan.actions and plan.again_in is None and not removed:
                 break
             self.controller.now += plan.again_in or 0.0
         else:
