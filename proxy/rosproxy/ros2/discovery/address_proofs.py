@@ -18,7 +18,7 @@ from typing import Any
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import WRITER_ENDPOINTS, announcement
-from rosproxy.ros2.protocol.reliable import heartbeat
+from rosproxy.ros2.protocol.reliable import heartbeat, heartbeats
 from rosproxy.ros2.protocol.rtps import (
     HEADER,
     NO_VENDOR,
@@ -26,10 +26,11 @@ from rosproxy.ros2.protocol.rtps import (
     RtpsError,
     SubmessageId,
     source_prefix,
+    source_vendor,
     submessages,
 )
 from rosproxy.ros2.registry.participants import ParticipantTable
-from rosproxy.ros2.rewriting.discovery import BuiltinWriter
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
 
 LEASE_DURATION = 12.0
 """Seconds for which a participant remembers the one in a question. Cyclone DDS announces itself
@@ -149,6 +150,16 @@ class AddressProofs:
     def _prefix(self, address: str) -> bytes:
         size = PREFIX - len(NO_VENDOR)
         return NO_VENDOR + blake2b(address.encode(), key=self.secret, digest_size=size).digest()
+
+
+def is_question_of_proxy(message: DiscoveryMessage) -> bool:
+    """Whether a message is the question of another proxy, as `AddressProofs.question` makes it.
+
+    Raises RtpsError.
+    """
+    is_of_proxy = source_vendor(message.datagram) == NO_VENDOR
+    is_announcement = message.of_participant is not None
+    return is_of_proxy and is_announcement and any(heartbeats(message.datagram))
 
 
 def _announces_nothing(datagram: bytes) -> bool:

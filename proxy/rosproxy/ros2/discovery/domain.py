@@ -33,7 +33,7 @@ from functools import partial
 from typing import Self
 
 from rosproxy.leases.ports import PortPool
-from rosproxy.ros2.discovery.address_proofs import AddressProofs
+from rosproxy.ros2.discovery.address_proofs import AddressProofs, is_question_of_proxy
 from rosproxy.ros2.discovery.claimed_addresses import claim_fault
 from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates, Standing, cost
 from rosproxy.ros2.discovery.domain_settings import (
@@ -282,8 +282,8 @@ class Domain:
             if is_for_data or may_be_discovery(datagram):  # Cyclone DDS has one locator for both
                 if self._is_too_much(datagram, source, now):
                     return []
-                imported = partial(self._imported, port, source, insider, now)
-                passed, back = _pass_on_each(datagram, imported)
+                heard = partial(self._heard_at_lease, port, source, insider, now)
+                passed, back = _pass_on_each(datagram, heard)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
         return [self._passed(lease, d, True) for d in passed] + back
@@ -453,6 +453,8 @@ class Domain:
     ) -> list[Outgoing]:
         if self.own.is_own(message.prefix):
             return []
+        if is_question_of_proxy(message):
+            return self.own.answer_to_proxy(self.own.observer.prefix, message, source)
         if message.of_participant is None:
             return self._told_outside(message, source, received, now)
         if not by_relay and not self.outside.may_announce(
@@ -619,6 +621,20 @@ class Domain:
             return []
         return self.returning.reminders(insider, now)
 
+    def _heard_at_lease(
+        self,
+        port: int,
+        source: str,
+        insider: InsideParticipant,
+        now: float,
+        message: DiscoveryMessage,
+        received: int,
+    ) -> _Passing:
+        """What becomes of metatraffic from outside at a port of the range. Raises RtpsError."""
+        if is_question_of_proxy(message):
+            return [], self.own.answer_to_proxy(insider.prefix, message, source)
+        return self._imported(port, source, insider, now, message, received)
+
     def _imported(
         self,
         port: int,
@@ -639,7 +655,9 @@ class Domain:
         back = list[Outgoing]()
         if spdp is not None:
             if outsider is None and not self.settings.is_peer(source):
-                return [], self._announced_at_lease(insider, message, source)
+                text = "a participant that was not heard before, at an address that is no peer's"
+                self.outside.refuse_stranger(source, text)
+                return [], []
             outsider, back = self._meet_outside(message, source, now)
         if outsider is None:
             return [], back
@@ -652,16 +670,6 @@ class Domain:
         if spdp is not None and spdp.ended:
             self._forget_outside(outsider)
         return passed, back
-
-    def _announced_at_lease(
-        self, insider: InsideParticipant, message: DiscoveryMessage, source: str
-    ) -> list[Outgoing]:
-        """What answers an announcement of a participant that was not heard before, at no peer's."""
-        if source_vendor(message.datagram) == NO_VENDOR:
-            return self.own.answer_to_proxy(insider, message, source)
-        text = "a participant that was not heard before, at an address that is no peer's"
-        self.outside.refuse_stranger(source, text)
-        return []
 
     def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
         """A datagram that goes to participants outside, as far as they may be sent any."""

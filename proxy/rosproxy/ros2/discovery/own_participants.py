@@ -21,7 +21,7 @@ from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
-from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 
 
 @dataclass(slots=True)
@@ -128,21 +128,21 @@ class OwnParticipants:
         return self.outside.allowed_questions(outsider, questions)
 
     def answer_to_proxy(
-        self, insider: InsideParticipant, message: DiscoveryMessage, source: str
+        self, prefix: bytes, message: DiscoveryMessage, source: str
     ) -> list[Outgoing]:
-        """The answer to another proxy that asks a participant inside to prove that it receives.
+        """The answer to another proxy that asks a participant to prove that it receives.
 
-        The participant knows nothing of the participants of proxies outside, so it can't answer
-        itself. The answer is shorter than the question. Raises RtpsError.
+        ``prefix`` is the GUID prefix of the observer, or of the participant inside at whose port
+        the question came. Nothing is sent if the question is for another participant. The proof
+        participant of a proxy is told to nobody: two proxies would ask each other without end. The
+        answer is shorter than the question. Raises RtpsError.
         """
         spdp = message.of_participant
         target = first_metatraffic(spdp, message.datagram, source) if spdp else None
-        asked = [h for h in heartbeats(message.datagram) if h.writer == BuiltinWriter.PUBLICATIONS]
-        if destination(message.datagram) != insider.prefix or not asked:
+        asked = next(heartbeats(message.datagram), None)
+        if destination(message.datagram) != prefix or asked is None:
             return []
-        answer = acknack(
-            insider.prefix, message.prefix, asked[0].writer, asked[0].first, (), 1, final=True
-        )
+        answer = acknack(prefix, message.prefix, asked.writer, asked.first, (), 1, final=True)
         return sent_to(target, [answer])
 
     def forget(self, prefix: bytes) -> None:

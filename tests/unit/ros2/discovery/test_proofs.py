@@ -1,6 +1,7 @@
 """Addresses prove that they receive; whose sources may be forged gets no one else's place."""
 
 from collections import Counter
+from functools import partial
 
 import pytest
 
@@ -264,6 +265,44 @@ def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
         assert acknowledged(out.datagram, prefix, BuiltinWriter.PUBLICATIONS) == [1]
         asking.heard_outside(out.datagram, HOST, NOW)
     assert asking.outside.by_prefix[A].proven is known
+
+
+def exchange(proxies: dict[str, Domain]) -> Counter[str]:
+    """Have proxies announce themselves until all is said; how many datagrams each has sent."""
+    counts = Counter[str]()
+    sent = [(host, out) for host, p in proxies.items() for out in p.own.announced_outside()]
+    while sent:
+        source, out = sent.pop(0)
+        counts[source] += 1
+        assert counts[source] < 100, "they go on and on"
+        host = out.target.host
+        if host in proxies:
+            listening = out.target.port - RANGE.advertised(RANGE.listen.first) + RANGE.listen.first
+            at = partial(proxies[host].at_lease, listening)
+            heard = at if listening > RANGE.listen.first else proxies[host].heard_outside
+            sent += [(host, back) for back in heard(out.datagram, source, NOW)]
+    return counts
+
+
+@pytest.mark.parametrize("peer_of_second", [HOST, ROBOT])
+def test_two_proxies_do_not_ask_each_other_without_end(peer_of_second: str) -> None:
+    """Each announced the questions of the other inside, and asked the asking participant again."""
+    proxies = {HOST: make_domain(peers=()), LAPTOP: make_domain(peers=())}
+    for host, peer in ((HOST, LAPTOP), (LAPTOP, peer_of_second)):
+        domain = proxies[host]
+        domain.settings.hosts = (host,)
+        domain.settings.peers = (HostPort(peer, RANGE.advertised(RANGE.listen.first)),)
+        domain.own.observer.prefix = domain.proofs.secret = host.encode().ljust(PREFIX, b"-")
+        meet(domain, A if host == HOST else B)
+    exchange(proxies)
+    second = exchange(proxies)
+    observers = {host: domain.own.observer.prefix for host, domain in proxies.items()}
+    for host, other in ((HOST, LAPTOP), (LAPTOP, HOST)):
+        outside = proxies[host].outside
+        assert outside.by_prefix.keys() <= {observers[other]}
+        assert all(p.proven for p in outside.by_prefix.values())
+    # All have answered: nothing but the announcements is left to say.
+    assert second.total() <= 6
 
 
 def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
