@@ -27,14 +27,16 @@ SHORTEST_PAUSE = 0.005
 """Seconds by which a flood is ahead of its rate before it waits."""
 PADDING = 200
 """Bytes by which an announcement is as long as a real one: no address is sent more than came."""
+_SO_RCVBUFFORCE = 33
+"""Option of a socket for more bytes than rmem_max allows (socket(7)); Python's module lacks it."""
 
 Address = tuple[str, int]
 
 
 def udp(address: str, port: int = 0) -> socket.socket:
-    """A socket at an address of this machine."""
+    """A socket at an address of this machine, with room for all that a busy test reads late."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024 * 1024)
+    sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 8 * 1024 * 1024)
     sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(address))
     sock.bind((address, port))
     return sock
