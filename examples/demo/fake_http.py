@@ -173,6 +173,7 @@ class FakeTcpServer:
         self._serve = serve
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
+        self._is_stopped = False
         self.admits: Callable[[str], bool] = lambda _peer: True
         self.connections = 0
         self.address: Address = ("", 0)
@@ -185,6 +186,7 @@ class FakeTcpServer:
     async def start(self, address: str, port: int = 0) -> None:
         """Listen; on a free port if none is given."""
         port = port or free_ports(1)
+        self._is_stopped = False
         self._server = await asyncio.start_server(self._accept, address, port, backlog=256)
         self.address = self._server.sockets[0].getsockname()[:2]
 
@@ -197,6 +199,7 @@ class FakeTcpServer:
     async def stop(self) -> None:
         """Stop listening and close all connections."""
         self.stop_listening()
+        self._is_stopped = True
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -214,10 +217,23 @@ class FakeTcpServer:
         try:
             await self._serve(reader, writer)
         except (OSError, EOFError, asyncio.CancelledError):
-            pass  # the peer, or who stopped the server, ended it
+            pass  # the peer has ended the connection, or `stop` has
         finally:
+            await self._close(writer)
             self._tasks.discard(task)
+
+    async def _close(self, writer: asyncio.StreamWriter) -> None:
+        """Close a connection when what was written is sent; at once after `stop`."""
+        if self._is_stopped:
+            writer.transport.abort()
+        else:
             writer.close()
+        try:
+            await writer.wait_closed()
+        except asyncio.CancelledError:  # the peer does not read, and `stop` was called
+            writer.transport.abort()
+        except OSError:
+            pass
 
 
 class FakeHttpServer(FakeTcpServer):
