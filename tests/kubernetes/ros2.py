@@ -89,7 +89,7 @@ def node(
 
 def lan_relays(of: RosProxy) -> list[Json]:
     """The pods of a RosProxy's LAN relays."""
-    bodies = api.objects("pods", of.namespace, "app.kubernetes.io/component=LAN relay")
+    bodies = api.objects("pods", of.namespace, "app.kubernetes.io/component=lan-relay")
     return [body for body in bodies if "deletionTimestamp" not in body["metadata"]]
 
 
