@@ -134,8 +134,8 @@ class OwnParticipants:
 
         ``prefix`` is the GUID prefix of the observer, or of the participant inside at whose port
         the question came. Nothing is sent if the question is for another participant. The proof
-        participant of a proxy is told to nobody: two proxies would ask each other without end. The
-        answer is shorter than the question. Raises RtpsError.
+        participant of a proxy is announced to no side: two proxies would ask each other without
+        end. The answer is shorter than the question. Raises RtpsError.
         """
         spdp = message.of_participant
         target = first_metatraffic(spdp, message.datagram, source) if spdp else None
