@@ -140,7 +140,7 @@ async def _ask_master(context: Context, trial: _PortTrial, target: HostPort) -> 
     except TimeoutError:
         return "missed"
     except Unreachable as error:
-        log.debug("the master can't try %s: %s", target, error)
+        log.debug("the master can't call the port under test, %s: %s", target, error)
         return "unknown"
     return "ok"
 

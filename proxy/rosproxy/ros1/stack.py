@@ -172,10 +172,10 @@ class Ros1:
         context.metrics.registry.register(self._state)
         repeat = context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
-        repeat(self.prober.look, PROBE_TICK, "looking after nodes")
+        repeat(self.prober.look, PROBE_TICK, "probing nodes")
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
-        repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
-        repeat(self.stand_ins.tidy, TIDY_INTERVAL, "looking after nodes outside")
+        repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "checking subscribers")
+        repeat(self.stand_ins.tidy, TIDY_INTERVAL, "checking stand-ins for nodes outside")
         repeat(self._messages.look, COUNT_TICK, "counting messages")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         repeat(self._enforcer.look, ENFORCE_TICK, "enforcing the policy")
@@ -246,10 +246,13 @@ class Ros1:
     def unready(self) -> str | None:
         """Why nodes can't use it now; None if they can."""
         if self.retired:
-            return "retired: nothing is registered any more"
+            return "the proxy is retired and accepts no registrations"
         if self.master_monitor.up:
             return None
-        return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
+        return (
+            self.master_monitor.error
+            or f"the proxy has not asked master {self.settings.master_uri} yet"
+        )
 
     async def _handle_update(self, body: Any) -> dict[str, Any]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
@@ -276,7 +279,9 @@ class Ros1:
         address = read_body(body, MasterAddress).address
         upstream = self.context.upstream
         if address != upstream.master_address:
-            log.info("master %s is looked for at %s", self.settings.master_uri, address)
+            log.info(
+                "master %s: the proxy connects to %s from now on", self.settings.master_uri, address
+            )
             upstream.master_address = address
             self.context.outside_changed.set()
             self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
@@ -287,8 +292,9 @@ class Ros1:
         ports = self.settings.ports.listen
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         if files != resource.RLIM_INFINITY and files < len(ports) + SPARE_FILES:
-            text = f"{ports} are more ports than this process may have open files: raise ulimit -Hn"
-            raise SettingError(RANGE_OPTION, text)
+            needed = len(ports) + SPARE_FILES
+            text = f"{ports} needs {needed} open files, and this process may have {files}"
+            raise SettingError(RANGE_OPTION, f"{text}. Raise the limit (ulimit -Hn)")
         # Half of what is left may go to kept connections, one for each node; clients get the rest.
         spare = max(files, 0) - len(ports) - SPARE_FILES
         self.prober.kept_connections.most = max(0, min(len(ports), spare // 2))
@@ -307,7 +313,7 @@ class Ros1:
         with setting_error_if_taken(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
         context = self.context
-        greeting = f"rosproxy: {title}; nodes use it by ROS_MASTER_URI\n"
+        greeting = f"rosproxy: {title}; nodes use this address as ROS_MASTER_URI\n"
         server = XmlRpcServer(context, service, greeting, context.master_call, service, guard)
         self._servers.append(server)
         self._acceptors.append(Acceptor(context.tasks, sock, server.dispatch, context.gate))

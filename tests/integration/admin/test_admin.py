@@ -81,7 +81,10 @@ async def test_not_ready_before_the_master_was_asked(
 ) -> None:
     master.delay = 0.5
     proxy = await make_proxy()
-    assert await ask(proxy, "/readyz") == (503, f"master {master.uri} was not asked yet\n")
+    assert await ask(proxy, "/readyz") == (
+        503,
+        f"the proxy has not asked master {master.uri} yet\n",
+    )
     assert (await status(proxy))["master"]["up"] is False
 
 

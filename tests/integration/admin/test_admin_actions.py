@@ -485,7 +485,10 @@ async def test_retiring(
     assert not everything(master)
     address = (proxy.settings.admin.host, proxy.settings.admin.port)
     ready = await exchange(address, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
-    assert (ready.status, ready.body) == (503, b"retired: nothing is registered any more\n")
+    assert (ready.status, ready.body) == (
+        503,
+        b"the proxy is retired and accepts no registrations\n",
+    )
 
 
 async def test_retiring_waits_for_registrations_under_way(

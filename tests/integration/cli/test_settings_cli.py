@@ -219,8 +219,8 @@ async def test_it_starts_without_a_master_says_so_and_works_once_it_is_up(
 ):
     await master.stop()
     process: Process = start_process()
-    await until(lambda: "waiting for it" in process.text, "it says so")
-    assert process.text.count("waiting for it") == 1
+    await until(lambda: "The proxy waits for the master" in process.text, "it says so")
+    assert process.text.count("The proxy waits for the master") == 1
     with pytest.raises(ConnectionResetError):
         await node.publish(process.master)
     await master.start()

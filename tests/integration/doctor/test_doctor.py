@@ -159,7 +159,7 @@ async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
     await proxy.stop()
     await fake.stop()
     assert "not at the path /ros" in findings[0].text
-    assert f"rather --master-uri http://{MASTER}:{fake.address[1]} " in error
+    assert f"Set --master-uri http://{MASTER}:{fake.address[1]} " in error
 
 
 async def test_something_else_answers_for_the_master(make_proxy: MakeProxy) -> None:

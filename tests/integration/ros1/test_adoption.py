@@ -178,7 +178,7 @@ async def test_nodes_elsewhere_are_left_alone(
     assert all_of(master) == before
     texts = [problem.text for problem in proxy.ros1.context.problems.all()]
     assert any("no node answers at" in text for text in texts)
-    assert any("in none of the inside networks" in text for text in texts)
+    assert any("is not in an inside network" in text for text in texts)
 
 
 async def test_another_node_at_the_same_port(
@@ -249,7 +249,7 @@ async def test_a_node_that_is_subscribed_to_a_parameter_is_left_as_it_was(
     del before["/rosout_disable_topics_generation"]  # which could not be told apart
     assert all_of(master) == before
     problems = [p for p in proxy.ros1.context.problems.all() if p.subject == "/talker"]
-    assert "Restart its container" in problems[-1].text
+    assert "Restart the container of the node" in problems[-1].text
     assert not shutdowns(node)
     assert not proxy.endpoint(node).registrations
 

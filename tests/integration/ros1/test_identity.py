@@ -75,7 +75,9 @@ async def test_the_master_port_is_for_inside_alone(
     for phrase in (OUTSIDE, "127.0.2.0/24", "--inside-network"):
         assert phrase in reply.body.decode()
         assert phrase in problems(proxy)["master port"]
-    assert caplog.text.count("no inside network") == 1  # it is told in the log now and then only
+    assert (
+        caplog.text.count("is not in an inside network") == 1
+    )  # it is told in the log now and then only
     assert proxy.metric("strangers_total", standing="outside") == 3
     assert "/stranger" not in master.nodes
     assert (await node.publish(proxy.master))[0] == 1
@@ -304,7 +306,7 @@ async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
     assert (await publish(node, proxy))[0] == 1
     assert address_of(proxy, "/hidden") == OTHER_NODE
     code, text, _ = await call(proxy.master, "registerPublisher", "/evil2", *forged, source=HIDDEN)
-    assert (code, "gives its name as /hidden" in text) == (-1, True)
+    assert (code, "has the name /hidden" in text) == (-1, True)
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")

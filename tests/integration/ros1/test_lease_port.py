@@ -107,7 +107,7 @@ async def test_a_malformed_header_is_answered_with_an_error(proxy, node, header)
     await node.publish(proxy.master)
     async with connect(proxy.lease(node)) as wire:
         await wire.send(header)
-        assert "rosproxy: connection header" in (await read_header(wire))["error"]
+        assert "rosproxy: the connection header" in (await read_header(wire))["error"]
         assert await wire.end() == "closed"
     assert node.headers == []
 

@@ -92,6 +92,6 @@ async def test_a_master_port_where_no_program_listens_is_told_in_plain_words(mak
     proxy = await make_proxy(master_uri=f"http://{OUTSIDE}:{port}")
     await until(lambda: proxy.app.status()["master"]["error"], "the master is away")
     assert proxy.app.status()["master"]["error"] == (
-        f"master http://{OUTSIDE}:{port}: connection refused: no roscore runs there; by default "
-        "it listens on port 11311"
+        f"master http://{OUTSIDE}:{port}: connection refused. No roscore listens there. Check the "
+        "port; roscore listens on 11311 by default"
     )

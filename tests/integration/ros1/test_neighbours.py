@@ -127,7 +127,8 @@ async def test_a_parameter_reaches_who_subscribed_to_a_namespace_it_is_in(proxy,
     await rpc(proxy.uri(node), "paramUpdate", "/master", "/robot/arm/speed/", 1)
     assert node.calls[-1] == ("paramUpdate", ("/master", "/robot/arm/speed/", 1))
     reply = await rpc(proxy.uri(node), "paramUpdate", "/master", "/robots/", 1)
-    assert reply == [-1, f"rosproxy: /talker ({node.uri}) has not subscribed to /robots/", 0]
+    text = f"rosproxy: /talker ({node.uri}) has not subscribed to parameter /robots/"
+    assert reply == [-1, text, 0]
 
 
 async def test_a_node_is_not_told_of_what_the_one_before_at_its_port_subscribed_to(proxy, node):

@@ -103,7 +103,7 @@ async def test_one_that_can_not_show_who_it_is_stays_registered(proxy, master, n
     await proxy.restart()
     await until(lambda: proxy.app.status()["problems"], "it is told")
     (problem,) = proxy.app.status()["problems"]
-    assert "does not tell whether it is the node" in problem["text"]
+    assert "can't tell whether this is the node" in problem["text"]
     await pass_time(10)
     assert master.nodes == {node.name: uri}
     assert await refuses(host_and_port(uri))

@@ -105,10 +105,14 @@ class MasterApi:
     def _refuse_loop(self, call: IncomingCall) -> None:
         """Refuse a call that the proxy itself has made. Raises XmlRpcError."""
         if call.comes_from(self._context.instance):
-            name = "a node's address"
+            text = "the address of a node leads back to the proxy itself"
             if call.loop_id == self._context.instance:
-                name = f"--master-uri {self._context.settings.master_uri}"
-            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{name} leads back to the proxy itself")
+                uri = self._context.settings.master_uri
+                text = (
+                    f"--master-uri {uri} leads back to the proxy itself. Set the URI of the real "
+                )
+                text += "master"
+            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, text)
 
     async def _answer(self, request: Request, call: IncomingCall) -> bytes | LongReply:
         """The reply to a request that was read; what needs no change passes untouched."""

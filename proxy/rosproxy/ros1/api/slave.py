@@ -34,8 +34,10 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 log = logging.getLogger(__name__)
 
 _Answer = TypeVar("_Answer")
-NO_CALLER_ID = "a policy is set, and the call's caller_id can't be read"
-NOT_THE_MASTER = "only the master may call this"
+NO_CALLER_ID = (
+    "the proxy can't read the caller_id of this call, and needs the caller_id to apply the policy"
+)
+NOT_THE_MASTER = "only the master's host may call this method (--slave-control master)"
 
 
 class SlaveApi:
@@ -57,7 +59,7 @@ class SlaveApi:
         self._tcpros = tcpros
         self._access = access
         self._nodes = InsideNodes(context, access)
-        greeting = "rosproxy: slave API of a ROS node behind it\n"
+        greeting = "rosproxy: slave API of a ROS node behind the proxy\n"
         self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
@@ -114,7 +116,7 @@ class SlaveApi:
         """The endpoint that a call is for. Raises Unreachable."""
         endpoint = self._context.registry.by_port.get(call.local.port)
         if call.comes_from(self._context.instance):
-            raise Unreachable("a node's address leads back to the proxy itself")
+            raise Unreachable("the address of a node leads back to the proxy itself")
         if endpoint is None or not self._matches_path(endpoint, call.path):
             raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
         return endpoint
@@ -133,7 +135,8 @@ class SlaveApi:
     ) -> bytes:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""
         if inner is None:
-            return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a method call")
+            text = f"an element of {multicall.MULTICALL} is not a method call"
+            return multicall.fault_value(xmlrpc.INVALID_REQUEST, f"rosproxy: {text}")
         # Several client libraries lack system.multicall (docs/architecture.md, Client libraries).
         body = multicall.single_call(inner)
         reply = await self._reply_to_call(
@@ -250,7 +253,7 @@ class SlaveApi:
                 health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
                 # Refused twice, the node has ended: its port refuses as well at once.
-                log.info("%s is gone: %s", endpoint.label, error)
+                log.info("%s has ended: %s", endpoint.label, error)
                 self._leases.close(endpoint)
             raise
         health.note(ProbeResult.ANSWERED, self._context.now())
@@ -274,7 +277,7 @@ class SlaveApi:
         await self._context.wait_for_registration(endpoint)
         if parameter is None or endpoint.may_hear_of(parameter):
             return None
-        return f"{endpoint.label} has not subscribed to {parameter}"
+        return f"{endpoint.label} has not subscribed to parameter {parameter}"
 
     async def _may_call(self, method: str, source: str) -> bool:
         """Whether ``--slave-control`` lets a source call a method."""

@@ -295,7 +295,7 @@ def parse_value(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
     try:
         return xmlrpc.read_response(reply, limits)
     except xmlrpc.XmlRpcError as error:
-        raise Unreachable(f"no XML-RPC reply: {error}", ProbeResult.ANSWERED) from None
+        raise Unreachable(f"the reply is not XML-RPC: {error}", ProbeResult.ANSWERED) from None
 
 
 def read_value(method: str, reply: bytes, limits: Limits = REPLY) -> Any:
@@ -307,7 +307,7 @@ def read_value(method: str, reply: bytes, limits: Limits = REPLY) -> Any:
             return value
         case [_, str(message), _] | {"faultString": str(message)}:
             raise MasterError(f"{method}: {brief(message, LONGEST_TEXT)}")
-    raise MasterError(f"{method}: the reply is no ROS status triple")
+    raise MasterError(f"{method}: the reply is not a ROS status triple")
 
 
 def _read_state(state: Any, types: Any) -> dict[str, list[Registration]]:

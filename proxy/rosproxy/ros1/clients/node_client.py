@@ -96,7 +96,7 @@ class NodeClient:
             self._topics(slave, "getSubscriptions"),
         )
         if answer.probe is not ProbeResult.ANSWERED:
-            log.debug("%s does not describe itself: %s", slave, answer.reason)
+            log.debug("node at %s does not answer: %s", slave, answer.reason)
             return None
         ports = await self._topic_ports(slave, sorted(published or {}))
         return NodeInfo(answer.pid, published, subscribed, ports)
@@ -120,7 +120,7 @@ class NodeClient:
             if error.probe is not ProbeResult.ANSWERED:
                 return None
         except MasterError as error:
-            log.debug("%s does not tell its name: %s", slave, error)
+            log.debug("node at %s gives no name: %s", slave, error)
         return await self._name_by_tcpros(slave, service)
 
     async def provider(self, server: HostPort, service: str) -> str | None:
@@ -153,7 +153,7 @@ class NodeClient:
                 with await sockets.dial(server) as conn:
                     return (await _greet(conn, fields)).get("callerid")
         except (OSError, EOFError, HeaderError) as error:
-            log.debug("%s does not answer a TCPROS header: %s", server, error)
+            log.debug("TCPROS server at %s does not answer a connection header: %s", server, error)
             return None
 
     async def take_leave(self, conn: socket.socket, topic: str) -> None:
@@ -172,7 +172,7 @@ class NodeClient:
         try:
             return read_types(await self._upstream.call_node(slave, self._within, method))
         except (Unreachable, MasterError) as error:
-            log.debug("%s does not tell its topics: %s", slave, error)
+            log.debug("node at %s gives no list of topics: %s", slave, error)
             return None
 
     async def topic_port(self, slave: HostPort, topic: str) -> int | None:
@@ -200,7 +200,7 @@ class NodeClient:
         try:
             return await self.topic_port(slave, topic)
         except (Unreachable, MasterError) as error:
-            log.debug("%s names no TCPROS port for topic %s: %s", slave, topic, error)
+            log.debug("node at %s gives no TCPROS port for topic %s: %s", slave, topic, error)
             return None
 
 

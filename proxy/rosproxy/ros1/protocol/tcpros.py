@@ -38,19 +38,19 @@ def decode_header(body: bytes) -> dict[str, str]:
     position = 0
     while position < len(body):
         if len(fields) == MAX_FIELDS:
-            raise HeaderError(f"connection header of more than {MAX_FIELDS} fields")
+            raise HeaderError(f"the connection header has more than {MAX_FIELDS} fields")
         start = position + 4
         if start > len(body):
-            raise HeaderError("connection header ends inside a field's length")
+            raise HeaderError("the connection header ends inside the length of a field")
         position = start + _LENGTH.unpack_from(body, position)[0]
         if position > len(body):
-            raise HeaderError("connection header ends inside a field")
+            raise HeaderError("the connection header ends inside a field")
         name, equals, value = body[start:position].decode("utf-8", "replace").partition("=")
         if not equals:
-            raise HeaderError("connection header has a field without '='")
+            raise HeaderError("the connection header has a field without '='")
         name = name.strip()
         if name in fields:
-            raise HeaderError("connection header has a field twice")
+            raise HeaderError("the connection header has the same field twice")
         fields[name] = value
     return fields
 
@@ -63,7 +63,8 @@ def header_length(first: bytes) -> int:
     """
     length: int = _LENGTH.unpack(first)[0]
     if length > MAX_HEADER:
-        raise HeaderError(f"connection header of {length} bytes, at most {MAX_HEADER} are read")
+        text = f"the connection header has {length} bytes, at most {MAX_HEADER} are accepted"
+        raise HeaderError(text)
     return length
 
 

@@ -36,13 +36,13 @@ def refusal(address: str, kind: ClientKind, networks: Sequence[Network]) -> str:
     """What somebody is told, in one line, who may not use the proxy as its master."""
     if kind is ClientKind.UNSELECTED:
         return (
-            f"rosproxy: {address} is not selected to use this proxy as its master: label its "
-            "container rosproxy.enable=true (Docker) or its pod rosproxy.io/inject=true "
-            "(Kubernetes), with this proxy's master"
+            f"rosproxy: {address} is not selected to use this proxy as its master. Label the "
+            "container rosproxy.enable=true (Docker) or the pod rosproxy.io/inject=true "
+            "(Kubernetes). The container or pod must use the master of this proxy"
         )
     inside = ", ".join(map(str, networks)) or "none"
     return (
-        f"rosproxy: {address} is in no inside network ({inside}), and only nodes inside may use "
-        "this proxy as their master: give its network by --inside-network "
-        "(ROSPROXY_INSIDE_NETWORKS), or use the real master"
+        f"rosproxy: {address} is not in an inside network ({inside}). Only inside nodes may use "
+        "this proxy as their master. Set --inside-network (ROSPROXY_INSIDE_NETWORKS) to the "
+        "network of this address, or use the real master"
     )

@@ -83,8 +83,8 @@ class Registry:
             if port is None:
                 raise RangeExhausted(
                     f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} "
-                    f"leases held, {len(self.pool.blocked)} taken by other programs); give the "
-                    "proxy a larger --port-range (ROSPROXY_PORT_RANGE)"
+                    f"leases held, {len(self.pool.blocked)} taken by other programs). Set a larger "
+                    "--port-range (ROSPROXY_PORT_RANGE)"
                 )
             endpoint = self._add(uri, node, location, port, source)
         elif location.confirmed or not endpoint.location.confirmed:

@@ -235,10 +235,13 @@ class StandIns:
     def advice(self, target: HostPort, reason: str, address: str) -> str:
         """What is wrong where no port can stand in, and the fix; ``address`` is the master's."""
         if self.is_bidirectional:
-            return f"inside nodes can't reach it: no port stands in for {target}; the last {reason}"
+            return (
+                f"inside nodes can't reach {target}: the proxy found no stand-in port; the last "
+                f"candidate {reason}"
+            )
         return (
-            f"inside nodes can't reach it: port {target.port} {reason}. Start that node with "
-            f"ROS_IP={address}, so that it gives its address instead of its host name"
+            f"inside nodes can't reach {target}: port {target.port} {reason}. Start that node with "
+            f"ROS_IP={address}; the node then gives its address instead of its host name"
         )
 
     def import_uri(self, uri: str, address: str) -> str:

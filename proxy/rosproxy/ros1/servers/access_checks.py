@@ -181,7 +181,7 @@ class AccessChecks:
         if reason is None and not policing.offers_tcpros_alone(call):
             if self.may_bypass(endpoint) or self._is_inside(source):
                 return None
-            reason = "only TCPROS is passed where a policy may deny a topic of the node"
+            reason = "the proxy passes only TCPROS, as a policy may deny a topic of this node"
         return None if reason is None else policing.no_publisher(topic, reason)
 
     # What a node inside asks of outside

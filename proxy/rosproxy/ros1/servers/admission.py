@@ -43,7 +43,7 @@ of a machine that has just started may be slow at once."""
 PATIENCE_STEP = 0.2
 MOST_ADDRESSES = 4
 """How many addresses of a host name are tried."""
-RETIRED = "rosproxy: this proxy has been retired and registers nothing any more"
+RETIRED = "rosproxy: this proxy is retired and accepts no registrations"
 
 
 class Cleanup(Protocol):
@@ -115,7 +115,7 @@ class NodeAdmission:
             if name != caller_id:
                 return Refusal(
                     f"rosproxy: {endpoint.uri[:200]} is not the address of {caller_id[:200]}: the "
-                    f"node there gives its name as {(name or 'none')[:200]}. Set ROS_IP where "
+                    f"node at this address has the name {(name or 'none')[:200]}. Set ROS_IP where "
                     f"{caller_id[:200]} runs"
                 )
         if location.address == caller.address:
@@ -211,7 +211,7 @@ class NodeAdmission:
         label = endpoint.label
         port = endpoint.port
         fields = endpoint.log_fields
-        text = "%s: %s does not answer: its port %d goes to another node"
+        text = "%s: %s does not answer. Its port %d goes to another node"
         await self._cleanup.give_up(endpoint)
         if registry.by_port.get(port) is endpoint and endpoint.expendable:
             self._leases.end(endpoint)
@@ -293,12 +293,14 @@ class NodeAdmission:
             if bears_out and client_kind is ClientKind.ADMITTED:
                 return NodeLocation(address, named=True, confirmed=False)
             if bears_out:
-                log.info("%s at %s is outside: its URI is not rewritten", caller_id, slave)
+                log.info(
+                    "%s at %s is outside: the proxy does not rewrite its URI", caller_id, slave
+                )
                 return None
         text = (
-            f"gives its address as {node}, but registers from {source}: no node answers there at "
-            f"port {node.port}, and none of this name at {', '.join(candidates[:MOST_ADDRESSES])}. "
-            "Set ROS_IP where it runs"
+            f"gives its address as {node}, but registers from {source}. No node answers at "
+            f"{HostPort(source, node.port)}, and no node with this name answers at "
+            f"{', '.join(candidates[:MOST_ADDRESSES])}. Set ROS_IP where the node runs"
         )
         self._context.problems.add(caller_id, text)
         log.warning("%s: %s %s", source, caller_id, text)
@@ -329,9 +331,9 @@ def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
 
 def _crowd_text(source: str, slave: HostPort, most: int) -> str:
     return (
-        f"rosproxy: {slave} does not answer, nor has any of the {most} nodes that {source} has "
-        "registered before: no more ports of the range are kept for nodes that never answered. "
-        "Check ROS_IP where they run, and that no firewall or network policy is in between"
+        f"rosproxy: {slave} does not answer. {source} has registered {most} nodes that have never "
+        "answered; the proxy keeps no more ports for such nodes. Check ROS_IP where these nodes "
+        "run, and that no firewall or network policy blocks the proxy"
     )
 
 
@@ -347,11 +349,11 @@ def _on_loopback(endpoint: Endpoint) -> bool:
 def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
     if _on_loopback(endpoint):
         return (
-            f"gives its address as {endpoint.uri}, a loopback address, and listens only there: no "
-            "other machine can reach it. Unset ROS_IP and ROS_HOSTNAME where it runs, or set "
-            f"ROS_IP={endpoint.location.address}"
+            f"gives its address as {endpoint.uri}, a loopback address. The node listens on "
+            "loopback only, so no other machine can reach the node. Unset ROS_IP and ROS_HOSTNAME "
+            f"where the node runs, or set ROS_IP={endpoint.location.address}"
         )
     return (
-        f"can't be reached by the proxy at {endpoint.slave} ({reason}). Check that it listens on "
-        "that address and that no firewall or network policy is in between"
+        f"can't be reached by the proxy at {endpoint.slave} ({reason}). Check that the node "
+        "listens on this address, and that no firewall or network policy blocks the proxy"
     )

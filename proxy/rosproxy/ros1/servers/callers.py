@@ -72,7 +72,7 @@ class Callers:
             async with asyncio.timeout(UPDATE_TIMEOUT):
                 await self._begun.wait()
         except TimeoutError:
-            log.info("no operator has selected any address yet: the inside networks are let in")
+            log.info("no operator has selected addresses yet: the proxy serves all inside networks")
             self._begun.set()
 
     async def wait_until_begun(self) -> None:
@@ -117,7 +117,7 @@ class Callers:
                 while self._client_kind(source) is not ClientKind.ADMITTED:
                     await self._update.wait()
         except TimeoutError:
-            log.debug("%s was not selected in time", source)
+            log.debug("no operator has selected %s in time", source)
         finally:
             waiting[source] -= 1
             if not waiting[source]:

@@ -214,10 +214,10 @@ class InsideNodes:
         try:
             port = await self._context.nodes.topic_port(endpoint.slave, topic) or NO_PORT
         except MasterError as error:
-            log.debug("%s does not publish %s: %s", endpoint.label, topic, error)
+            log.debug("%s does not publish topic %s: %s", endpoint.label, topic, error)
             port = NO_PORT
         except Unreachable as error:
-            log.debug("%s names no TCPROS port for topic %s: %s", endpoint.label, topic, error)
+            log.debug("%s gives no TCPROS port for topic %s: %s", endpoint.label, topic, error)
         endpoint.note_topic_port(topic, port or None)
         return port
 
@@ -279,7 +279,7 @@ class InsideNode:
             return node
         port = await self._learn_port(endpoint, kind, name)
         if port == NO_PORT:
-            raise NotOffered(f"{endpoint.label} has no {kind} {name or '(none is named)'}")
+            raise NotOffered(f"{endpoint.label} has no {kind} {name or '(no name given)'}")
         return await _dial(endpoint.address, port)
 
     def label(self, kind: str, name: str) -> str:
@@ -300,11 +300,11 @@ class InsideNode:
         endpoint = self._endpoint
         if not endpoint.registrations or endpoint.health.has_ended:
             return
-        text = f"no TCPROS connection to it for {name or '?'}"
+        text = f"no TCPROS connection to the node for {name or '?'}"
         if is_loopback(endpoint.node.host):
             text += (
-                f": it listens on loopback only ({endpoint.uri}). Unset ROS_IP and ROS_HOSTNAME "
-                f"where it runs, or set ROS_IP={endpoint.location.address}"
+                f". The node listens on loopback only ({endpoint.uri}). Unset ROS_IP and "
+                f"ROS_HOSTNAME where the node runs, or set ROS_IP={endpoint.location.address}"
             )
         log.warning("%s: %s", endpoint.label, text)
         self._context.problems.add(endpoint.label, text, endpoint.port)
@@ -317,7 +317,7 @@ def _requested(fields: Mapping[str, str]) -> tuple[str, str, str]:
     # rospy and roscpp would serve the topic (tcpros_base.py, _tcp_server_callback;
     # connection_manager.cpp, onConnectionHeaderReceived), and the policy be asked for the service.
     if "service" in fields and "topic" in fields:
-        raise HeaderError("connection header for a topic and for a service")
+        raise HeaderError("the connection header names both a topic and a service")
     kind = "service" if "service" in fields else "topic"
     return kind, fields.get(kind, ""), fields.get("callerid", "")
 
@@ -344,7 +344,7 @@ async def _dial(address: str, port: int | None) -> socket.socket | None:
     try:
         return await sockets.dial(HostPort(address, port)) if port else None
     except (OSError, TimeoutError) as error:
-        log.debug("connecting to %s:%s: %s", address, port, error)
+        log.debug("no connection to %s:%s: %s", address, port, error)
         return None
 
 

@@ -272,7 +272,9 @@ class XmlRpcServer(web.Server):
             return web.Response(status=400, text=f"{error}\n")
         except Exception:
             log.exception("a call from %s failed in the proxy", request.remote)
-            reply = xmlrpc.dump_fault(xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see its log")
+            reply = xmlrpc.dump_fault(
+                xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see the proxy's log"
+            )
         if isinstance(reply, LongReply):
             return await self._send_long(request, call, reply)
         if len(reply) > passing.SHORT:
@@ -287,7 +289,7 @@ class XmlRpcServer(web.Server):
         Raises HttpRefusal, OverBudget.
         """
         if not is_plain(request.headers):
-            text = "compressed requests are refused; ROS sends none"
+            text = "the request is compressed; send the request without compression"
             raise HttpRefusal(415, "compressed", text)
         try:
             size = request.content_length or 0
@@ -410,5 +412,5 @@ async def _send(request: web.BaseRequest, response: DocumentReply) -> DocumentRe
     try:
         await response.prepare(request)
     except ConnectionError as error:
-        log.debug("%s is gone: %s", request.remote, error)
+        log.debug("the caller %s has closed the connection: %s", request.remote, error)
     return response

@@ -76,7 +76,7 @@ class Outside:
             slave = await self.reach(stand_in.target)
             port = await self._context.nodes.topic_port(slave, topic)
         except (OSError, Unreachable, MasterError) as error:
-            log.debug("%s names no TCPROS port for topic %s: %s", stand_in.uri, topic, error)
+            log.debug("%s gives no TCPROS port for topic %s: %s", stand_in.uri, topic, error)
             return None
         if port is not None:
             stand_in.note_topic_port(topic, port)
@@ -105,7 +105,7 @@ class Outside:
         mapped = self._context.upstream.reach(target)
         resolved = await resolve(mapped.host, NODES)
         if not resolved:
-            raise OSError(f"{target.host} can't be resolved")
+            raise OSError(f"host name {target.host} can't be resolved")
         outside = [a for a in resolved if not self._leads_back(HostPort(a, mapped.port))]
         if not outside:
             raise ConnectionRefusedError(f"{', '.join(resolved)} port {target.port} is not outside")

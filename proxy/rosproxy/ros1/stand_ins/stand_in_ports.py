@@ -225,7 +225,7 @@ class StandInPorts:
             ]
             graph = Graph(state, await upstream.look_up("lookupNode", names))
         except (Unreachable, MasterError) as error:
-            log.debug("the master can't be asked who publishes: %s", error)
+            log.debug("the master gives no list of publishers: %s", error)
             return {}
         publishers = graph.by_topic(Kind.PUBLISHER)
         return {topic: set(publishers.get(topic, ())) for topic in topics}
@@ -260,7 +260,7 @@ class StandInPorts:
         unused = (s for s in self._stand_ins.by_local.values() if not counts[s.local.port])
         stand_in = next(unused, None)
         if stand_in is None:
-            return f"is not opened: all {stand_ins.MOST_STAND_INS} stand-in ports are in use"
+            return f"can't be opened: all {stand_ins.MOST_STAND_INS} stand-in ports are in use"
         self._close(stand_in)
         return None
 
@@ -274,7 +274,7 @@ class StandInPorts:
         try:
             sock = sockets.listen(local.host, local.port)
         except OSError as error:
-            return f"can't be opened here ({error.strerror})"
+            return f"can't be opened by the proxy ({error.strerror})"
         serve = partial(self._serve, stand_in)
         gate = self._context.gate
         self._acceptors[local] = Acceptor(self._context.tasks, sock, serve, gate)
@@ -296,7 +296,7 @@ class StandInPorts:
         try:
             sock = sockets.listen(candidate.host, candidate.port)
         except OSError as error:
-            log.debug("%s can't be opened: %s", candidate, error)
+            log.debug("fast port %s can't be opened: %s", candidate, error)
             return
         serve = partial(self._serve, stand_in)
         gate = self._context.gate
@@ -336,7 +336,9 @@ class StandInPorts:
 
     def _note_refused(self, stand_in: StandIn) -> None:
         """Close the port of a node that refuses, since it has ended, until it is found again."""
-        log.debug("%s refuses connections: its stand-in %s closes", stand_in.uri, stand_in.local)
+        log.debug(
+            "%s refuses connections: the proxy closes the stand-in %s", stand_in.uri, stand_in.local
+        )
         self._close(stand_in)
         self._refused[stand_in.uri] = None
         if len(self._refused) > stand_ins.MOST_STAND_INS:
@@ -372,7 +374,7 @@ class StandInPorts:
             raise Unreachable("the address of a node outside leads back to the proxy itself")
         stand_in = self._stand_ins.at(call.local)
         if stand_in is None:
-            raise Unreachable(f"{call.local} stands in for nobody any more")
+            raise Unreachable(f"{call.local} is not a stand-in any more")
         parsed = xmlrpc.parse_call(call.body, self._context.master_call)
         answer = self._answer(stand_in, parsed, call)
         return await count_reply(self._context.metrics, "stand_in", parsed.method, answer)

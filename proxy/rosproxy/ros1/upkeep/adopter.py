@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 SHUTDOWN_TIMEOUT = 2.0
 """Seconds in which the master must say where a node is that is to be shut down."""
 NO_PORT = (
-    "registered around the proxy and can't be adopted: no port of the range is left; give the "
-    "proxy a larger --port-range"
+    "registered directly at the master, and can't be adopted: no port of the range is left. Set a "
+    "larger --port-range (ROSPROXY_PORT_RANGE)"
 )
 
 
@@ -60,7 +60,7 @@ class Adopter:
             if is_inside(address, context.addressing.networks):
                 inside.append((address, names))
             else:
-                problem = "is in none of the inside networks: its nodes are not adopted"
+                problem = "is not in an inside network: the proxy does not adopt the nodes there"
                 context.problems.add(address, problem)
         if not inside:
             return 0
@@ -85,7 +85,8 @@ class Adopter:
         uri = await self._look_up(caller_id)
         advertised = self._context.addressing.advertised_uri(endpoint)
         if uri and uri != advertised and is_known_as(endpoint, uri):
-            log.info("%s was registered as %s around the proxy; taken over", caller_id, uri)
+            text = "%s was registered directly at the master as %s; the proxy takes the node over"
+            log.info(text, caller_id, uri)
             try:
                 async with self._lock:
                     await self._registrar.reclaim({caller_id: (endpoint, uri)})
@@ -111,7 +112,8 @@ class Adopter:
         advertised = self._context.addressing.advertised_uri(endpoint)
         if not decisions.has_name_still(endpoint, uri, advertised):
             return False
-        log.info("%s registered around the proxy; the master's shutdown is not passed on", name)
+        text = "%s registered directly at the master; the proxy does not pass on the shutdown"
+        log.info(text, name)
         former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
         self._context.tasks.spawn(self._reclaim(endpoint, former), f"taking over {endpoint.uri}")
         return True
@@ -123,7 +125,7 @@ class Adopter:
                 await self._registrar.reclaim(former)
                 await self._registrar.reconcile(endpoint)
         except (Unreachable, MasterError) as error:
-            log.warning("%s; missing registrations are made later", error)
+            log.warning("%s. The proxy makes the missing registrations later", error)
 
     async def _inspect(self, slaves: set[HostPort]) -> dict[HostPort, NodeInfo]:
         """What the nodes at slave addresses say of themselves, where one answers."""
@@ -169,7 +171,7 @@ class Adopter:
         adopted = {name: e for name, (e, _) in former.items() if name in e.caller_ids}
         for name, endpoint in adopted.items():
             uri = self._context.addressing.advertised_uri(endpoint)
-            log.info("%s adopted: %s", name, uri)
+            log.info("%s adopted: advertised as %s", name, uri)
         return len(adopted)
 
     async def _make_endpoint(

@@ -121,7 +121,7 @@ class ContainerEvents:
             endpoint.health.probe_soon()  # another process may have the address by now
         silent = [e for e in alive if outcomes[e] is ProbeResult.SILENT]
         if silent:
-            self.context.tasks.spawn(self._remove_later(silent), "second chance of silent nodes")
+            self.context.tasks.spawn(self._remove_later(silent), "probing silent nodes again")
         return await self._unregister(e for e in dead if not e.health.cleaned)
 
     async def _remove_later(self, silent: Sequence[Endpoint]) -> None:
@@ -176,7 +176,7 @@ class ContainerEvents:
         self.leases.open(endpoint)
         address = endpoint.location.address
         fields = endpoint.log_fields
-        log.info("%s is at %s now", endpoint.label, address, extra=fields)
+        log.info("%s moved to %s", endpoint.label, address, extra=fields)
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:
         """Unregister nodes; how many names that were."""

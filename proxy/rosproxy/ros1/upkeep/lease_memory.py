@@ -16,8 +16,9 @@ from rosproxy.ros1.registry import remembered_leases
 from rosproxy.ros1.registry.remembered_leases import RememberedLease
 
 REFUSED = (
-    "the master does not keep this parameter ({}), so that nodes have to be restarted after a "
-    "restart of the proxy. If another proxy with a policy is in between, allow the parameter there"
+    "the master refuses to keep this parameter ({}). Without the parameter, nodes must be "
+    "restarted after a restart of the proxy. If another proxy with a policy is in between, allow "
+    "the parameter in that policy"
 )
 
 

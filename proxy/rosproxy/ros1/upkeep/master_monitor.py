@@ -79,7 +79,7 @@ class MasterMonitor:
         if uri.path in MASTER_PATHS or "HTTP status 404" not in str(error):
             return ""
         return (
-            f": a ROS master knows the paths / and /RPC2 alone, so rather --master-uri "
+            ". A ROS master answers only at the paths / and /RPC2. Set --master-uri "
             f"http://{uri.netloc} (ROSPROXY_MASTER_URI)"
         )
 
@@ -93,7 +93,7 @@ class MasterMonitor:
                 log.info("master %s answers (pid %s)", self._context.settings.master_uri, self.pid)
                 self._context.problems.solved("master")
             else:
-                log.warning("%s; waiting for it", error)
+                log.warning("%s. The proxy waits for the master", error)
                 self._context.problems.add("master", error)
         self.up = up
         self.error = error
@@ -102,5 +102,5 @@ class MasterMonitor:
 def _port_hint(error: Exception) -> str:
     """What to do where no program listens."""
     if isinstance(error, Unreachable) and error.probe is ProbeResult.REFUSED:
-        return ": no roscore runs there; by default it listens on port 11311"
+        return ". No roscore listens there. Check the port; roscore listens on 11311 by default"
     return ""

@@ -92,7 +92,7 @@ class MessageCounter:
                     slave, within, "getBusStats", limits=BUS_STATS
                 )
         except (Unreachable, MasterError) as error:
-            log.debug("%s does not tell what it has counted: %s", endpoint.label, error)
+            log.debug("%s gives no message counts: %s", endpoint.label, error)
             self._answers[endpoint] = self._after_failure(former, error)
             return
         if endpoint.slave != slave:

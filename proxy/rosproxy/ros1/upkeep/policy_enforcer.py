@@ -57,7 +57,7 @@ class PolicyEnforcer:
             try:
                 await self.enforce()
             except (Unreachable, MasterError) as error:
-                log.debug("the policy could not be enforced yet: %s", error)
+                log.debug("the proxy could not enforce the policy yet: %s", error)
 
     async def enforce(self) -> EnforcementCounts:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
@@ -75,7 +75,7 @@ class PolicyEnforcer:
             self._enforced_version = version
         enforced = EnforcementCounts(hidden, shown, cut)
         if enforced != EnforcementCounts():
-            text = "policy: %d registrations are hidden now, %d shown, %d connections were cut"
+            text = "policy applied: %d registrations hidden, %d shown, %d connections cut"
             log.info(text, hidden, shown, cut)
         return enforced
 

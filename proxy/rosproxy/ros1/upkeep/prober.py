@@ -102,7 +102,7 @@ class Prober:
             async with self._limit:
                 await self._look_after(endpoint, answer)
         except (Unreachable, MasterError) as error:  # the same is due at the next probe
-            log.debug("probe of %s could not be acted on yet: %s", endpoint.label, error)
+            log.debug("%s: the proxy could not act on the probe yet: %s", endpoint.label, error)
         finally:
             self._probing.discard(endpoint)
 
@@ -158,6 +158,9 @@ class Prober:
         lease_time = liveness.lease_lasts(endpoint, self._context.settings.linger)
         if endpoint.note_unused(now) >= lease_time:
             log.info(
-                "port %d is free again: %s", endpoint.port, endpoint.uri, extra=endpoint.log_fields
+                "port %d is free again: the lease of %s has ended",
+                endpoint.port,
+                endpoint.uri,
+                extra=endpoint.log_fields,
             )
             self._leases.end(endpoint)

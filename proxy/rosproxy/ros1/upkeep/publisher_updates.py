@@ -90,7 +90,10 @@ class PublisherUpdates:
                 try:
                     await self._hand_out(inside)
                 except Unreachable as error:
-                    log.debug("publishers of %s could not be handed out yet: %s", topic, error)
+                    text = (
+                        "topic %s: the proxy could not send the publishers to subscribers yet: %s"
+                    )
+                    log.debug(text, topic, error)
                     self._changed_topics[topic] = True
                     await asyncio.sleep(RETRY)
         finally:
@@ -120,6 +123,6 @@ class PublisherUpdates:
                 timeout = self._context.settings.probe_timeout
                 await self._context.upstream.post_to_node(slave, body, timeout)
             except Unreachable as error:
-                log.debug("publisherUpdate of %s was not answered: %s", topic, error)
+                log.debug("publisherUpdate of topic %s was not answered: %s", topic, error)
                 return False
         return True

@@ -49,9 +49,9 @@ PARALLEL_INSPECTIONS = 64
 CLAIM_GRACE = 1.0
 """Seconds that a claim gets to be borne out once a living node waits for its port."""
 DOUBT = (
-    "answers, but does not tell whether it is the node that the master has at this port, which is "
-    "closed until it registers again: its client library lacks getPublications or "
-    "getSubscriptions, and it has no topic or service that the proxy could ask it for"
+    "answers, but the proxy can't tell whether this is the node that the master has at this port: "
+    "the client library lacks getPublications or getSubscriptions, and the node has no topic or "
+    "service to ask for. The port stays closed until the node registers again. Restart the node"
 )
 
 
@@ -101,7 +101,7 @@ class Recovery:
             if self._recovered.is_set():
                 return
             if self._failures != failures_before:
-                raise Unreachable("the master's state could not be read")
+                raise Unreachable("the proxy could not read the master's state")
             try:
                 await self._context.policy.wait_for_operator(self._context.settings.await_policy)
                 await self._recover()
@@ -162,7 +162,7 @@ class Recovery:
         self._plane.recovered([e for e in endpoints if self._access.may_bypass(e)])
         if (unserved or forgotten) and self._context.settings.cleanup_after:
             sweep = self._sweep(unserved, forgotten)
-            self._context.tasks.spawn(sweep, "taking back what former proxies left")
+            self._context.tasks.spawn(sweep, "taking back registrations of former proxies")
         self.verifying |= set(endpoints)
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
@@ -173,7 +173,7 @@ class Recovery:
 
         async def ask(claim: Claim) -> None:
             log.warning(
-                "port %d of %s: another URI at the master claims the port or the node",
+                "port %d of %s: another URI at the master claims the same port or the same node",
                 claim.port,
                 claim.uri,
             )
@@ -188,16 +188,15 @@ class Recovery:
         """The endpoint of a claim, not trusted yet; None if it is outside, or its port is taken."""
         address = claim.slave.host
         if self._context.client_kind(address) is ClientKind.OUTSIDE:
-            text = "port %d: not recovered: the node's address %s is in no inside network"
+            text = "port %d: not recovered: the node's address %s is not in an inside network"
             log.warning(text, claim.port, address)
             return None
         location = NodeLocation(address, named=claim.node.host == address, confirmed=False)
         registry = self._context.registry
         endpoint = registry.restore(claim.uri, claim.node, location, claim.port)
         if endpoint is None:
-            log.warning(
-                "port %d: not recovered: it is taken, or %s has another port", claim.port, claim.uri
-            )
+            text = "port %d: not recovered: the port is taken, or %s has another port"
+            log.warning(text, claim.port, claim.uri)
             return None
         for registration in claim.registrations:
             registry.register(endpoint, registration)
@@ -238,7 +237,7 @@ class Recovery:
                     await self.serve(endpoint)
                     await self._registrar.apply_policy()
             except (Unreachable, MasterError) as error:
-                log.warning("%s is left registered at the master: %s", claim.advertised, error)
+                log.warning("%s stays registered at the master: %s", claim.advertised, error)
 
     async def _is_borne_out(self, claim: Claim) -> bool | None:
         """Whether the node of a claim is inside and is the one that the master has.
@@ -270,7 +269,8 @@ class Recovery:
             self._note_doubt(endpoint)
             return
         if not borne_out:
-            log.warning("%s: not served: the node there has none of its topics", endpoint.label)
+            text = "%s: not recovered: the node at this address has none of the registered topics"
+            log.warning(text, endpoint.label)
             await self._registrar.clean_up(endpoint)
             self._leases.end(endpoint)
             return

@@ -66,7 +66,7 @@ class Registrar:
                 former[registration.caller_id] = endpoint, uri
             else:
                 log.info(
-                    "%s is another node's name now, at %s; not registered again",
+                    "%s is now the name of another node, at %s: not registered again",
                     registration.caller_id,
                     uri,
                 )
@@ -99,7 +99,7 @@ class Registrar:
         for registration in missing:
             self._context.registry.register(endpoint, registration)
         if missing:
-            _log(endpoint, "%s: %d topics were not registered; they are now", len(missing))
+            _log(endpoint, "%s: the proxy registered %d missing topics", len(missing))
             await self.register([(endpoint, r) for r in missing])
 
     async def register_lost(self) -> None:
@@ -121,7 +121,9 @@ class Registrar:
         endpoints = {r: e for e in alive for r in e.registrations.values()}
         missing = decisions.lost_registrations(list(endpoints), state, started)
         if missing:
-            log.warning("the master has lost %d registrations; they are made again", len(missing))
+            log.warning(
+                "the master has lost %d registrations; the proxy makes them again", len(missing)
+            )
             await self.register([(endpoints[r], r) for r in missing])
         elif our_state[0] == registry.changes:  # nothing was registered while it was asked
             self._complete_state = digest, *our_state
@@ -133,7 +135,7 @@ class Registrar:
         await self._unregister(endpoint, registrations)
         endpoint.health.note_cleaned(started)
         self._context.metrics.cleanups.inc()
-        _log(endpoint, "cleaned up %s: %d registrations taken back", len(registrations))
+        _log(endpoint, "%s unregistered: %d registrations taken back", len(registrations))
 
     async def give_up(self, endpoint: Endpoint) -> None:
         """Unregister a node that does not answer, whose port another needs. Raises Unreachable."""
@@ -159,7 +161,9 @@ class Registrar:
         service = service_uri(slave)
         await upstream.multicall([decisions.unregister_call(r, uri, service) for r in stale])
         if stale:
-            log.info("took back %d registrations that a former proxy left for %s", len(stale), uri)
+            log.info(
+                "unregistered %d registrations that a former proxy left for %s", len(stale), uri
+            )
 
     async def disown(self, endpoint: Endpoint, registrations: Sequence[Registration]) -> None:
         """Unregister names that another node had on this port before. Raises Unreachable.
@@ -386,8 +390,9 @@ class Registrar:
     def _drop_stuck_name(self, endpoint: Endpoint, name: str, uri: str) -> None:
         self._context.registry.drop_caller(endpoint, name)
         problem = (
-            f"registered as {uri} around the proxy and can't be taken over: it is subscribed to a "
-            "parameter, and the master lists no such subscriptions. Restart its container"
+            f"registered directly at the master as {uri}, and can't be taken over: the node is "
+            "subscribed to a parameter, and the master lists no such subscriptions. Restart the "
+            "container of the node"
         )
         log.warning("%s: %s", name, problem)
         self._context.problems.add(name, problem)

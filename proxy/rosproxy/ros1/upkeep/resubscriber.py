@@ -105,14 +105,12 @@ class Resubscriber:
         try:
             topics = await self._withdraw(endpoints) if endpoints else set()
             if topics:
-                log.info(
-                    "subscribers of %d topics had no connection; sent them publisherUpdate again",
-                    len(topics),
-                )
+                text = "subscribers of %d topics had no connection; sent publisherUpdate again"
+                log.info(text, len(topics))
                 pairs = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
                 await self._registrar.register([pair for pair in pairs if pair[1].name in topics])
         except (Unreachable, MasterError) as error:  # there are further looks (LOOK_DELAYS)
-            log.debug("subscribers without a connection could not be looked for: %s", error)
+            log.debug("the proxy could not look for subscribers without a connection: %s", error)
 
     def _due(self) -> list[Endpoint]:
         """The endpoints that it is time to look at; each is named once per look."""
@@ -183,7 +181,7 @@ class Resubscriber:
                 try:
                     rows = await upstream.call_node(endpoint.slave, timeout, "getBusInfo")
                 except (Unreachable, MasterError) as error:
-                    log.debug("%s does not tell its connections: %s", endpoint.label, error)
+                    log.debug("%s gives no list of connections: %s", endpoint.label, error)
                     return []
             return decisions.read_bus(rows)
 
@@ -262,7 +260,9 @@ class Resubscriber:
         topics = set()
         for (topic, node), answered in zip(missed_uris, await asyncio.gather(*calls), strict=True):
             if answered:
-                log.debug("%s has no connection for %s; sent it publisherUpdate", node, topic)
+                log.debug(
+                    "%s has no connection for topic %s: the proxy sent publisherUpdate", node, topic
+                )
                 topics.add(topic)
         return topics
 

@@ -300,7 +300,7 @@ def test_the_size_is_bounded(odd: str) -> None:
 @pytest.mark.parametrize("name", ["methodName", "value", "string", "array", "struct", "name"])
 def test_what_python_would_read_in_spite_of_a_prefix_is_refused(name: str) -> None:
     body = raw_call(f"<value>a</value><x:{name}>b</x:{name}>")
-    with pytest.raises(XmlRpcError, match="must have no prefix"):
+    with pytest.raises(XmlRpcError, match="must not have a namespace prefix"):
         xmlrpc.parse_call(body)
 
 

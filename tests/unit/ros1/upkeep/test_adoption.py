@@ -145,9 +145,9 @@ def test_a_service_is_no_topic() -> None:
 def test_doubts_tell_what_was_found() -> None:
     node = direct("/n", ["/a"], SIX, SEVEN)
     assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in locate([node], {})[1]["/n"]
-    assert "does not show that it is this one" in locate([node], {SIX: ["/b"]})[1]["/n"]
+    assert "does not show that it made" in locate([node], {SIX: ["/b"]})[1]["/n"]
     either = locate([node], {SIX: ["/a"], SEVEN: ["/a"]})[1]["/n"]
-    assert "could be at 10.0.0.6:40001 or 10.0.0.7:40001; not adopted" in either
+    assert "not adopted: the node may be at 10.0.0.6:40001 or 10.0.0.7:40001" in either
 
 
 def test_two_containers_with_the_same_names_and_ports() -> None:

@@ -98,9 +98,10 @@ def parse_call(body: bytes, limits: Limits = OWN_REPLY) -> Call:
         return Call(*plain)
     parser = _Parser(body, limits)
     if parser.root != "methodCall" or not parser.method:
-        raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC call: no methodCall with a methodName")
+        text = "the document is not an XML-RPC call: a methodCall with a methodName is missing"
+        raise XmlRpcError(INVALID_REQUEST, text)
     if body.count(b"<methodName") != 1:
-        raise XmlRpcError(INVALID_REQUEST, "more than one methodName")
+        raise XmlRpcError(INVALID_REQUEST, "the call has more than one methodName")
     return Call(parser.method, parser.values)
 
 
@@ -123,7 +124,7 @@ def parse_response(body: bytes, limits: Limits = OWN_REPLY) -> tuple[Value, bool
         return plain, False
     parser = _Parser(body, limits)
     if parser.root != "methodResponse" or len(parser.values) != 1:
-        raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
+        raise XmlRpcError(INVALID_REQUEST, "the document is not an XML-RPC response")
     return parser.values[0], parser.fault
 
 
@@ -194,15 +195,17 @@ class _Parser:
         self._count = 0
         self._inner = 0
         if len(body) > limits.size:
-            raise XmlRpcError(PARSE_ERROR, f"longer than {limits.size} bytes")
+            raise XmlRpcError(PARSE_ERROR, f"the document is longer than {limits.size} bytes")
         if exceeds_elements(body, limits):  # before any takes memory
-            raise XmlRpcError(PARSE_ERROR, f"more than {limits.elements} elements")
+            text = f"the document has more than {limits.elements} elements"
+            raise XmlRpcError(PARSE_ERROR, text)
         # expat has all attributes of a tag in memory, each in some 200 bytes, when it tells of it.
         if _has_long_tag(body):
-            raise XmlRpcError(PARSE_ERROR, f"a tag of more than {LONGEST_TAG} bytes")
+            text = f"the document has a tag of more than {LONGEST_TAG} bytes"
+            raise XmlRpcError(PARSE_ERROR, text)
         # expat finds UTF-16 out by itself; here tags and texts are looked for as ASCII.
         if b"\0" in body:
-            raise XmlRpcError(PARSE_ERROR, "NUL bytes in the document; use UTF-8")
+            raise XmlRpcError(PARSE_ERROR, "the document has NUL bytes; use UTF-8")
         self._expat = parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
@@ -211,7 +214,9 @@ class _Parser:
         try:
             parser.Parse(body, True)
         except expat.ExpatError as error:
-            raise XmlRpcError(PARSE_ERROR, f"not well-formed XML: {error}") from None
+            raise XmlRpcError(
+                PARSE_ERROR, f"the document is not well-formed XML: {error}"
+            ) from None
 
     def _doctype(self, *_: object) -> None:
         raise XmlRpcError(PARSE_ERROR, "document type declarations are refused")
@@ -220,7 +225,8 @@ class _Parser:
         self._encoding = (encoding or self._encoding).lower()
         if self._encoding not in _ENCODINGS:
             name = self._encoding[:20]
-            raise XmlRpcError(PARSE_ERROR, f"encoding {name} is not supported; use UTF-8")
+            text = f"the encoding {name} of the document is not supported; use UTF-8"
+            raise XmlRpcError(PARSE_ERROR, text)
 
     def _start(self, name: str, attributes: Sized) -> None:
         self._path.append(name)
@@ -241,12 +247,15 @@ class _Parser:
     def _check(self, name: str) -> None:
         """Refuse an element that begins, if it is one too many or could be read in two ways."""
         if len(self._path) > self._limits.depth:
-            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {self._limits.depth} elements")
+            text = f"the document is nested deeper than {self._limits.depth} elements"
+            raise XmlRpcError(PARSE_ERROR, text)
         if self._count > self._limits.elements:
-            text = f"more than {self._limits.elements} elements and attributes"
+            text = f"the document has more than {self._limits.elements} elements and attributes"
             raise XmlRpcError(PARSE_ERROR, text)
         if ":" in name and name.rpartition(":")[2] in _MEANING:
-            raise XmlRpcError(INVALID_REQUEST, "an element of XML-RPC must have no prefix")
+            raise XmlRpcError(
+                INVALID_REQUEST, "an XML-RPC element must not have a namespace prefix"
+            )
 
     def _end(self, name: str) -> None:
         self._path.pop()
@@ -267,7 +276,7 @@ class _Parser:
 
     def _start_kind(self, name: str) -> None:
         if not self._open or self._path[-2:-1] != ["value"]:
-            raise XmlRpcError(INVALID_REQUEST, f"<{name}> outside of a <value>")
+            raise XmlRpcError(INVALID_REQUEST, f"the element <{name}> is not inside a <value>")
         value = self._open[-1]
         value.kind = KINDS[name]
         if name in SCALARS:

@@ -41,7 +41,8 @@ def inner_calls(call: Call) -> list[Call | None]:
     items = inner_items(call)
     if len(items) > MOST_CALLS:
         raise XmlRpcError(
-            INVALID_PARAMS, f"{len(items)} calls in {MULTICALL}; at most {MOST_CALLS}"
+            INVALID_PARAMS,
+            f"{MULTICALL} has {len(items)} calls, at most {MOST_CALLS} are accepted",
         )
     return [_inner_call(item) for item in items]
 
@@ -89,12 +90,12 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
 
 def _inner_call(item: Value) -> Call | None:
     if len(set(item.members)) < len(item.members):  # Python takes the last of a name
-        raise XmlRpcError(INVALID_PARAMS, f"a call of {MULTICALL} has a member twice")
+        raise XmlRpcError(INVALID_PARAMS, f"a call in {MULTICALL} has a member twice")
     method = item.member("methodName")
     params = item.member("params")
     name = method.string() if method else None
     if name == MULTICALL:
-        raise XmlRpcError(INVALID_PARAMS, f"{MULTICALL} inside {MULTICALL}")
+        raise XmlRpcError(INVALID_PARAMS, f"{MULTICALL} must not contain {MULTICALL}")
     if not name or params is None or params.kind != "array":
         return None
     return Call(name, params.items)

@@ -144,7 +144,7 @@ class CallWatch:
             self._nested = max(self._nested - 1, 0) if tag[1] else self._nested + 1
             if self._nested > NESTED:
                 raise XmlRpcError(
-                    PARSE_ERROR, f"more than {NESTED} arrays or structs in each other"
+                    PARSE_ERROR, f"arrays and structs are nested deeper than {NESTED} levels"
                 )
         # What is looked for may begin here and end in the next piece.
         self._tail = text[1 - _LONGEST :]
@@ -184,21 +184,23 @@ class MulticallWatch(CallWatch):
         try:
             self._parser.Parse(piece, last)
         except expat.ExpatError as error:
-            raise XmlRpcError(PARSE_ERROR, f"not well-formed XML: {error}") from None
+            text = f"the document is not well-formed XML: {error}"
+            raise XmlRpcError(PARSE_ERROR, text) from None
         self._size += len(piece)
         if self._size - self._parser.CurrentByteIndex > LONGEST_MARKUP:
-            text = f"a tag or comment of more than {LONGEST_MARKUP} bytes in a long {MULTICALL}"
+            text = f"a long {MULTICALL} has a tag or comment of more than {LONGEST_MARKUP} bytes"
             raise XmlRpcError(PARSE_ERROR, text)
 
     def _start(self, name: str, attributes: Collection[str]) -> None:
         self._note_names((name, *attributes))
         self._depth += 1
         if self._depth > DEPTH:
-            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {DEPTH} elements")
+            raise XmlRpcError(PARSE_ERROR, f"the document is nested deeper than {DEPTH} elements")
         if self._depth > _CONTENT_DEPTH:
             return
         if name not in _LEVELS[self._depth - 1]:
-            raise XmlRpcError(INVALID_REQUEST, f"misplaced <{name[:40]}> in a long {MULTICALL}")
+            text = f"a long {MULTICALL} has the element <{name[:40]}> in a wrong place"
+            raise XmlRpcError(INVALID_REQUEST, text)
         if self._depth == _VALUE_DEPTH:
             self._has_call = False
         elif self._depth == _CALL_DEPTH:
@@ -218,8 +220,8 @@ class MulticallWatch(CallWatch):
                 self._names.add(name)
                 self._names_length += len(name)
         if self._names_length > LONGEST_NAMES:
-            text = f"names of elements and attributes with more than {LONGEST_NAMES} characters"
-            raise XmlRpcError(PARSE_ERROR, f"{text} in a long {MULTICALL}")
+            text = f"the names of elements and attributes in a long {MULTICALL} have more than"
+            raise XmlRpcError(PARSE_ERROR, f"{text} {LONGEST_NAMES} characters together")
 
     def _end(self, name: str) -> None:
         if self._depth == _FIELD_DEPTH and name == "name":
@@ -228,10 +230,10 @@ class MulticallWatch(CallWatch):
             self._end_member()
         elif self._depth == _CALL_DEPTH and sorted(self._members) != ["methodName", "params"]:
             raise XmlRpcError(
-                INVALID_REQUEST, f"a call in {MULTICALL} needs one methodName and params"
+                INVALID_REQUEST, f"a call in {MULTICALL} needs one methodName and one params"
             )
         elif self._depth == _VALUE_DEPTH and not self._has_call:
-            raise XmlRpcError(INVALID_REQUEST, f"a value in {MULTICALL} that is no struct")
+            raise XmlRpcError(INVALID_REQUEST, f"a call in {MULTICALL} is not a struct")
         if self._depth in (_FIELD_DEPTH, _CONTENT_DEPTH):
             self._parser.CharacterDataHandler = None
         self._depth -= 1
@@ -254,7 +256,8 @@ class MulticallWatch(CallWatch):
     def _add_text(self, text: str) -> None:
         self._text += text
         if len(self._text) > HEAD:
-            raise XmlRpcError(INVALID_REQUEST, f"a name of more than {HEAD} characters")
+            text = f"a long {MULTICALL} has a name of more than {HEAD} characters"
+            raise XmlRpcError(INVALID_REQUEST, text)
 
 
 def cut(body: bytes) -> Iterator[bytes]:

@@ -114,9 +114,10 @@ def _score(node: DirectNode, info: NodeInfo) -> int:
 def _doubt(node: DirectNode, best: list[HostPort], infos: Mapping[HostPort, NodeInfo]) -> str:
     slaves = ", ".join(map(str, node.slaves))
     if best:
-        reason = f"could be at {' or '.join(map(str, best))}; not adopted. Restart its container"
+        candidates = " or ".join(map(str, best))
+        reason = f"the node may be at {candidates}. Restart the container of the node"
     elif any(slave in infos for slave in node.slaves):
-        reason = f"the node at {slaves} does not show that it is this one; not adopted"
+        reason = f"the node at {slaves} does not show that it made the registrations"
     else:
-        reason = f"no node answers at {slaves}; not adopted"
-    return f"registered as {node.uri} around the proxy: {reason}"
+        reason = f"no node answers at {slaves}"
+    return f"registered directly at the master as {node.uri}, and not adopted: {reason}"

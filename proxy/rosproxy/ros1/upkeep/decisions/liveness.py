@@ -23,11 +23,11 @@ NO_PATIENCE = 0.001
 class AfterAnswer(Enum):
     """What is due first once a node has answered."""
 
-    VERIFY = "the master alone has told of it: is it the one?"
-    COME_BACK = "it was unregistered meanwhile: register it again"
-    UNREGISTER_LEFT_OVER = "it is another process: take back what the former one left"
-    RECONCILE = "it has registered around the proxy: compare what it has"
-    NOTHING = "all is as it was"
+    VERIFY = "only the master has named the node: verify that this is the node"
+    COME_BACK = "the node was unregistered meanwhile: register the node again"
+    UNREGISTER_LEFT_OVER = "another process answers: unregister what the former process left"
+    RECONCILE = "the node registered directly at the master: compare the registrations"
+    NOTHING = "nothing has changed"
 
 
 def after_answer(endpoint: Endpoint, pid: int | None) -> AfterAnswer:
