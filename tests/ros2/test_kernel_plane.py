@@ -110,7 +110,7 @@ def test_a_locator_for_discovery_too_stays_with_the_proxy(lab: Lab) -> None:
     lab.node("jazzy", "out", "pub", topic="/chatter")
     reader.wait_for_count("^got hello ", 5)
     (lease,) = leases(lab, "metatraffic")
-    assert (lease.plane, lease.reason) == ("copy", "it is read and rewritten")
+    assert (lease.plane, lease.reason) == ("copy", "the proxy reads and rewrites discovery")
     assert forwarded_ports(lab) == []
 
 

@@ -62,7 +62,7 @@ class DomainPlane(Collector):
         text = "Datagrams of user data that the kernel forwarded to participants inside."
         packets = self._plane.total.packets
         yield CounterMetricFamily("rosproxy_ros2_kernel_datagrams", text, value=packets)
-        text = "Bytes of these as IP packets, headers included."
+        text = "Bytes of these datagrams as IP packets, headers included."
         received = self._plane.total.received
         yield CounterMetricFamily("rosproxy_ros2_kernel_bytes", text, value=received)
 
@@ -70,9 +70,9 @@ class DomainPlane(Collector):
 def _reason(participant: Participant, lease: Lease) -> str:
     """Why the kernel may not forward a lease, if it may not."""
     if lease.kind is LeaseKind.METATRAFFIC:
-        return "it is read and rewritten"
+        return "the proxy reads and rewrites discovery"
     if not isinstance(participant, InsideParticipant):
-        return "the kernel forwards to inside alone"
+        return "the kernel forwards only to participants inside"
     if not participant.reads_discovery_at(lease):
         return "another participant at the address may read discovery at this port"
     return f"{participant.vendor_name} may read discovery at this port"

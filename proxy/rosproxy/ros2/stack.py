@@ -100,16 +100,16 @@ class Ros2:
         self._runtime.metrics.registry.register(self._domain_plane)
         # Unlike in ROS 1 there is no registry to rebuild: what was forwarded is among the leases.
         self.plane.recovered([])
-        tasks.spawn(self._forget_former(), "waiting for participants of before the start")
+        tasks.spawn(self._forget_former(), "waiting for participants from before the start")
         await self._refresh()
         if self._awaiting:
             tasks.spawn(self._await_policy(), "waiting for an operator's policy")
         tasks.repeat(self._look_at_policy, POLICY_INTERVAL, "applying the policy")
         for server in self.servers:
-            tasks.repeat(server.expire, EXPIRY_INTERVAL, "looking after participants")
+            tasks.repeat(server.expire, EXPIRY_INTERVAL, "ending participants")
             tasks.repeat(server.observe, ANNOUNCE_INTERVAL, "observing participants")
-        tasks.repeat(self._refresh, REFRESH_INTERVAL, "looking at networks and peers")
-        tasks.repeat(self._watch.look, REFRESH_INTERVAL, "looking at what keeps participants apart")
+        tasks.repeat(self._refresh, REFRESH_INTERVAL, "checking networks and peers")
+        tasks.repeat(self._watch.look, REFRESH_INTERVAL, "checking connections of participants")
         tasks.repeat(self._sample_rates, RATE_INTERVAL, "sampling rates")
 
     def _start_servers(self) -> None:
@@ -309,7 +309,9 @@ class Ros2:
         host = self._settings.advertise_host
         hosts = advertised_hosts(await resolve(host), self._settings.bind, ())
         if not hosts:
-            text = f"{host} can't be resolved; ROS 2 needs its address: give that instead"
+            text = (
+                f"host name {host} can't be resolved. Set the IP address: ROS 2 needs the address"
+            )
             raise SettingError("--advertise-host", text)
         return hosts
 
@@ -369,8 +371,8 @@ class Ros2:
         self._runtime.problems.solved(subject)
         if not resolved:
             text = (
-                "its name can't be resolved, so that participants inside are not announced there: "
-                "give its address"
+                "the host name can't be resolved, so the proxy does not announce participants to "
+                "this peer. Set the address of the peer"
             )
             self._runtime.problems.add(subject, text)
         return [HostPort(address, peer.port) for address in resolved]

@@ -198,7 +198,7 @@ async def test_a_process_at_the_proxys_address_announces_nothing(
     assert (relay.dropped, relay.to_lan) == (len(refused), 1)
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(warnings) == 1
-    assert "it has no proof: run the proxy and its LAN relay in one version" in warnings[0]
+    assert "the datagram has no proof. Use the same version for the proxy" in warnings[0]
 
 
 async def test_refused_datagrams_cost_the_proxy_none_of_its_allowance(boundary: Boundary) -> None:
@@ -233,7 +233,7 @@ async def test_secrets_that_differ_are_told(
 
         await until(proxy_refuses, "the proxy refuses what the relay carries")
         await until(relay_refuses, "the relay refuses what the proxy announces")
-    assert "give the proxy and its LAN relay one secret" in caplog.text
+    assert "Give the proxy and its LAN relay the same secret" in caplog.text
 
 
 async def test_unproven_sources_share_one_allowance(

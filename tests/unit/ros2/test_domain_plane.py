@@ -32,10 +32,10 @@ class Plane:
 @pytest.mark.parametrize(
     ("prefix", "address", "port", "reason"),
     [
-        (A, INSIDE, 7410, "it is read and rewritten"),
+        (A, INSIDE, 7410, "the proxy reads and rewrites discovery"),
         (A, INSIDE, 7411, "Cyclone DDS may read discovery at this port"),
         (B, INSIDE, 7411, "another participant at the address may read discovery at this port"),
-        (B, ROBOT, 7411, "the kernel forwards to inside alone"),
+        (B, ROBOT, 7411, "the kernel forwards only to participants inside"),
     ],
 )
 def test_why_the_kernel_does_not_forward_a_port(

@@ -21,11 +21,11 @@ def claim_fault(address: str, settings: DomainSettings) -> str | None:
     """
     parsed = as_ip(address)
     if parsed is None or is_loopback(address) or address == _BROADCAST or parsed.is_multicast:
-        return f"{address} is no address of a machine on a LAN"
+        return f"{address} is not an address of a machine on a LAN"
     if is_of_link(address):
-        return f"{address} means something on its own link alone; use a global address there"
+        return f"{address} is a link-local address; use a global address on that machine"
     if settings.is_inside(address):
-        return f"{address} lies in an inside network"
+        return f"{address} is in an inside network"
     if address not in settings.hosts and settings.proxy_address_for(address) == address:
         return f"{address} is an address of the proxy itself"
     return None

@@ -86,7 +86,7 @@ class DataLeases:
     def note_former(self, forwards: Mapping[int, HostPort]) -> None:
         """Note what a former process had the kernel forward; with an empty mapping, forget it."""
         self._former = {
-            port: ForwardedLease(port, target, "a participant of before the start")
+            port: ForwardedLease(port, target, "a participant from before the start of the proxy")
             for port, target in forwards.items()
         }
         self._cached_changes = -1  # none: all is looked at anew

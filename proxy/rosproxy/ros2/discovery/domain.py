@@ -232,7 +232,7 @@ class Domain:
         try:
             for message, received in credited_messages(datagram):
                 if by_relay and message.of_participant is None:
-                    raise RtpsError("the LAN relay carries announcements of participants alone")
+                    raise RtpsError("the LAN relay may pass on only announcements of participants")
                 sent += self._heard_outside(message, source, by_relay, received, now)
         except RtpsError as error:
             sent += self._drop("malformed", source, str(error))
@@ -460,7 +460,9 @@ class Domain:
         if not by_relay and not self.outside.may_announce(
             message, source, self.own.observer.prefix
         ):
-            self.outside.refuse_stranger(source, "an announcement; the address is no peer's")
+            self.outside.refuse_stranger(
+                source, "a participant announces itself, and the address is not a peer"
+            )
             return []
         if self.owners.is_inside(message.prefix):
             return self._claimed_by_outside(message, source, received, now)
@@ -595,7 +597,11 @@ class Domain:
         """Metatraffic from inside as outside gets it, and what goes back. Raises RtpsError."""
         insider = self.inside.find(message.prefix, source)
         if insider is None:
-            return self._drop("unknown_participant", source, "it has not announced itself")
+            return self._drop(
+                "unknown_participant",
+                source,
+                "the participant has not announced itself to the proxy",
+            )
         if insider.is_apart:
             return []
         readers = [outsider.prefix for outsider, _ in _meant(users, message.datagram)]
@@ -655,7 +661,7 @@ class Domain:
         back = list[Outgoing]()
         if spdp is not None:
             if outsider is None and not self.settings.is_peer(source):
-                text = "a participant that was not heard before, at an address that is no peer's"
+                text = "a new participant announces itself, and the address is not a peer"
                 self.outside.refuse_stranger(source, text)
                 return [], []
             outsider, back = self._meet_outside(message, source, now)
@@ -678,7 +684,9 @@ class Domain:
             if target.may_be_sent(len(datagram)):
                 sent.append(self._passed(lease, datagram, False))
             else:
-                text = f"{target.guid_prefix} has not shown yet that it receives what is sent to it"
+                text = (
+                    f"participant {target.guid_prefix} has not shown yet that it receives datagrams"
+                )
                 sent += self._drop("unproven", target.address, text)
         return sent
 
@@ -705,7 +713,8 @@ class Domain:
         """Whether a source makes more discovery than it may; what is not is charged to it."""
         if self.rates.take(source, len(datagram), now, self.standing(source)):
             return False
-        self.refused("rate", source, "more discovery than one source may send in a second")
+        text = "the source sends more discovery in a second than one source may send"
+        self.refused("rate", source, text)
         return True
 
     def _named_by(self, source: str) -> NamedBy:
@@ -786,7 +795,9 @@ class Domain:
 
         It is let in again with its next announcement, and gets other ports.
         """
-        text = f"{insider.guid_prefix} gives back a port that another participant has claimed"
+        text = (
+            f"participant {insider.guid_prefix} loses a port that another participant has claimed"
+        )
         self.refused("port_claim", insider.address, text)
         return self._end_for(insider)
 

@@ -184,7 +184,7 @@ class FragmentStore:
     def rewritten(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
         """As `FragmentStores.rewritten`, for a message with fragments."""
         if len(message.fragments) > MOST_FRAGMENTS:
-            raise RtpsError(f"more than {MOST_FRAGMENTS} fragments in a datagram")
+            raise RtpsError(f"the datagram has more than {MOST_FRAGMENTS} fragments")
         # Whole announcements beside the fragments are rewritten now, fragments in `_filled`.
         arrived = _WaitingDatagram(port, message.fragments, rewrite(message))
         completed = {
@@ -252,7 +252,8 @@ class FragmentStore:
     def _gathered(self, port: int, sample: Sample, frags: Fragments) -> _PendingSample:
         """What has come of a fragment's sample. Raises RtpsError if the fragment can't be one."""
         if frags.size < SHORTEST or not 0 < frags.total <= LONGEST:
-            raise RtpsError(f"an announcement of {frags.total} bytes in fragments of {frags.size}")
+            text = f"an announcement has {frags.total} bytes in fragments of {frags.size} bytes"
+            raise RtpsError(f"{text}, which is outside the limits")
         gathered = self._samples.get(_key(port, sample))
         if gathered is None:
             gathered = self._samples[_key(port, sample)] = _PendingSample(frags.total, frags.size)
@@ -260,7 +261,7 @@ class FragmentStore:
             while self._sample_bytes > MOST_BYTES:
                 self._sample_bytes -= self._samples.pop(next(iter(self._samples))).cost
         if (gathered.total, gathered.size) != (frags.total, frags.size):
-            raise RtpsError("fragments of the same announcement that differ in size")
+            raise RtpsError("the fragments of an announcement differ in size")
         return gathered
 
     def _whole(self, port: int, sample: Sample) -> bytes | None:
@@ -293,7 +294,10 @@ def _payloads(datagram: bytes, sample: Sample, frags: Fragments) -> Iterator[tup
     count = -(-frags.total // frags.size)
     last = frags.first + frags.count - 1
     if sample.payload is None or not 0 < frags.first <= last <= count:
-        raise RtpsError(f"fragments {frags.first} to {last} of {count}")
+        text = (
+            f"an announcement of {count} fragments can't have the fragments {frags.first} to {last}"
+        )
+        raise RtpsError(text)
     offset = sample.payload.start
     for number in range(frags.first, last + 1):
         size = frags.size if number < count else frags.total - (count - 1) * frags.size

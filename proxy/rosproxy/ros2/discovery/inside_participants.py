@@ -123,11 +123,11 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     def _why_no_place(self, prefix: bytes, source: str) -> str:
         """Why a new participant at an address gets no place; empty if it gets one."""
         if self.count_by_address[source] >= MOST_PER_ADDRESS:
-            return f"the address has {MOST_PER_ADDRESS} participants already"
+            return f"the address already has {MOST_PER_ADDRESS} participants"
         has_answered = self.proofs.has_answered(source, prefix)
         most = MOST_INSIDE if has_answered else MOST_INSIDE_UNPROVEN
         is_full = len(self._answering(has_answered)) >= most
-        return f"there are {most} participants inside already" if is_full else ""
+        return f"the proxy already has {most} participants inside" if is_full else ""
 
     def _answering(self, has_answered: bool) -> list[InsideParticipant]:
         """The participants that have proved to receive, or all others, in the order they came."""
@@ -290,8 +290,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
         """Have a participant meet all outside anew, which knows it by a port that it lost."""
         participant.parting_from = now
-        text = f"{participant.guid_prefix} claims port {former_port}, on which another participant "
-        text += "has as good a claim; it gets another port, and outside meets it anew"
+        text = f"participant {participant.guid_prefix} gets another port than {former_port}, which "
+        text += "another participant claims as well; outside discovers the participant anew"
         self.refused("port_claim", participant.address, text)
 
     def _has_its_share(self, address: str) -> bool:
@@ -313,23 +313,25 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         now: float,
     ) -> Lease | None:
         if len(participant.leases) >= MOST_LEASES:
-            text = f"has more than {MOST_LEASES} locators; {locator} got no port"
+            text = f"{locator} got no port: the participant has more than {MOST_LEASES} locators"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.BOUND, text)
             return None
         ports = self.settings.ports.listen
         if self._has_its_share(participant.address):
-            text = f"{locator} got no port: {participant.address} has as many of {ports} as one "
-            text += "address may have"
+            text = f"{locator} got no port: {participant.address} already has as many ports of "
+            text += f"{ports} as one address may have"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         if self.lacks_proof(participant.prefix, participant.address):
-            text = f"{locator} got no port: the last ports of {ports} are for participants that "
-            text += "have proved to receive, and this one does not answer the proxy"
+            text = (
+                f"{locator} got no port: the participant does not answer the proxy, and the last "
+            )
+            text += f"free ports of {ports} are for participants that answer"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         port = self.ports.take(participant.prefix, locator, kind, now, former_port)
         if port is None:
-            text = f"no port of {ports} is free for {locator}"
+            text = f"{locator} got no port: no port of {ports} is free"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
         if former_port not in (None, port) and self.ports.may_have_returning(now):

@@ -59,8 +59,8 @@ from rosproxy.ros2.rewriting.discovery import (
 )
 
 HIDDEN_SOURCE = (
-    "it is the gateway of the proxy's own network: the engine sends datagrams of outside on with "
-    "this address, so that the proxy does not know who sent them"
+    "this address is the gateway of the proxy's own network: the engine forwards datagrams from "
+    "outside with this address, so the proxy does not know the real sender"
 )
 DISPOSE_MESSAGE_INTERVAL = 2.0
 """Seconds after which a participant inside is told again to forget one outside, until they meet."""
@@ -99,11 +99,13 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         metatraffic = first_metatraffic(spdp, datagram, source)
         if metatraffic is None:
             fault = traits(spdp, datagram, source).locator_fault
-            text = f"it announces no locator for discovery at {source} ({fault})"
+            text = f"the participant announces no locator for discovery at {source} ({fault})"
             self.refused("no_locator", source, text)
             return None
         if self._is_own_port(metatraffic):
-            text = f"it announces {metatraffic} for discovery, a port of the proxy itself"
+            text = (
+                f"the participant announces {metatraffic} for discovery, a port of the proxy itself"
+            )
             self.refused("own_port", source, text)
             return None
         participant = participant or self._add(prefix, datagram, source, now)
@@ -245,7 +247,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Whether nothing from an address is read, since no participant is known there."""
         if self.is_met(source):
             return False
-        self.refuse_stranger(source, "the address is no peer's, and nobody was heard there")
+        text = "the address is not a peer, and no participant there has announced itself"
+        self.refuse_stranger(source, text)
         return True
 
     def refuse_stranger(self, source: str, text: str) -> None:
@@ -307,7 +310,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def _why_no_place(self, source: str) -> str:
         """Why a new participant at an address gets no place; empty if it gets one."""
         if self._is_full(source):
-            return f"the address has {self.count_by_address[source]} participants already"
+            return f"the address already has {self.count_by_address[source]} participants"
         if self.settings.is_peer(source):
             most = MOST_AT_PEERS
             present = [p for p in self.by_prefix.values() if p.trusted]
@@ -317,7 +320,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         else:
             most = MOST_OUTSIDE_UNPROVEN
             present = self._unproven_strangers()
-        return f"there are {most} participants outside already" if len(present) >= most else ""
+        return f"the proxy already has {most} participants outside" if len(present) >= most else ""
 
     def _is_full(self, source: str) -> bool:
         """Whether an address has as many participants as it may."""
@@ -417,7 +420,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
                 self.stand_ins.setdefault(port, []).append((outsider, lease))
                 self.changes += 1
         if lease is None:
-            text = f"no stand-in port is left for locator {locator} of {outsider.guid_prefix}"
+            text = f"participant {outsider.guid_prefix}: no stand-in port is left for {locator}"
             self.refused("stand_ins", outsider.address, text)
         elif kind is LeaseKind.METATRAFFIC:
             lease.kind = kind

@@ -28,7 +28,7 @@ def wrapped(source: str, datagram: bytes) -> bytes:
 def unwrapped(data: bytes) -> tuple[str, bytes]:
     """The address and the datagram. Raises RtpsError if it is too short."""
     if len(data) < _SIZE:
-        raise RtpsError("shorter than an address")
+        raise RtpsError("the datagram is too short for the address of its source")
     return _unpacked(data[:_SIZE]), data[_SIZE:]
 
 

@@ -61,18 +61,21 @@ class RelayProof:
     def opened(self, direction: Direction, datagram: bytes) -> bytes:
         """Return the content of a datagram that has a good proof. Raises ProofError."""
         if not datagram.startswith(MAGIC) or len(datagram) < _CONTENT_AT:
-            raise ProofError("it has no proof: run the proxy and its LAN relay in one version")
+            raise ProofError(
+                "the datagram has no proof. Use the same version for the proxy and its LAN relay"
+            )
         if len(datagram) > _CONTENT_AT + LONGEST_CONTENT:
-            raise ProofError(f"it has more than {LONGEST_CONTENT} bytes behind its proof")
+            raise ProofError(f"the datagram has more than {LONGEST_CONTENT} bytes after its proof")
         stamp = datagram[len(MAGIC) : len(MAGIC) + _STAMP.size]
         proof = datagram[len(MAGIC) + _STAMP.size : _CONTENT_AT]
         content = datagram[_CONTENT_AT:]
         if not hmac.compare_digest(proof, self._proof(direction, stamp, content)):
-            raise ProofError("its proof is wrong: give the proxy and its LAN relay one secret")
+            text = "the proof is wrong. Give the proxy and its LAN relay the same secret"
+            raise ProofError(text)
         age = self._unix_time() - _STAMP.unpack(stamp)[0] / 1000
         if abs(age) > WINDOW_S:
-            text = "it is a repeated one, or the clocks of the proxy and its LAN relay differ"
-            raise ProofError(f"its proof is {age:.0f} s old: {text}")
+            text = "the datagram was repeated, or the clocks of the proxy and its LAN relay differ"
+            raise ProofError(f"the proof is {age:.0f} s old: {text}")
         return content
 
     def _proof(self, direction: Direction, stamp: bytes, content: bytes) -> bytes:

@@ -54,7 +54,7 @@ def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
             first = _number(*numbers[:2])
             last = _number(*numbers[2:])
             if last > LAST_NUMBER:
-                raise RtpsError(f"a heartbeat up to the number {last}")
+                raise RtpsError(f"a heartbeat has the impossible last number {last}")
             yield Heartbeat(writer, first, last)
 
 
@@ -128,7 +128,7 @@ def withheld(sample: Sample) -> Overwrite:
     size = sample.body.end - sample.body.start
     next_sequence = sample.sequence + 1
     if size < _GAP_SIZE + 4:
-        raise RtpsError(f"a sample of discovery in {size} bytes")
+        raise RtpsError(f"a sample of discovery has {size} bytes, which is too short")
     # It may be 0: the length 0 of a PAD means none, not up to the end (9.4.5.1.3).
     pad = size - _GAP_SIZE - 4
     gap = struct.pack(order + "BBH", SubmessageId.GAP, flag, _GAP_SIZE)

@@ -147,9 +147,9 @@ class Overwrite(msgspec.Struct, frozen=True):
 def source_prefix(datagram: bytes) -> bytes:
     """The GUID prefix in the header of a message. Raises RtpsError if it is none."""
     if len(datagram) < HEADER or datagram[:4] != MAGIC:
-        raise RtpsError("no RTPS message")
+        raise RtpsError("the datagram is not an RTPS message")
     if datagram[4] != 2:
-        raise RtpsError(f"RTPS version {datagram[4]}.{datagram[5]}, not 2")
+        raise RtpsError(f"the message has RTPS version {datagram[4]}.{datagram[5]}, not 2")
     return datagram[8:HEADER]
 
 
@@ -192,7 +192,9 @@ def samples(datagram: bytes) -> list[Sample]:
                 inline_bytes += sample.inline_qos.end - sample.inline_qos.start
             # Reading a parameter takes a microsecond, and the shortest has four bytes.
             if inline_bytes > MOST_INLINE_BYTES:
-                raise RtpsError(f"inline QoS of more than {MOST_INLINE_BYTES} bytes in a datagram")
+                raise RtpsError(
+                    f"the datagram has more than {MOST_INLINE_BYTES} bytes of inline QoS"
+                )
             all_samples.append(sample)
     return all_samples
 
@@ -256,7 +258,7 @@ def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
         if body > size:
             raise RtpsError("the message ends inside a submessage's header")
         if (count := count + 1) > MOST_SUBMESSAGES:
-            raise RtpsError(f"more than {MOST_SUBMESSAGES} submessages")
+            raise RtpsError(f"the message has more than {MOST_SUBMESSAGES} submessages")
         kind, flags, first, second = datagram[offset:body]
         length = first + (second << 8) if flags & _LITTLE else (first << 8) + second
         offset = body + length
@@ -265,9 +267,10 @@ def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
         if offset > size:
             raise RtpsError(f"submessage {kind:#x} is longer than the message")
         if (offset - body) % ALIGNMENT and offset < size:
-            raise RtpsError(f"submessage {kind:#x} of {offset - body} bytes in front of others")
+            text = f"submessage {kind:#x} has {offset - body} bytes, no multiple of {ALIGNMENT}"
+            raise RtpsError(f"{text}, and is not the last")
         if kind == INFO_DST and offset - body < PREFIX:
-            raise RtpsError(f"a destination of {offset - body} bytes needs {PREFIX}")
+            raise RtpsError(f"a destination has {offset - body} bytes and needs {PREFIX}")
         yield kind, flags, Span(body, offset)
 
 
@@ -282,7 +285,7 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
     last = span.end - 4
     for _ in range(MOST_PARAMETERS):
         if offset > last:
-            raise RtpsError("a parameter list without an end")
+            raise RtpsError("a parameter list has no end")
         pid, length = unpack(datagram, offset)
         if pid == SENTINEL:
             yield pid, offset, offset + 4
@@ -291,10 +294,10 @@ def walk_parameters(datagram: bytes, span: Span, little: bool) -> Iterator[tuple
         if end > span.end:
             raise RtpsError(f"parameter {pid:#x} is longer than its list")
         if length % ALIGNMENT:
-            raise RtpsError(f"parameter {pid:#x} of {length} bytes, no multiple of {ALIGNMENT}")
+            raise RtpsError(f"parameter {pid:#x} has {length} bytes, no multiple of {ALIGNMENT}")
         yield pid, offset, end
         offset = end
-    raise RtpsError(f"a list of more than {MOST_PARAMETERS} parameters")
+    raise RtpsError(f"a list has more than {MOST_PARAMETERS} parameters")
 
 
 def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment: bool) -> Sample:
@@ -307,10 +310,10 @@ def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment:
     low = _unpack("I", datagram, start + 16, flags)
     sequence = (high << 32) + low
     if not 0 < sequence <= LAST_NUMBER:
-        raise RtpsError(f"a sample with the number {sequence}")
+        raise RtpsError(f"a sample has the impossible number {sequence}")
     offset = start + 4 + to_qos
     if not start + fixed_size <= offset <= body.end:
-        raise RtpsError(f"inline QoS {to_qos} octets on, which is outside of the submessage")
+        raise RtpsError(f"the inline QoS is {to_qos} octets on, outside of the submessage")
     qos = None
     if flags & _QOS:
         *_, (_, _, end) = walk_parameters(datagram, Span(offset, body.end), little)
@@ -346,7 +349,7 @@ def _fragments(datagram: bytes, offset: int, flags: int) -> Fragments:
 def require_size(body: Span, size: int) -> None:
     """Raise RtpsError unless a submessage has so many bytes."""
     if body.end - body.start < size:
-        raise RtpsError(f"a submessage of {body.end - body.start} bytes needs {size}")
+        raise RtpsError(f"a submessage has {body.end - body.start} bytes and needs {size}")
 
 
 def _unpack(form: str, datagram: bytes, offset: int, flags: int) -> int:

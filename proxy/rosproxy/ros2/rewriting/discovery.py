@@ -65,7 +65,7 @@ TAKEN_FOR_FAST_DDS = (FAST_DDS, NO_VENDOR)
 _DISPOSED_OR_UNREGISTERED = 0x03
 LONGEST_OF_PARTICIPANT = 8192
 """Bytes of a datagram in which a participant announces itself; it is kept. Some have 1,500."""
-_OF_ANOTHER = "it announces another participant than the one that sends it"
+_OF_ANOTHER = "the datagram announces another participant than its sender"
 LONGEST_TOPIC = 1024
 """Bytes of a topic's name; those of ROS 2 have 255."""
 MOST_PARAMETERS_OF_ALL = 4096
@@ -174,7 +174,7 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
     if any(sample.prefix != prefix for sample in builtin_samples):
         raise RtpsError(_OF_ANOTHER)
     if builtin_samples and has_checksum(datagram):
-        raise RtpsError("discovery with a checksum, which would not fit what is rewritten")
+        raise RtpsError("the discovery has a checksum, so the proxy can't rewrite the discovery")
     for sample in builtin_samples:  # fragments have inline QoS as well
         _require_own(datagram, sample, inline_parameters(datagram, sample))
     message = DiscoveryMessage(
@@ -184,7 +184,8 @@ def read_discovery(datagram: bytes) -> DiscoveryMessage:
         tuple((s, s.fragments) for s in builtin_samples if s.fragments is not None),
     )
     if len(datagram) > LONGEST_OF_PARTICIPANT and message.of_participant is not None:
-        raise RtpsError(f"a participant's announcement in {len(datagram)} bytes")
+        text = f"the announcement of a participant has {len(datagram)} bytes"
+        raise RtpsError(f"{text}, at most {LONGEST_OF_PARTICIPANT} are accepted")
     return message
 
 
@@ -194,7 +195,8 @@ def read_messages(datagram: bytes) -> Iterator[DiscoveryMessage]:
     for message in map(read_discovery, by_source(datagram)):
         announced_count += message.of_participant is not None
         if announced_count > MOST_ANNOUNCED:
-            raise RtpsError(f"more than {MOST_ANNOUNCED} announcements of participants")
+            text = f"the datagram has more than {MOST_ANNOUNCED} announcements of participants"
+            raise RtpsError(text)
         yield message
 
 
@@ -255,7 +257,7 @@ def require_rewritable(message: DiscoveryMessage) -> None:
     are read once all are there, and nobody waits for that with a participant's announcement.
     """
     if message.fragments:
-        raise RtpsError("fragments in a message by which a participant announces itself")
+        raise RtpsError("the message by which a participant announces itself has fragments")
     rewritten(message, lambda *_: None, lambda told: bool(told.topic(message.datagram)))
 
 
@@ -269,9 +271,9 @@ def _announcements(datagram: bytes, builtin_samples: Iterable[Sample]) -> tuple[
         parameter_count += len(announcement.parameters.parameters)
         locator_count += announcement.locator_count
         if parameter_count > MOST_PARAMETERS_OF_ALL:
-            raise RtpsError(f"more than {MOST_PARAMETERS_OF_ALL} parameters in a datagram")
+            raise RtpsError(f"the datagram has more than {MOST_PARAMETERS_OF_ALL} parameters")
         if locator_count > MOST_LOCATORS_OF_ALL:
-            raise RtpsError(f"more than {MOST_LOCATORS_OF_ALL} locators in a datagram")
+            raise RtpsError(f"the datagram has more than {MOST_LOCATORS_OF_ALL} locators")
         announcements.append(announcement)
     return tuple(announcements)
 
@@ -282,18 +284,18 @@ def _announcement(datagram: bytes, sample: Sample) -> Announcement:
     ended = sample.is_key_only or _tells_an_end(datagram, inline)
     # An end may have no payload, but not one in which nobody has looked for whose it is.
     if parameters is None and (sample.payload or not ended):
-        raise RtpsError("an announcement that is no parameter list")
+        raise RtpsError("an announcement is not a parameter list")
     parameters = parameters or ParameterList(sample.little, ())
     _require_own(datagram, sample, parameters)
     topics = parameters.all(Pid.TOPIC_NAME)
     # The policy is asked of the first alone, and a receiver may take another one.
     if len(topics) > 1:
-        raise RtpsError("an announcement that names more than one topic")
+        raise RtpsError("an announcement names more than one topic")
     is_endpoint = sample.writer in _KINDS
     if is_endpoint and not ended and not parameters.text(datagram, Pid.TOPIC_NAME):
-        raise RtpsError("a reader or writer without a topic")
+        raise RtpsError("a reader or writer has no topic")
     if topics and topics[0].value.end - topics[0].value.start > LONGEST_TOPIC:
-        raise RtpsError(f"a topic with a name of more than {LONGEST_TOPIC} bytes")
+        raise RtpsError(f"the name of a topic has more than {LONGEST_TOPIC} bytes")
     return Announcement(BuiltinWriter(sample.writer), sample, parameters, inline, ended)
 
 

@@ -375,7 +375,7 @@ class DomainServer:
         standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
         if not self._reader.read(heard_at, standing, len(datagram), read):
-            text = "more discovery waits to be read than has room"
+            text = "the queue of discovery that the proxy has not read yet is full"
             self.domain.refused("rate", heard_at, text)
 
     def _carry_out(self, take: Take, datagram: bytes, source: str) -> list[Outgoing]:

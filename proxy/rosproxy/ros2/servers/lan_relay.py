@@ -164,7 +164,7 @@ class LanRelay:
             now = self._loop.time()
             if now - self._warned_at >= QUIET_S:
                 self._warned_at = now
-                log.warning("refused: a datagram from %s, the proxy's address: %s", source, error)
+                log.warning("refused: from %s, the proxy's address: %s", source, error)
             return None
 
     def _announcements(self, datagram: bytes) -> list[bytes]:

@@ -274,7 +274,7 @@ def test_a_range_that_is_too_short_is_told() -> None:
         domain.heard_inside(spdp(prefix, address), address, NOW)
     assert len(domain.inside.leases) == 15  # of sixteen, one is for discovery
     shortages = domain.inside.port_shortages.values()
-    assert all("is free for" in shortage.text for shortage in shortages)
+    assert all("got no port: no port of" in shortage.text for shortage in shortages)
     assert {shortage.kind for shortage in shortages} == {ShortageKind.RANGE}
     assert domain.inside.port_shortages
 
