@@ -154,7 +154,8 @@ def read_range(text: str) -> PortRange:
         raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 11000-11099")
     ports = PortRange(int(match[1]), int(match[2]))
     if not 1 <= ports.first <= ports.last <= 65535:
-        raise ValueError(f"{text!r} must rise and lie between 1 and 65535, such as 11000-11099")
+        message = f"{text!r} must rise and stay between 1 and 65535, such as 11000-11099"
+        raise ValueError(message)
     return ports
 
 
@@ -235,7 +236,7 @@ def read_token_hash(text: str) -> str | None:
     digits = text.strip().lower()
     if digits and not _HASH.fullmatch(digits):
         raise ValueError(
-            'must be the 64 hex digits of a SHA-256: printf %s "$TOKEN" | sha256sum gives them'
+            'must be the 64 hex digits of a SHA-256; printf %s "$TOKEN" | sha256sum prints them'
         )
     return digits or None
 
@@ -245,7 +246,7 @@ def read_policy_layers(text: str) -> tuple[PolicyLayer, ...]:
     try:
         return read_layers(json.loads(text)) if text.strip() else ()
     except RecursionError:
-        raise ValueError("nested too deeply") from None
+        raise ValueError("the JSON is nested too deeply") from None
 
 
 def hash_token(token: str) -> str:

@@ -227,7 +227,7 @@ def test_policy_comes_from_a_variable_as_one_text() -> None:
 
 
 def test_too_many_rules_are_refused() -> None:
-    with pytest.raises(SettingError, match="1001 rules in all layers"):
+    with pytest.raises(SettingError, match="the policy has 1001 rules"):
         parse_settings(
             {
                 "master_uri": "http://robot:11311",

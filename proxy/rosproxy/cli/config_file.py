@@ -33,9 +33,10 @@ def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{path} is no UTF-8 text") from None
+        raise ValueError(f"{path} is not UTF-8 text") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ValueError(f'{path} is no TOML: {error}; write as port-range = "A-B"') from None
+        reason = f'{error}; write an option as port-range = "A-B"'
+        raise ValueError(f"{path} is not TOML: {reason}") from None
     values = {}
     for key, value in table.items():
         option = options.get(key)
@@ -47,7 +48,7 @@ def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any
 
 def _unknown(key: str, options: Mapping[str, click.Option]) -> str:
     near = difflib.get_close_matches(key.lower(), sorted({*options} - _COMMAND_LINE_ONLY), 1)
-    hint = f"did you mean {near[0]}?" if near else "it takes the names of options, without --"
+    hint = f"did you mean {near[0]}?" if near else "keys are the names of options, without --"
     return f"unknown key {key[:40]!r}; {hint}"
 
 

@@ -80,5 +80,5 @@ async def _own_address(host: str) -> str:
     """Where to listen. Raises SettingError for a name that leads nowhere."""
     addresses = await resolve(host)
     if not addresses:
-        raise SettingError("--admin-bind", f"{host} can't be resolved here")
+        raise SettingError("--admin-bind", f"the host name {host} can't be resolved here")
     return addresses[0]

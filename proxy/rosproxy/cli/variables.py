@@ -24,7 +24,7 @@ class UnknownVariable(msgspec.Struct, frozen=True):
     def text(self) -> str:
         """What is wrong, in words that follow the name."""
         hint = f"; did you mean {self.suggestion}?" if self.suggestion else ""
-        return f"is no variable of rosproxy's and is ignored{hint}"
+        return f"is not a variable of rosproxy and is ignored{hint}"
 
 
 def unknown(environment: Mapping[str, str], known_names: Collection[str]) -> list[UnknownVariable]:

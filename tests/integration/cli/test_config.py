@@ -62,16 +62,16 @@ async def test_a_file_has_what_neither_the_command_line_nor_a_variable_gives(fil
     [
         ('port-rang = "1-2"', "unknown key 'port-rang'; did you mean port-range?"),
         ("check = true", "unknown key 'check'"),
-        ('xyzzy = "1"', "it takes the names of options, without --"),
+        ('xyzzy = "1"', "keys are the names of options, without --"),
         ("port-range = 5", "--port-range"),
         ('port-range = ["1-2"]', "port-range takes one value, not a list"),
         ("port-range = 1979-05-27", "port-range must be a text in quotes, or a number"),
         ("[port-range]\na = 1", "port-range must be a text in quotes, or a number"),
         ('udp = "yes"', "udp must be true or false"),
         ("master-port = 70000", "--master-port"),
-        ("port-range = 11000-11099", "is no TOML"),
-        ("a = " + "[" * 100_000, "is no TOML"),
-        ("\x00", "is no TOML"),
+        ("port-range = 11000-11099", "is not TOML"),
+        ("a = " + "[" * 100_000, "is not TOML"),
+        ("\x00", "is not TOML"),
         ("#" * 1_100_000, "is longer than"),
     ],
 )
@@ -88,7 +88,7 @@ async def test_a_file_that_is_not_there(tmp_path: Path):
     assert (code, "none.toml can't be read: No such file or directory" in said) == (2, True)
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     code, said = await check(*GOOD, "--config", str(tmp_path / "bytes.toml"))
-    assert (code, "is no UTF-8 text" in said) == (2, True)
+    assert (code, "is not UTF-8 text" in said) == (2, True)
 
 
 async def test_status_asks_where_the_file_says(proxy: Proxy, tmp_path: Path):
@@ -128,14 +128,14 @@ def test_the_operators_use_what_the_file_says(tmp_path: Path, engine: str):
 async def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(start_process, monkeypatch):
     code, said = await check(*GOOD, ROSPROXY_PORT_RANG="11000-11005")
     assert code == 0
-    assert "ROSPROXY_PORT_RANG is no variable of rosproxy's and is ignored" in said
+    assert "ROSPROXY_PORT_RANG is not a variable of rosproxy and is ignored" in said
     assert "did you mean ROSPROXY_PORT_RANGE?" in said
     clean = clean_environment(ROSPROXY_PORT_RANG="11000-11005")
     monkeypatch.setattr("tests.integration.process.clean_environment", lambda: clean)
     process: Process = start_process()
     assert "ROSPROXY_PORT_RANGE?" in process.text
     shown = await run("status", "--admin", f"http://{process.options['admin_bind']}")
-    assert "ROSPROXY_PORT_RANG: is no variable" in shown.out
+    assert "ROSPROXY_PORT_RANG: is not a variable" in shown.out
     told = await run("doctor", ROSPROXY_PORT_RANG="1", ROSPROXY_ADMIN=process.options["admin_bind"])
     assert "unset ROSPROXY_PORT_RANG, and set the one that was meant" in told.out
 
@@ -311,4 +311,4 @@ async def test_a_variable_that_is_not_read_is_called_unknown():
     """Where an option has others than that of its name, which click would read besides."""
     code, said = await check(*GOOD, ROSPROXY_INSIDE_NETWORK="no network")
     assert code == 0
-    assert "ROSPROXY_INSIDE_NETWORK is no variable of rosproxy's" in said
+    assert "ROSPROXY_INSIDE_NETWORK is not a variable of rosproxy" in said

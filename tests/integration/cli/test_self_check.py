@@ -267,7 +267,7 @@ async def test_the_deep_check_of_a_sound_proxy_ends_with_0_and_leaves_nothing(ma
         ({"advertise_host": "nowhere.invalid"}, "can't be resolved here"),
         (
             {"admin_bind": "nowhere.invalid:11312"},
-            "--admin-bind: nowhere.invalid can't be resolved",
+            "--admin-bind: the host name nowhere.invalid can't be resolved here",
         ),
         ({"advertise_host": "192.0.2.1"}, "The master does not get through either"),
         ({"policy_file": "/nowhere/policy"}, "--policy-file: /nowhere/policy can't be read"),

@@ -131,7 +131,7 @@ def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By commands at once, and by the operator for as long as it runs."""
-    misspelt = "is no variable of rosproxy's and is ignored; did you mean ROSPROXY_PORT_WINDOW?"
+    misspelt = "is not a variable of rosproxy and is ignored; did you mean ROSPROXY_PORT_WINDOW?"
     result = run("docker", "status", ROSPROXY_PORT_WINDO="12000-12999")
     assert f"ROSPROXY_PORT_WINDO {misspelt}" in result.stderr
     told: list[Problem] = []

@@ -167,5 +167,5 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
 
 def test_a_misspelt_variable_is_told_by_the_doctor_too(caplog: pytest.LogCaptureFixture) -> None:
     run("doctor", ROSPROXY_ALLOW_MASTERS="robot", KUBECONFIG="/nowhere")
-    assert "ROSPROXY_ALLOW_MASTERS is no variable of rosproxy's and is ignored" in caplog.text
+    assert "ROSPROXY_ALLOW_MASTERS is not a variable of rosproxy and is ignored" in caplog.text
     assert "did you mean ROSPROXY_ALLOW_MASTER?" in caplog.text
