@@ -244,7 +244,7 @@ async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
             await wire.send(post(body)[:-1])
         reply = await exchange(proxy.lease(node), post(body))
         assert reply.status == 503
-        assert b"more than 524288 bytes of requests and replies at once from" in reply.body
+        assert b"at most 524288 bytes of requests and replies are accepted at once" in reply.body
         assert (await rpc(proxy.master, "getPid", "/n", source=NODE))[0] == 1
     assert proxy.metric("refused_total", reason="over_budget")
     (problem,) = proxy.app.status()["problems"]

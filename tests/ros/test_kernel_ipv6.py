@@ -78,7 +78,7 @@ def test_the_port_of_a_killed_node_refuses(lab: Lab) -> None:
 def test_a_node_that_does_not_answer_the_kernel_is_served_by_the_proxy(lab: Lab) -> None:
     _, seen = kernel.status_of_unanswered(lab)
     assert seen["data_plane"]["plane"] == "splice"
-    assert "nothing came back" in seen["data_plane"]["reason"]
+    assert "did not answer through the kernel" in seen["data_plane"]["reason"]
 
 
 def test_without_ipv6_forwarding_the_proxy_serves_and_says_why(lab: Lab) -> None:

@@ -104,7 +104,7 @@ def test_a_table_that_somebody_removed_is_made_again(lab: Lab) -> None:
 def test_a_node_that_does_not_answer_the_kernel_is_served_by_the_proxy(lab: Lab) -> None:
     topic, seen = kernel.status_of_unanswered(lab)
     assert seen["data_plane"]["plane"] == "splice"
-    assert "nothing came back" in seen["data_plane"]["reason"]
+    assert "did not answer through the kernel" in seen["data_plane"]["reason"]
     assert topic in [connection["name"] for connection in seen["connections"]]
 
 

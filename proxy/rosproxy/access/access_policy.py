@@ -111,7 +111,7 @@ class AccessPolicy:
         if verdict.rule is not None:
             is_audit = verdict.mode is PolicyMode.AUDIT
             self._metrics.policy_denied.labels(kind.value, verdict.mode.value).inc()
-            outcome = "would be denied" if is_audit else "denied"
+            outcome = "would be denied" if is_audit else "is denied"
             reason = WOULD_BE_DENIED if is_audit else DENIED
             text = f"{kind.value} {subject} {outcome} by {verdict.reason}"
             self._refusals.note(reason, source, text)

@@ -133,7 +133,7 @@ def read_layer(written: WrittenLayer) -> PolicyLayer:
     """A layer from what was written. Raises ValueError, which names layer and rule."""
     shown = written.name[:40]
     if not written.name.strip() or len(written.name) > LONGEST_LAYER_NAME:
-        text = f"a layer's name has 1 to {LONGEST_LAYER_NAME} characters"
+        text = f"the name of a layer must have 1 to {LONGEST_LAYER_NAME} characters"
         raise ValueError(f"layer {shown!r}: {text}")
     try:
         rules = tuple(rule for text in written.rules for rule in parse_rules(text))
@@ -168,10 +168,10 @@ def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
 def check_bounds(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
     """The layers, unless they are too many. Raises ValueError."""
     if len(layers) > MOST_LAYERS:
-        raise ValueError(f"{len(layers)} layers, at most {MOST_LAYERS} are accepted")
+        raise ValueError(f"the policy has {len(layers)} layers, at most {MOST_LAYERS} are accepted")
     count = sum(len(layer.rules) for layer in layers)
     if count > MOST_RULES:
-        raise ValueError(f"{count} rules in all layers, at most {MOST_RULES} are accepted")
+        raise ValueError(f"the policy has {count} rules, at most {MOST_RULES} are accepted")
     return tuple(layers)
 
 

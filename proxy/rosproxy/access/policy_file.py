@@ -47,7 +47,7 @@ class PolicyFile:
         except OSError as error:
             raise ValueError(f"{self._path} can't be read: {error.strerror}") from None
         except UnicodeDecodeError:
-            raise ValueError(f"{self._path} is no UTF-8 text") from None
+            raise ValueError(f"{self._path} is not UTF-8 text") from None
         self._policy.use_file(PolicyLayer(f"{OPTION} {self._path}", rules, self._mode))
 
     async def look(self) -> None:
@@ -60,7 +60,7 @@ class PolicyFile:
         try:
             self.read()
         except ValueError as error:
-            text = f"{error}; the rules that were read before stay in force"
+            text = f"{error}. The rules that were read before stay in force"
             # A file that can't be opened is tried at each look, and told of once.
             if text not in (problem.text for problem in self._problems.all()):
                 log.error("%s: %s", OPTION, text)

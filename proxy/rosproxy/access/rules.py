@@ -136,7 +136,7 @@ def _parse(tokens: list[str]) -> Rule:
         raise ValueError(f"the kind must be one of {', '.join(_KINDS)}, not {tokens[1][:20]!r}")
     by = tokens[4] if len(tokens) == 5 else "*"
     if max(len(tokens[2]), len(by)) > LONGEST_GLOB:
-        raise ValueError(f"a glob has at most {LONGEST_GLOB} characters")
+        raise ValueError(f"a glob must have at most {LONGEST_GLOB} characters")
     globs = [by] if kind is RuleKind.SLAVE else [tokens[2], by]
     for glob in globs:
         if glob[0] not in "/*?":  # it would never match: names that the master knows begin so

@@ -43,7 +43,7 @@ class PolicySources:
             settings.policy_file, PolicyMode(settings.policy_mode), runtime.policy, runtime.problems
         )
         _read(file)
-        runtime.tasks.repeat(file.look, LOOK_INTERVAL, "looking at the policy's file")
+        runtime.tasks.repeat(file.look, LOOK_INTERVAL, "checking the policy file")
 
     async def post(self, body: Any) -> dict[str, Any]:
         """``POST /policy``: how many registrations are hidden and shown now, and what was cut.
@@ -56,7 +56,7 @@ class PolicySources:
         except BodyError as error:
             # A former refusal has another text, and would be kept beside this one (`Problems.add`).
             problems.solved(OPERATOR_POLICY)
-            problems.add(OPERATOR_POLICY, f"refused; the previous policy stays in force: {error}")
+            problems.add(OPERATOR_POLICY, f"refused: {error}. The previous policy stays in force")
             raise
         problems.solved(OPERATOR_POLICY)
         counts = Counter[str]()

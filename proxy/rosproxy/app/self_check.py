@@ -87,7 +87,7 @@ class SelfCheck:
             try:
                 await self._try_range(or_fast=False)
             except OSError as error:  # a port that was free a moment ago
-                log.debug("the range could not be tried: %s", error)
+                log.debug("the proxy could not try the range: %s", error)
             await self._until_due()
 
     async def _until_due(self) -> None:

@@ -46,7 +46,7 @@ class OpenRelays:
             try:
                 loop.call_soon_threadsafe(self._finish, ended_relay, ended)
             except RuntimeError:
-                log.debug("the event loop has ended before a relay")
+                log.debug("a relay ended after the event loop")
 
         relay.start(finished, self._quiet_sockets.when_readable)
 

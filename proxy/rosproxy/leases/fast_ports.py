@@ -152,10 +152,10 @@ def why_no_fast_port(pool: PortPool, endpoint: LeaseHolder) -> str:
     """Why an endpoint that could have a fast port has none."""
     port = partner(pool.range, endpoint.port)
     if port is None:
-        return f"port {endpoint.port} has no second port in the range to be its fast port"
+        return f"port {endpoint.port} has no second port in the range for a fast port"
     if pool.is_free(port):
-        return "nobody has asked for a topic of it lately"
-    return f"its fast port would be {port}, which is in use"
+        return "no subscriber has asked for a topic of the node lately"
+    return f"the fast port of the node would be {port}, which is in use"
 
 
 def fast_port_count(holders: Iterable[LeaseHolder]) -> int:

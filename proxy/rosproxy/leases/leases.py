@@ -128,7 +128,7 @@ class Leases(Generic[_H]):
             return
         self._kernel.note_change(endpoint)
         if error := self._listen(endpoint, endpoint.port):
-            text = f"port {endpoint.port} is taken: {error}"
+            text = f"port {endpoint.port} can't be opened: {error}"
             self._problems.add(endpoint.label, text, endpoint.port)
             log.error("port %d of %s can't be opened: %s", endpoint.port, endpoint.label, error)
         elif endpoint.fast_port is not None and self._listen(endpoint, endpoint.fast_port):
@@ -284,7 +284,7 @@ class Leases(Generic[_H]):
             return None
         port = holder.fast_port
         log.info(
-            "%s: its fast port %s is taken back, since no other port of the range is free",
+            "%s: the proxy takes fast port %s back, since no other port of the range is free",
             holder.label,
             port,
         )

@@ -25,10 +25,11 @@ class Budget:
     def take(self, source: str, size: int) -> None:
         """Take so much for a source. Raises OverBudget, and takes nothing."""
         if self.used + size > self.most:
-            raise OverBudget(f"more than {self.most} {self._unit} at once; try again")
+            raise OverBudget(f"at most {self.most} {self._unit} are accepted at once; try again")
         total = self._used_by_source.get(source, 0) + size
         if total > self._share:
-            raise OverBudget(f"more than {self._share} {self._unit} at once from {source}")
+            text = f"at most {self._share} {self._unit} are accepted at once from {source}"
+            raise OverBudget(text)
         self.used += size
         self._used_by_source[source] = total
 

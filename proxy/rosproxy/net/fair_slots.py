@@ -31,7 +31,7 @@ class FairSlots:
     def slot(self, source: str) -> Iterator[None]:
         """Take a slot for as long as the context lasts. Raises NoSlot."""
         if self._taken[source] >= self.each:
-            raise NoSlot(f"{self.each} {self._work} from {source} already; {self._advice}")
+            raise NoSlot(f"{source}: {self.each} {self._work} already; {self._advice}")
         if self.taken >= self.most:
             raise NoSlot(f"{self.most} {self._work} already; {self._advice}")
         self._taken[source] += 1

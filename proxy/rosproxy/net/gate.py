@@ -42,12 +42,15 @@ class Gate:
     def admits(self, source: str, port: int) -> bool:
         """Whether another connection may come in; makes room if one of the source waits."""
         if self._by_port[port] >= self._per_port:
-            text = f"port {port} has {self._per_port} connections (--max-connections-per-lease)"
+            text = f"port {port} already has {self._per_port} connections"
+            text += " (--max-connections-per-lease)"
             self._note_refusal("connections_per_lease", source, text)
             return False
         if self._by_source[source] < self.per_source:
             return True
-        text = f"{self.per_source} connections from one source (--max-connections-per-source)"
+        text = (
+            f"the source already has {self.per_source} connections (--max-connections-per-source)"
+        )
         self._note_refusal("connections_per_source", source, text)
         return self._end_oldest(source)
 
@@ -73,7 +76,7 @@ class Gate:
         number = next(self._numbers)
         connections = self._waiting.setdefault(source, {})
         if len(connections) >= MOST_WAITING:
-            text = f"{MOST_WAITING} silent connections from one source"
+            text = f"the source already has {MOST_WAITING} connections on which it has sent nothing"
             self._note_refusal("silent_connections", source, text)
             self._end_oldest(source)
         self._waiting.setdefault(source, {})[number] = end

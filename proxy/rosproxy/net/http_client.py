@@ -177,7 +177,7 @@ class HttpClient:
         if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
             raise ValueError(
                 f"{host}{path} can't be requested: "
-                "its host or path is empty or has spaces or control characters in it"
+                "the host or the path is empty, or has spaces or control characters"
             )
         start = f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
         return f"{start}{self._headers}Content-Length: {size}\r\n\r\n".encode()
@@ -315,7 +315,7 @@ class TooLong(BadResponse):
     """A body of more bytes than there may be."""
 
     def __init__(self, most: int) -> None:
-        super().__init__(f"a body of more than {most} bytes")
+        super().__init__(f"the body is longer than {most} bytes")
 
 
 async def read_bounded(

@@ -55,14 +55,16 @@ def _start(host: str, source: str) -> Future[list[str]]:
     lookup: Future[list[str]] = Future()
     if not _may_start(source):
         label = source or "the proxy"
-        log.warning("too many name look-ups for %s; %s is taken as unresolvable", label, host)
+        log.warning(
+            "%s: too many name look-ups at once; host name %s counts as unresolvable", label, host
+        )
         lookup.set_result([])
         return lookup
     _running[host] = source, lookup
     try:
         threading.Thread(target=_look_up, args=(host, lookup), daemon=True).start()
     except RuntimeError as error:  # the process or the machine has no thread left
-        log.warning("%s: %s can't be looked up: %s", source or "the proxy", host, error)
+        log.warning("%s: host name %s can't be looked up: %s", source or "the proxy", host, error)
         _end(host, lookup, [])
     return lookup
 

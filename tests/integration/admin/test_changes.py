@@ -75,7 +75,7 @@ async def test_so_many_may_wait(make_proxy: MakeProxy, monkeypatch: pytest.Monke
     await until(lambda: room.slots.taken == each, "all wait")
     refused = await wait(proxy, version)
     assert refused.status == 503
-    assert b"4 callers wait for a change from 127.0.1.9 already; ask /status" in refused.body
+    assert b"127.0.1.9: 4 callers wait for a change already; ask /status" in refused.body
     some[0].cancel()
     await until(lambda: room.slots.taken < each, "there is room again")
     room.end()

@@ -147,7 +147,7 @@ async def test_a_range_without_partners_has_no_fast_ports(make_proxy, make_node,
     await node.publish(proxy.master)
     for _ in range(2):
         assert await ask(proxy, node) == proxy.lease(node)
-    assert caplog.text.count("has no second port in the range to be its fast port") == 1
+    assert caplog.text.count("has no second port in the range for a fast port") == 1
 
 
 async def test_without_the_kernel_nobody_is_sent_to_a_fast_port(make_proxy, make_node, no_kernel):

@@ -273,7 +273,7 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
     assert bench.tools.forwards == {}
     waiting = False, ("--mark", Marks(11311).port_selector(45002), "--state", "SYN_SENT")
     assert waiting in bench.tools.forgotten
-    assert "nothing came back" in bench.plane.status_of(endpoint)["reason"]
+    assert "did not answer through the kernel" in bench.plane.status_of(endpoint)["reason"]
     bench.tools.flows = ""
     bench.later += 6
     assert await bench.plane.syncer.forwards(endpoint, 50000)
@@ -360,7 +360,7 @@ async def test_a_kernel_without_limits_forwards_and_says_so(
     await bench.forwarded()
     assert bench.plane.status()["plane"] == "kernel"
     (problem,) = bench.context.problems.all()
-    assert "forged SYNs" in problem.text
+    assert "forged SYN packets" in problem.text
     assert "nft_limit" in problem.text
     assert problem.text in caplog.text
     bench.tools.lacking = ""

@@ -64,7 +64,7 @@ def test_denials_are_told_with_rule_and_layer(
     assert [(p.subject, p.text) for p in problems.all()] == [
         (
             "refused: policy",
-            "from 10.0.0.1: publish /own of /n denied by policy of web: deny publish /own",
+            "from 10.0.0.1: publish /own of /n is denied by policy of web: deny publish /own",
         ),
         (
             "refused: policy audit",

@@ -111,7 +111,7 @@ def test_layers_are_read_as_they_are_written(policy: list[PolicyLayer]) -> None:
         ({}, "Expected `array`"),
         ([{"name": "a"}], "rules"),
         ([{"name": "a", "rules": ["deny publish a"]}], "layer 'a': rule 'deny publish a'"),
-        ([{"name": " ", "rules": []}], "name has 1 to 200"),
+        ([{"name": " ", "rules": []}], "must have 1 to 200"),
         ([{"name": "a", "rules": [], "addresses": ["talker"]}], "layer 'a': addresses"),
         ([{"name": "a", "rules": [], "mode": "off"}], "mode"),
         ([{"name": "a", "rules": [], "more": 1}], "more"),

@@ -18,9 +18,7 @@ INSIDE = ParticipantStatus(
     address="172.30.0.5",
     vendor="Fast DDS",
     leases=(
-        LocatorStatus(
-            11401, "172.30.0.5:7410", "metatraffic", 3, 1500, 500.0, "copy", "it is read"
-        ),
+        LocatorStatus(11401, "172.30.0.5:7410", "metatraffic", 3, 1500, 500.0, "copy", "discovery"),
         LocatorStatus(
             11402, "172.30.0.5:7411", "data", plane="kernel", kernel_datagrams=7, kernel_bytes=900
         ),

@@ -50,7 +50,7 @@ def test_a_node_that_named_its_port_is_forwarded_to(named: dict[str, Any]) -> No
     ("endpoint", "world", "why"),
     [
         (an_endpoint(trusted=False), BOTH, "does not answer"),
-        (an_endpoint(topic_ports={}), BOTH, "nobody has asked"),
+        (an_endpoint(topic_ports={}), BOTH, "no subscriber has asked"),
         (an_endpoint(topic_ports={"/a": 1, "/b": 2}), BOTH, "several TCPROS ports"),
         (an_endpoint("127.0.0.1"), BOTH, "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(ipv4=False), "net.ipv4.ip_forward"),
@@ -90,7 +90,7 @@ def test_datagrams_stay_in_user_space_where_the_way_inside_takes_shorter_ones() 
     host = HostForwarding(longest_packet=1500)
     said = destination(an_endpoint(), host, Route("10.0.0.2", 1400), False)
     assert isinstance(said, str)
-    assert "takes packets of 1400 bytes, and packets of 1500 may arrive" in said
+    assert "takes packets of at most 1400 bytes, and packets of 1500 bytes may arrive" in said
 
 
 def test_a_node_that_is_down_stays_in_user_space() -> None:

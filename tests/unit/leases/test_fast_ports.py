@@ -61,7 +61,7 @@ def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
     assert not fast_ports.claim(registry.pool, first)
     assert not fast_ports.claim(registry.pool, second)
     assert fast_ports.why_no_fast_port(registry.pool, first) == (
-        "its fast port would be 1001, which is in use"
+        "the fast port of the node would be 1001, which is in use"
     )
 
 

@@ -10,10 +10,10 @@ from rosproxy.net.budget import Budget, Charge, OverBudget
 def test_a_source_has_a_share_and_leaves_the_rest_to_others() -> None:
     budget = Budget(100, 50, "bytes")
     budget.take("a", 50)
-    with pytest.raises(OverBudget, match="more than 50 bytes at once from a"):
+    with pytest.raises(OverBudget, match="at most 50 bytes are accepted at once from a"):
         budget.take("a", 1)
     budget.take("b", 50)
-    with pytest.raises(OverBudget, match="more than 100 bytes at once; try again"):
+    with pytest.raises(OverBudget, match="at most 100 bytes are accepted at once; try again"):
         budget.take("c", 1)
     budget.give("a", 1)
     budget.take("c", 1)

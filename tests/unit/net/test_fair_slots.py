@@ -11,9 +11,7 @@ FAR = "192.0.2.2"
 def test_a_source_has_its_share_and_leaves_the_rest_to_others() -> None:
     slots = FairSlots("replies are under way", 3, 2, "read one")
     with slots.slot(NEAR), slots.slot(NEAR):
-        with pytest.raises(
-            NoSlot, match=r"2 replies are under way from 192\.0\.2\.1 already; read"
-        ):
+        with pytest.raises(NoSlot, match=r"192\.0\.2\.1: 2 replies are under way already; read"):
             slots.slot(NEAR).__enter__()
         with slots.slot(FAR):
             assert slots.taken == 3

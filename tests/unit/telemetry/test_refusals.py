@@ -25,10 +25,10 @@ def test_each_refusal_counts_and_the_first_of_a_source_is_told(
     clock = [0.0]
     refusals = Refusals(metrics, problems, lambda: clock[0])
     for _ in range(5):
-        refusals.note("long_body", "10.0.0.5", "a body of more than 5 bytes")
+        refusals.note("long_body", "10.0.0.5", "the body is longer than 5 bytes")
     refusals.note("long_body", "10.0.0.6", "another")
     assert [record.message for record in caplog.records] == [
-        "refused: long body, from 10.0.0.5: a body of more than 5 bytes",
+        "refused: long body, from 10.0.0.5: the body is longer than 5 bytes",
         "refused: long body, from 10.0.0.6: another",
     ]
     clock[0] = QUIET

@@ -45,9 +45,9 @@ def destination(
     if endpoint.is_down or not endpoint.trusted:
         return "the node does not answer"
     if not ports:
-        return "nobody has asked for a topic of it yet"
+        return "no subscriber has asked for a topic of the node yet"
     if len(ports) > 1:
-        return "its topics are on several TCPROS ports"
+        return "the node has topics on several TCPROS ports"
     obstacle = _obstacle(endpoint.address, host, route, has_connections)
     return obstacle or HostPort(endpoint.address, next(iter(ports)))
 
@@ -69,8 +69,8 @@ def _obstacle(
     # outside, and the sender goes on to send packets of that length.
     if not has_connections and route.mtu < host.longest_packet:
         return (
-            f"the way to {address} takes packets of {route.mtu} bytes, and packets of "
-            f"{host.longest_packet} may arrive: give the proxy's networks the same MTU"
+            f"the route to {address} takes packets of at most {route.mtu} bytes, and packets of "
+            f"{host.longest_packet} bytes may arrive: give the proxy's networks the same MTU"
         )
     return None
 

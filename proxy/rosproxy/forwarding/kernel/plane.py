@@ -88,7 +88,7 @@ class KernelPlane:
         self._report()
         if self.syncer.usable:
             self._tasks.repeat(self.syncer.run_once, 0, f"forwarding {self.syncer.traffic}")
-            self._tasks.repeat(self.look, LOOK_INTERVAL, "looking at the kernel's counters")
+            self._tasks.repeat(self.look, LOOK_INTERVAL, "reading the kernel's counters")
 
     async def stop(self) -> None:
         """Take the table away, and what the kernel knows of connections through it.
@@ -186,7 +186,7 @@ class KernelPlane:
                 log.warning("%s: %s", self.syncer.subject, self._table.weakness)
                 self._problems.add(self.syncer.subject, self._table.weakness)
         elif self._settings.data_plane == "kernel":
-            text = f"the kernel forwards no {traffic}, the proxy does ({plane}): {reason}"
+            text = f"the proxy forwards {traffic} ({plane}), not the kernel: {reason}"
             log.error("%s kernel: %s", OPTION, text)
             self._problems.add(self.syncer.subject, text)
         else:

@@ -36,8 +36,8 @@ async def find_obstacle(mode: DataPlane, tools: Tools) -> str | None:
         return str(error)
     if chains:
         return (
-            f"another firewall here drops what is forwarded ({', '.join(chains)}): run the proxy "
-            "in a network namespace of its own"
+            "another firewall in this network namespace drops forwarded packets "
+            f"({', '.join(chains)}): run the proxy in a network namespace of its own"
         )
     return None
 
@@ -48,8 +48,9 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
         return
     if mode == "auto" and (hardware := _hardware()):
         yield (
-            f"this looks like a host's own network (it has {hardware}), which --data-plane auto "
-            "leaves alone: use --data-plane kernel, or a network namespace of its own"
+            f"the proxy seems to run in the host's network (interface {hardware}), where "
+            "--data-plane auto does not use the kernel: set --data-plane kernel, or run the proxy "
+            "in a network namespace of its own"
         )
     host = read_forwarding()
     if not (host.ipv4 or host.ipv6):
@@ -60,8 +61,9 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
     # nft lists nothing of iptables-legacy, so that `dropping_chains` can't see its policy.
     if "filter" in _read(_LEGACY_TABLES).split():
         yield (
-            "iptables-legacy has a filter table here, which may drop what is forwarded: use "
-            "iptables-nft, or run the proxy in a network namespace of its own"
+            "iptables-legacy has a filter table in this network namespace, which may drop "
+            "forwarded packets: use iptables-nft, or run the proxy in a network namespace of its "
+            "own"
         )
 
 

@@ -152,7 +152,7 @@ class ForwardSyncer:
         why = self.reason(endpoint)
         if why and self.usable and self._logged.get(endpoint) != why:
             self._logged[endpoint] = why
-            log.info("%s: the proxy forwards its topics: %s", endpoint.label, why)
+            log.info("%s: the proxy forwards the topics, not the kernel: %s", endpoint.label, why)
 
     async def forwards(self, endpoint: LeaseHolder, node_port: int) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
@@ -189,7 +189,7 @@ class ForwardSyncer:
         for port in ports:
             target = self._table.forwards.get(port)
             if target is not None:
-                why = f"nothing came back from the node at {target} through the kernel"
+                why = f"the node at {target} did not answer through the kernel"
                 self._pauses.note(port, target, why, self._clock())
         if ports:
             self._all_changed = True
@@ -261,7 +261,7 @@ class ForwardSyncer:
             self.why_not = str(error)
             self._retry_at = self._clock() + RETRY_LOST
             self._accounts.note_peers({})
-            text = f"{self.traffic} are no longer forwarded by the kernel: {error}"
+            text = f"the kernel no longer forwards {self.traffic}: {error}"
             log.error("%s", text)
             self._problems.add(self.subject, text)
 
@@ -287,9 +287,9 @@ class ForwardSyncer:
         for port in {**change.removed, **change.added}:
             endpoint = self._accounts.owners.get(port)
             target = change.added.get(port)
-            name = endpoint.label if endpoint else "a node that is gone"
+            name = endpoint.label if endpoint else "a node that has ended"
             if target:
                 log.info("%s: the kernel forwards port %d to %s", name, port, target)
             else:
-                why = self.reason(endpoint) if endpoint else "its endpoint has ended"
+                why = self.reason(endpoint) if endpoint else "the endpoint has ended"
                 log.info("%s: the kernel no longer forwards port %d: %s", name, port, why)

@@ -39,7 +39,7 @@ class KernelTable:
         try:
             former = await self._read()
         except (ToolError, NftError) as error:
-            log.debug("no table of a former process: %s", error)
+            log.debug("the kernel has no table of a former process: %s", error)
             former = TableState()
         self.counted = set(former.counters)
         await self.make(former.forwards, surroundings(former.forwards))
@@ -115,8 +115,8 @@ class TrackedTable(KernelTable):
             self._connections.limits_new = False
             await super().begin(surroundings)
             self.weakness = (
-                f"the kernel forwards without a limit for new connections ({error}), and forged "
-                "SYNs can keep new subscribers out: load the module nft_limit on the host"
+                f"the kernel forwards new connections without a limit ({error}), so forged SYN "
+                "packets can keep new subscribers out: load the module nft_limit on the host"
             )
 
     async def look(self, ipv6: bool) -> tuple[Counters, Survey | None]:
@@ -151,7 +151,7 @@ class TrackedTable(KernelTable):
             await self.forget(ports)
             await self.tools.nft("-f", "-", document=self._connections.cut(numbers, "delete"))
         except ToolError as error:
-            log.warning("connections can't be ended: %s", error)
+            log.warning("the connections through the kernel can't be ended: %s", error)
 
     async def remove(self) -> None:
         """End what goes through the table, remove it, and forget all connections through it."""
@@ -160,7 +160,7 @@ class TrackedTable(KernelTable):
                 await self.tools.nft("-f", "-", document=self._connections.ended())
                 await asyncio.sleep(RESET_TIME)
             except ToolError as error:
-                log.warning("connections can't be ended: %s", error)
+                log.warning("the connections through the kernel can't be ended: %s", error)
         await super().remove()
         for ipv6 in (False, True):
             await self._forget(ipv6, "--mark", self._connections.marks.table_selector)
@@ -174,4 +174,4 @@ class TrackedTable(KernelTable):
         try:
             await self.tools.forget_flows(ipv6, *options)
         except ToolError as error:
-            log.warning("connections can't be ended: %s", error)
+            log.warning("the connections through the kernel can't be ended: %s", error)
