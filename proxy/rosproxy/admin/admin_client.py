@@ -67,7 +67,7 @@ class AdminClient:
     def page(self) -> str:
         """Where a browser finds the live page; with a key, if a token is set. Raises AdminError."""
         if not _authorization():
-            # Only to find out whether anybody is there: without a token the page needs no key.
+            # Only to find out whether the proxy answers: without a token the page needs no key.
             self.get("/healthz")
             return f"{self.url}/"
         return f"{self.url}/?key={self._json(self._ask('POST', '/page-key', 5.0), 'key')['key']}"
@@ -102,7 +102,7 @@ class AdminClient:
         except (ValueError, RecursionError):
             answer = None
         if not isinstance(answer, dict) or key not in answer:
-            raise AdminError(f"what answers at {self.url} is not the admin endpoint of a rosproxy")
+            raise AdminError(f"the program at {self.url} is not the admin endpoint of a rosproxy")
         return answer
 
 

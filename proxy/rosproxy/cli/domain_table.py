@@ -21,7 +21,7 @@ def domain_lines(domain: document.DomainStatus, columns: int) -> Iterator[str]:
     if not participants:
         yield "No participant has been heard yet."
         return
-    # Where somebody is inside, those outside send there, and nothing has come from one of these.
+    # With participants inside, an outside participant sends to the range; nothing has come yet.
     unheard = "outside?" if domain.inside else "outside"
     sides = ["inside"] * len(domain.inside)
     sides += ["outside" if p.proven else unheard for p in domain.outside]
@@ -37,14 +37,17 @@ def _summary(domain: document.DomainStatus) -> str:
     targets = [f"peers {listed(map(clean, domain.peers))}"] if domain.peers else []
     targets += [f"LAN relay {clean(domain.lan_relay)}"] if domain.lan_relay else []
     announced_to = (
-        "; ".join(targets) or "neither peers nor a LAN relay: inside is announced to nobody"
+        "; ".join(targets)
+        or "no peer and no LAN relay is set, so inside is announced to no host outside"
     )
     ports = f"{domain.ports_used} ports used, {domain.ports_free} free"
     lost = f"; {domain.dropped} datagrams refused, {domain.lost} lost"
     trouble = lost if domain.dropped or domain.lost else ""
     plane = f"; user data {_plane(domain.data_plane)}" if domain.data_plane else ""
     discovery = clean(domain.discovery)
-    return f"domain {domain.domain}: {announced_to}; found at {discovery}; {ports}{plane}{trouble}"
+    return (
+        f"domain {domain.domain}: {announced_to}; discovery at {discovery}; {ports}{plane}{trouble}"
+    )
 
 
 def _plane(plane: document.DataPlaneStatus) -> str:

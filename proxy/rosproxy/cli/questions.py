@@ -97,10 +97,10 @@ def _open_page(admin: Any) -> None:
     click.echo(url)
     if not webbrowser.open(url):
         text = (
-            "No browser here. In a container this address is the container's own. The operator's "
+            "No browser was found here. In a container, the address leads to the container itself. "
         )
-        text += "page shows all proxies: rosproxy-operator docker status. By hand: "
-        click.echo(f"{text}docs/guide/live-page.md.", err=True)
+        text += "The page of the operator shows all proxies: rosproxy-operator docker status. "
+        click.echo(f"{text}Without an operator, see docs/guide/live-page.md.", err=True)
 
 
 def _why_not_ready(admin: Any) -> str:

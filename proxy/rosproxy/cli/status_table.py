@@ -69,7 +69,8 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
         host = clean(settings.advertise_host)
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
     if missing := left_out(status):
-        yield f"left out {plural(missing, 'name')} and entries: /status is bounded, see limits.md"
+        entries = f"{plural(missing, 'name')} and entries"
+        yield f"left out {entries}: /status is bounded, see docs/reference/limits.md"
 
 
 def _master(master: document.MasterStatus) -> str:
@@ -233,7 +234,7 @@ def _problems(status: document.ProxyStatus, columns: int) -> Iterator[str]:
     """All problems but the master's, which its own line tells."""
     problems = [problem for problem in status.problems if problem.subject != "master"]
     if problems:
-        yield from ("", "problems (rosproxy doctor looks into them):")
+        yield from ("", "problems (run rosproxy doctor to examine them):")
     for problem in problems:
         text = f"{clean(problem.subject)}: {clean(problem.text)}"
         yield from wrap(f"{duration(problem.age)} ago  {text}", columns, INDENT, "  ")

@@ -31,7 +31,7 @@ MOST_CONNECTIONS = 1000
 
 @dataclass(eq=False)
 class Ros1State(Collector):
-    """What there is to tell of ROS 1, read when somebody asks."""
+    """The state of ROS 1, read at each request."""
 
     _context: Context
     _monitor: MasterMonitor
@@ -99,7 +99,7 @@ class Ros1State(Collector):
         buffered = context.buffered
         yield "leases_used", "Ports held by inside nodes.", len(endpoints)
         yield "leases_free", "Ports left for inside nodes.", fast_ports.ports_left(pool, endpoints)
-        text = "Of the ports left, those that serve topics meanwhile."
+        text = "Free ports that serve as fast ports now."
         yield "fast_ports", text, fast_ports.fast_port_count(endpoints)
         yield "leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)
         yield "open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)
@@ -109,7 +109,11 @@ class Ros1State(Collector):
         yield "udpros_relays", text, len(self._stand_ins.udpros)
         text = "Memory that calls and replies hold while they are read."
         yield "buffered_bytes", text, buffered.used
-        yield "buffered_bytes_limit", "Memory that they may hold.", buffered.most
+        yield (
+            "buffered_bytes_limit",
+            "Limit of the memory that calls and replies hold.",
+            buffered.most,
+        )
         yield "master_up", "Whether the master answers.", bool(self._monitor.up)
         text = "Whether the kernel forwards topics."
         yield "kernel_plane", text, self._plane.syncer.usable
@@ -117,7 +121,7 @@ class Ros1State(Collector):
         yield "kernel_connections", "TCPROS connections that the kernel forwards.", forwarded
 
     def _nodes_down(self) -> Metric:
-        """The nodes that do not answer, by name, for whoever is on call."""
+        """The nodes that do not answer, by name, for alerts."""
         text = "Inside nodes that do not answer, by name."
         gauge = GaugeMetricFamily("rosproxy_nodes_down", text, labels=["node"])
         down = [e for e in self._context.registry if e.is_down and not e.health.has_ended]
@@ -145,9 +149,9 @@ class Ros1State(Collector):
 
     def _counted_by_nodes(self) -> Iterable[Metric]:
         labels = ["name", "side"]
-        text = "Messages of topics that inside nodes published or received, as they count."
+        text = "Messages of topics that inside nodes published or received, as the nodes count."
         messages = CounterMetricFamily("rosproxy_topic_messages", text, labels=labels)
-        text = "Bytes of topics that inside nodes published or received, as they count."
+        text = "Bytes of topics that inside nodes published or received, as the nodes count."
         sizes = CounterMetricFamily("rosproxy_topic_bytes", text, labels=labels)
         for key, (size, count) in self._messages.read().by_topic.items():
             messages.add_metric(key, count)

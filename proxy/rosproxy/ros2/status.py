@@ -45,7 +45,7 @@ _Participant = TypeVar("_Participant", bound=Participant)
 
 @dataclass(eq=False)
 class Ros2State(Collector):
-    """What there is to tell of ROS 2, read when somebody asks.
+    """The state of ROS 2, read at each request.
 
     Without ``with_names`` no topics and services are listed: that takes a tenth of the time.
     """
@@ -92,7 +92,7 @@ class Ros2State(Collector):
         )
         lacking = GaugeMetricFamily(
             "rosproxy_ros2_participants_without_port",
-            "Participants inside with locators that got no port.",
+            "Participants inside with a locator that got no port.",
             labels=["domain"],
         )
         dropped = CounterMetricFamily(

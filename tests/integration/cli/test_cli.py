@@ -121,7 +121,7 @@ async def test_somebody_else_answers(stranger: str) -> None:
     result = await run("status", "--admin", stranger)
     assert result.code == 1
     assert result.err == (
-        f"rosproxy: what answers at {stranger} is not the admin endpoint of a rosproxy\n"
+        f"rosproxy: the program at {stranger} is not the admin endpoint of a rosproxy\n"
     )
 
 

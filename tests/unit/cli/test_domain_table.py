@@ -59,7 +59,7 @@ def test_a_domain_and_its_participants_are_shown() -> None:
     text = shown(DOMAIN)
     for expected in (
         "ROS 2, domain 7, networks 172.30.0.0/16",
-        "domain 7: LAN relay 172.30.0.1:7500; found at 10.0.0.1:11400; 1 ports used, 62 free",
+        "domain 7: LAN relay 172.30.0.1:7500; discovery at 10.0.0.1:11400; 1 ports used, 62 free",
         "4 datagrams refused",
         "11401 to 172.30.0.5:7410",
         "/chatter",
@@ -88,5 +88,5 @@ def test_what_the_kernel_forwards_is_told() -> None:
 
 def test_who_is_told_nobody_is_told_so() -> None:
     text = shown(DomainStatus(domain=0))
-    assert "neither peers nor a LAN relay: inside is announced to nobody" in text
+    assert "so inside is announced to no host outside" in " ".join(text.split())
     assert "No participant has been heard yet." in text

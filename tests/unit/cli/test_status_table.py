@@ -123,7 +123,9 @@ def test_what_the_proxy_has_left_out_is_told() -> None:
     lines = lines_of(make_node(left_out=1234))
     assert [line for line in lines if "1234 more names and connections" in line]
     assert not [line for line in lines_of(make_node()) if "not shown" in line]
-    assert "left out 1234 names and entries: /status is bounded, see limits.md" in lines
+    assert (
+        "left out 1234 names and entries: /status is bounded, see docs/reference/limits.md" in lines
+    )
     assert not [line for line in lines_of(make_node()) if "left out" in line]
 
 
@@ -150,7 +152,7 @@ def test_problems_stand_at_the_end() -> None:
     lines = lines_of(make_node(), problems=[problem, masters])
     assert lines[-3:] == [
         "",
-        "problems (rosproxy doctor looks into them):",
+        "problems (run rosproxy doctor to examine them):",
         "  2 min ago  /talker: does not answer",
     ]
 
