@@ -188,8 +188,8 @@ def test_a_firewall_before_the_range_is_a_warning_until_it_is_gone(
         lab.wait_for_participants(1, 1)
         wait_until("it is told", lambda: trouble(browser).startswith("warning: "))
         (outsider,) = lab.domain().outside
-        text = f"at {outsider.address} (Fast DDS, outside): nothing has come from it"
-        fix = "publish the range for UDP, and let it through firewalls"
+        text = f"at {outsider.address} (Fast DDS, outside): no datagram from this"
+        fix = "publish the range for UDP, and let firewalls accept UDP"
         assert text in trouble(browser)
         assert fix in trouble(browser)
         (warned,) = (cells for cells in browser.run(NODES) if cells[0] == "warning")

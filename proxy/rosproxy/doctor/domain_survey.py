@@ -1,11 +1,12 @@
-"""Who is on the networks inside, of whatever domain: each participant is asked to announce itself.
+"""The participants on the networks inside, in all domains: each is asked to announce itself.
 
 The proxy hears what is announced to the group of its own domain. It can't hear a participant of
 another one, nor one that announces itself to its own machine alone
-(``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST``). Yet both answer at once when they hear of somebody
-new. So the doctor is somebody new for a moment: it announces itself to the groups of all domains,
-and to all hosts (224.0.0.1, ff02::1) at the well-known ports of its own; hears who answers, and
-takes its leave. It has no reader and no writer, so that nothing else is told to it.
+(``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST``). Yet both answer at once when they hear a new
+participant. So the doctor is a new participant for a moment: it announces itself to the groups of
+all domains, and to all hosts (224.0.0.1, ff02::1) at the well-known ports of the proxy's domains.
+It collects the answers, and ends with a dispose message. The doctor has no reader and no writer, so
+it receives nothing else.
 """
 
 import contextlib
@@ -44,7 +45,7 @@ MOST_HEARD = 200
 
 
 def ask_participants(network: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """Who answers on a network, given as CIDR, if this machine is in it; takes WITHIN.
+    """The participants that answer on a network (CIDR) of this machine; takes WITHIN.
 
     ``domains``: in these, participants that don't hear the group are asked as well.
     """
@@ -73,7 +74,7 @@ def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
 
 
 def _ask(own_address: str, domains: Collection[int]) -> list[HeardParticipant]:
-    """Who answers on the network where this machine has this address. Raises OSError."""
+    """The participants that answer on the network of this own address. Raises OSError."""
     by_prefix: dict[str, HeardParticipant] = {}
     with contextlib.closing(datagrams.bind(own_address, 0)) as sock:
         # Not heard on this machine: the proxy, which hears the groups, would take the doctor for

@@ -1,4 +1,4 @@
-"""What keeps participants of a domain from meeting, as its status tells: the cause, and the fix.
+"""The problems that keep participants of a domain from meeting: the cause, and the fix.
 
 ``rosproxy doctor`` reports it when it is run; the proxy, once it is so, in its log and in
 ``rosproxy status``. Only the first cause is given for a participant: the others follow from it.
@@ -34,44 +34,44 @@ _FAST_DDS_NAME = VENDORS[FAST_DDS]
 _CYCLONE_DDS_NAME = VENDORS[CYCLONE_DDS]
 _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
     LocatorFault.TCP: (
-        "it is reached by TCP alone, and the proxy passes on UDP",
-        "where it runs: unset FASTDDS_BUILTIN_TRANSPORTS (LARGE_DATA is TCP), or give it a "
-        "transport of UDPv4 in its profile",
+        "receives by TCP only, and the proxy passes on UDP only",
+        "where the participant runs: unset FASTDDS_BUILTIN_TRANSPORTS (LARGE_DATA is TCP), or add "
+        "the transport UDPv4 to the profile",
     ),
     LocatorFault.LOOPBACK: (
-        "it announces loopback addresses alone, which mean its own machine to everybody",
-        "where it runs: ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, unset ROS_LOCALHOST_ONLY, and no "
-        "loopback in CYCLONEDDS_URI or an interface list; if it was started before its network "
-        "was up, restart it",
+        "announces only loopback addresses. Other machines reach only themselves at such addresses",
+        "where the participant runs: set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, unset "
+        "ROS_LOCALHOST_ONLY, and remove loopback from CYCLONEDDS_URI or the interface list. If "
+        "the participant started before its network was up, restart it",
     ),
     LocatorFault.ELSEWHERE: (
-        "the addresses that it announces are not the one that it sends from",
-        "where it runs: let it use the network that it shares with the proxy (the interface list "
-        "of its profile, or CYCLONEDDS_URI), without NAT between the two",
+        "does not announce the address from which it sends",
+        "where the participant runs: use a network that the proxy shares (interface list of the "
+        "profile, or CYCLONEDDS_URI), without NAT between participant and proxy",
     ),
     LocatorFault.MISSING: (
-        "it announces no address of UDP",
-        "where it runs: give it a transport of UDPv4 in its profile",
+        "announces no UDP address",
+        "where the participant runs: add the transport UDPv4 to the profile",
     ),
 }
-_LONGER_RANGE = "give a longer --port-range, and publish it"
+_LONGER_RANGE = "set a larger --port-range, and publish the new range"
 _SHORTAGE_FIXES = {
     ShortageKind.BOUND.value: (
-        "where it runs: fewer addresses (the interface list of its profile, or CYCLONEDDS_URI), "
-        "fewer readers and writers with ports of their own (unique network flows), or several "
-        "processes; a longer range does not help"
+        "where the participant runs: use fewer addresses (interface list of the profile, or "
+        "CYCLONEDDS_URI), fewer readers and writers with separate ports (unique network flows), or "
+        "several processes. A larger range does not help"
     ),
 }
-_DEFAULT_FIX = "give both the same {policy}"
+_DEFAULT_FIX = "set the same {policy} on both sides"
 _FIXES = {
     "type": "use the same type in both programs, or remap the name in one of them",
     "reliability": "make the publisher RELIABLE, or the subscription BEST_EFFORT",
     "durability": "make the publisher TRANSIENT_LOCAL (latched), or the subscription VOLATILE",
-    "deadline": "a shorter deadline for the publisher, or a longer one for the subscription",
+    "deadline": "set a shorter deadline in the publisher, or a longer deadline in the subscription",
     "liveliness lease duration": (
-        "a shorter lease for the publisher, or a longer one for the subscription"
+        "set a shorter lease duration in the publisher, or a longer one in the subscription"
     ),
-    "data representation": "have both write and read XCDR (version 1), as ROS 2 does",
+    "data representation": "use XCDR version 1 in both programs, as ROS 2 does",
 }
 
 
@@ -82,14 +82,17 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
     if domain.mismatches_left_out:
         text = f"{plural(domain.mismatches_left_out, 'more pair')} of endpoints don't match"
         yield DomainProblem(
-            "qos", f"domain {domain.domain}", text, "first correct the pairs that are named"
+            "qos",
+            f"domain {domain.domain}",
+            text,
+            "first correct the pairs that other findings name",
         )
     if domain.not_compared:
         # The number changes with each look, and the watch reports each change of a text.
-        text = "some pairs of a reader and a writer are not compared: there are too many"
+        text = "some pairs of a reader and a writer are not compared: the domain has too many"
         fix = (
-            "`rosproxy status --json` lists the readers and writers of each address: end programs "
-            "that have thousands; a domain of hundreds of nodes may have as many by itself"
+            "`rosproxy status --json` lists the readers and writers of each address. Stop programs "
+            "that have thousands. A domain of hundreds of nodes may have so many without a fault"
         )
         yield DomainProblem("qos", f"domain {domain.domain}", text, fix, grave=False)
 
@@ -108,7 +111,7 @@ def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, Do
 
 
 def participant_label(participant: ParticipantStatus, is_inside: bool) -> str:
-    """A participant as texts name it, besides its GUID prefix."""
+    """The address, implementation and side of a participant, for texts with its GUID prefix."""
     return (
         f"at {participant.address} ({participant.vendor}, {'inside' if is_inside else 'outside'})"
     )
@@ -128,14 +131,14 @@ def _problems(
     participant: ParticipantStatus, domain: DomainStatus, is_inside: bool
 ) -> Iterator[DomainProblem]:
     """What is wrong with a participant, the first cause first."""
-    label = participant_label(participant, is_inside)
+    label = f"participant {participant_label(participant, is_inside)}"
     if participant.domain is not None and participant.domain != domain.domain:
         text = (
-            f"{label}: it says that it is in domain {participant.domain}, but was heard in "
-            f"domain {domain.domain}"
+            f"{label}: announces domain {participant.domain}, but was heard in domain "
+            f"{domain.domain}"
         )
         fix = (
-            f"ROS_DOMAIN_ID={domain.domain} for it, or "
+            f"set ROS_DOMAIN_ID={domain.domain} for the participant, or "
             f"--ros2-domain {participant.domain} for the proxy"
         )
         yield DomainProblem("domain", participant.guid_prefix, text, fix)
@@ -150,10 +153,11 @@ def _problems(
         yield DomainProblem(
             "ports", participant.guid_prefix, f"{label}: {participant.problem}", fix
         )
-    if domain.inside and not participant.proven:  # else there is nobody whom it could answer
-        text = f"{label}: nothing has come from it at the ports of the range"
+    # A participant outside sends to the range only if there are participants inside.
+    if domain.inside and not participant.proven:
+        text = f"{label}: no datagram from this participant has arrived at the ports of the range"
         fix = (
-            "publish the range for UDP, and let it through firewalls, so that it reaches "
+            "publish the range for UDP, and let firewalls accept UDP from the participant to "
             f"{domain.discovery.rpartition(':')[0]}"
         )
         yield DomainProblem("reached", participant.guid_prefix, text, fix, grave=False)
@@ -169,13 +173,13 @@ def _security(
     """
     if participant.security != DdsSecurity.PROTECTED or participant.vendor == _CYCLONE_DDS_NAME:
         return
-    text = f"{label}: DDS Security protects its discovery, so that the proxy can't change the "
+    text = f"{label}: DDS Security protects its discovery, so the proxy can't replace the "
     side = "outside" if is_inside else "inside"
-    text += f"addresses of its readers and writers: what {side} sends does not reach them"
-    fix = "a governance with discovery_protection_kind and rtps_protection_kind NONE; or "
-    fix += "ROS_SECURITY_ENABLE=false"
+    text += f"addresses of its readers and writers. Datagrams from {side} do not reach these"
+    fix = "set discovery_protection_kind and rtps_protection_kind to NONE in the governance; or "
+    fix += "set ROS_SECURITY_ENABLE=false"
     if not is_inside:
-        fix += "; or a way out for those inside, and --direction out"
+        fix += "; or give participants inside a route outwards, and set --direction out"
     # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
     yield DomainProblem(
         "security", participant.guid_prefix, text, fix, grave=participant.vendor == _FAST_DDS_NAME
@@ -183,7 +187,7 @@ def _security(
 
 
 def _mismatch(pair: MismatchStatus, writer: str, reader: str) -> DomainProblem:
-    sides = ("publisher", "subscription") if pair.kind == "topic" else ("one side", "other side")
+    sides = ("publisher", "subscription") if pair.kind == "topic" else ("writer", "reader")
     text = (
         f"{pair.policy} differs: the {sides[0]} {pair.writer} {writer} offers {pair.offered}, "
         f"the {sides[1]} {pair.reader} {reader} requests {pair.requested}"

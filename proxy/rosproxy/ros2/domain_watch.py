@@ -45,6 +45,6 @@ class DomainWatch:
             self._problems.solved(subject)
         for problem in sorted(current, key=lambda p: p.text):
             if former - current or problem not in former:
-                self._problems.add(subject, f"{problem.text}: {problem.fix}")
+                self._problems.add(subject, f"{problem.text}. Fix: {problem.fix}")
             if problem not in former:
-                log.warning("%s: %s; %s", subject, problem.text, problem.fix)
+                log.warning("%s: %s. Fix: %s", subject, problem.text, problem.fix)

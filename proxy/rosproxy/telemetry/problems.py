@@ -1,7 +1,7 @@
 """What the user should know: the problems that `rosproxy status` shows.
 
 Subjects are nodes' names and texts quote what nodes say, so that both are made harmless and
-bounded here, once for all who note something.
+bounded here, once for all modules that note a problem.
 """
 
 import time
@@ -42,7 +42,7 @@ class Problems:
         self._problems: list[NotedProblem] = []
 
     def add(self, subject: str, text: str, port: int | None = None, holds: bool = False) -> None:
-        """Note a problem; one that ``holds`` is to be `solved` by whoever notes it."""
+        """Note a problem. The caller has to call `solved` for a problem that ``holds``."""
         subject = brief(subject, LONGEST_SUBJECT)
         text = brief(text, LONGEST_TEXT)
         remaining = [p for p in self._problems if (p.subject, p.text) != (subject, text)]

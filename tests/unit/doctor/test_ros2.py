@@ -110,7 +110,7 @@ MISMATCH = MismatchStatus(
 def test_a_topic_that_matches() -> None:
     severity, text = diagnose_domain(BOTH, "/chatter")["topic", "/chatter"]
     assert severity is Severity.OK
-    for expected in ("01.0f.aa at 172.30.0.5", "01.10.bb at 10.0.0.9", "they match"):
+    for expected in ("01.0f.aa at 172.30.0.5", "01.10.bb at 10.0.0.9", "outside) match"):
         assert expected in text
 
 
@@ -131,8 +131,8 @@ def test_who_can_t_be_reached_matches_nobody() -> None:
 @pytest.mark.parametrize(
     ("domain", "said"),
     [
-        (replace(BOTH, outside=(OUTSIDE,)), "nobody subscribes to it"),
-        (replace(BOTH, inside=(INSIDE,)), "nobody publishes it"),
+        (replace(BOTH, outside=(OUTSIDE,)), "no participant subscribes to /chatter"),
+        (replace(BOTH, inside=(INSIDE,)), "no participant publishes /chatter"),
         (replace(BOTH, inside=(TALKER, replace(LISTENER)), outside=()), "on one side"),
     ],
 )
@@ -145,7 +145,7 @@ def test_a_topic_that_lacks_a_side(domain: DomainStatus, said: str) -> None:
 def test_who_serves_a_service() -> None:
     severity, text = diagnose_domain(BOTH, "/add")["service", "/add"]
     assert severity is Severity.OK
-    assert "served by 01.0f.aa at 172.30.0.5" in text
+    assert "served by participant 01.0f.aa at 172.30.0.5" in text
 
 
 def test_a_name_that_nobody_has() -> None:
@@ -168,7 +168,7 @@ def test_who_is_on_a_network_inside_and_not_heard() -> None:
     assert "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET" in text
     severity, text = told["domain", "01.10.dd"]
     assert severity is Severity.WARNING
-    assert "it is in domain 5; this proxy serves 0" in text
+    assert "is in domain 5, but this proxy serves domain 0" in text
     assert "--ros2-domain 5" in text
 
 

@@ -155,7 +155,7 @@ def test_a_name_that_one_proxy_knows_is_unknown_to_none() -> None:
     other = warning("node", "proxy b: /scanner", "is slow")
     found = without_names_of_others([[connected], [unknown, other]], ["/scan"])
     assert found == [connected, other]
-    lonely = note("topic", "proxy a: /scan", "nobody subscribes to it")
+    lonely = note("topic", "proxy a: /scan", "no participant subscribes to /scan")
     assert unknown not in without_names_of_others([[unknown], [lonely]], ["/scan"])
 
 
@@ -170,8 +170,8 @@ def test_a_participant_of_another_domains_proxy_is_not_missed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two proxies on one network, each for a domain, hear the participants of both."""
-    ours = warning("domain", "01.0f.aa", "it is in domain 5; this proxy serves 0")
-    lost = warning("domain", "01.0f.bb", "it is in domain 9; this proxy serves 0")
+    ours = warning("domain", "01.0f.aa", "is in domain 5, but this proxy serves domain 0")
+    lost = warning("domain", "01.0f.bb", "is in domain 9, but this proxy serves domain 0")
     said = json.dumps(as_json([ours, lost])).encode()
     container = {"name": "talker", "proxy": "p5", "participants": [{"guid_prefix": "01.0f.aa"}]}
     status = {

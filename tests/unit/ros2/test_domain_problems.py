@@ -29,10 +29,10 @@ def test_nothing_is_wrong() -> None:
     [
         ({"domain": 5}, "domain", True, "ROS_DOMAIN_ID=3"),
         ({"security": "protected"}, "security", True, "ROS_SECURITY_ENABLE=false"),
-        ({"security": "protected", "vendor": "OpenDDS"}, "security", False, "does not reach them"),
+        ({"security": "protected", "vendor": "OpenDDS"}, "security", False, "do not reach these"),
         ({"locator_fault": "tcp"}, "transport", True, "FASTDDS_BUILTIN_TRANSPORTS"),
         ({"locator_fault": "loopback"}, "transport", True, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
-        ({"locator_fault": "elsewhere"}, "transport", True, "not the one that it sends from"),
+        ({"locator_fault": "elsewhere"}, "transport", True, "does not announce the address"),
         ({"locator_fault": "missing"}, "transport", True, "UDPv4"),
         ({"problem": "no port of 11400-11403 is free"}, "ports", True, "--port-range"),
         (
@@ -51,7 +51,7 @@ def test_each_cause_has_its_fix(
     (problem,) = with_inside(**changes)
     assert (problem.check, problem.subject, problem.grave) == (check, "01.0f.aa", grave)
     assert said in problem.text + problem.fix
-    assert problem.text.startswith("at 172.30.0.5 (")
+    assert problem.text.startswith("participant at 172.30.0.5 (")
 
 
 def test_of_a_participant_the_first_cause_alone_is_told() -> None:
@@ -84,7 +84,7 @@ def test_outside_is_not_reached_in_direction_both_where_its_addresses_are_protec
     both_ways = replace(DOMAIN, direction="both")
     (problem,) = domain_problems(replace(both_ways, outside=(secured,)))
     assert (problem.check, problem.subject, problem.grave) == ("security", "01.10.bb", True)
-    assert "what inside sends does not reach them" in problem.text
+    assert "Datagrams from inside do not reach these" in problem.text
     assert "--direction out" in problem.fix
     harmless = replace(secured, security="authenticated"), replace(secured, vendor="Cyclone DDS")
     for outsider in harmless:
@@ -104,7 +104,7 @@ def test_what_another_version_says_is_passed_over() -> None:
     [
         ("type", "type", "remap"),
         ("reliability", "qos", "make the publisher RELIABLE"),
-        ("ownership", "qos", "give both the same ownership"),
+        ("ownership", "qos", "set the same ownership on both sides"),
     ],
 )
 def test_a_pair_that_does_not_match(policy: str, check: str, said: str) -> None:

@@ -1,7 +1,7 @@
-"""Rules about ROS 2: whether participants of both sides can meet, as far as the proxy sees it.
+"""Rules about ROS 2: whether participants of both sides discover each other, as the proxy sees it.
 
-Most of it the proxy knows itself (`rosproxy.ros2.domain_problems`). The doctor knows besides who
-is on the networks inside but not heard by the proxy, and which topics and services were asked for.
+Most of it the proxy knows itself (`rosproxy.ros2.domain_problems`). The doctor also knows the
+participants inside that the proxy does not hear, and the topics and services that were asked for.
 """
 
 from collections.abc import Iterator
@@ -25,22 +25,27 @@ OWN_MACHINE = "range"
 HIDDEN = "refused: hidden source"
 _REFUSED = {
     "refused: no locator": (
-        "tcp: unset FASTDDS_BUILTIN_TRANSPORTS there; loopback: ROS_AUTOMATIC_DISCOVERY_RANGE="
-        "SUBNET; elsewhere: it is behind NAT, put a proxy there; missing: give it UDPv4"
+        "where the participant runs: for (tcp) unset FASTDDS_BUILTIN_TRANSPORTS; for (loopback) "
+        "set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; for (elsewhere) start a proxy, since the "
+        "participant is behind NAT; for (missing) add the transport UDPv4 to the profile"
     ),
-    "refused: not a peer": "give its address as --ros2-peer, if it is to meet those inside",
+    "refused: not a peer": (
+        "set --ros2-peer ADDRESS if participants at this address shall meet participants inside"
+    ),
     HIDDEN: (
-        "rootless Docker: DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for its service; "
-        "Docker Desktop: use an engine on Linux; Docker before 23.0: as root on the host "
-        "conntrack -D -p udp. docs/guide/troubleshooting.md has more"
+        "rootless Docker: set DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for the service "
+        "of the engine; Docker Desktop: use an engine on Linux; Docker before 23.0: run "
+        "conntrack -D -p udp as root on the host. See docs/guide/troubleshooting.md"
     ),
-    "refused: participants": "rosproxy status lists them; docs/reference/limits.md has the bounds",
+    "refused: participants": (
+        "rosproxy status lists the participants; docs/reference/limits.md lists the bounds"
+    ),
 }
 """What mends what the proxy has refused, by the subject of the problem."""
 
 
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
-    """What is to be said of the domains."""
+    """All findings about the domains."""
     domains = facts.proxy.domains
     is_settled = facts.proxy.uptime >= SETTLED
     findings = [finding for domain in domains for finding in _domain(domain, is_settled)]
@@ -63,24 +68,22 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
 def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
     subject = f"domain {domain.domain}"
     if not domain.peers and not domain.lan_relay:
-        text = "participants inside are announced to nobody outside"
-        yield error(
-            "announcing",
-            subject,
-            text,
-            "give --ros2-peer, or run rosproxy lan-relay (--ros2-lan-relay)",
-        )
+        text = "no peer and no LAN relay is set, so the proxy announces participants inside to no "
+        text += "host outside"
+        fix = "set --ros2-peer, or run rosproxy lan-relay and set --ros2-lan-relay"
+        yield error("announcing", subject, text, fix)
     if not domain.inside and not is_settled:
         text = "no participant inside has been heard yet; the proxy has just started"
         yield note("inside", subject, text, "wait some seconds")
     elif not domain.inside:
         text = "no participant inside has been heard"
-        fix = f"put the nodes on a network of the proxy's, with ROS_DOMAIN_ID={domain.domain} and "
-        fix += (
-            "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; without multicast there, set ROS_STATIC_PEERS "
+        fix = (
+            "connect the nodes to an inside network of the proxy, and set "
+            f"ROS_DOMAIN_ID={domain.domain} and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET. If the "
+            "network has no multicast, set ROS_STATIC_PEERS to the proxy's address there. The "
+            "proxy can't carry RMW_IMPLEMENTATION=rmw_zenoh_cpp, which does not use DDS"
         )
-        fix += "to the proxy's address for them; with RMW_IMPLEMENTATION=rmw_zenoh_cpp they don't "
-        yield warning("inside", subject, text, fix + "use DDS, and the proxy can't carry them")
+        yield warning("inside", subject, text, fix)
     else:
         yield ok("inside", subject, f"inside: {_counted(domain.inside)}")
     if domain.outside:
@@ -90,14 +93,16 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
 
 
 def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
-    """Where outside nobody has been heard: at a peer, or anywhere."""
+    """The places outside where no participant has been heard: a peer, or all."""
     fix = (
-        "start one there with the same ROS_DOMAIN_ID; publish the range for UDP; Cyclone DDS takes "
-        "ports of its own where it has multicast, which no peer knows: run rosproxy lan-relay "
-        f'(--ros2-lan-relay), or give it <Peer address="{domain.discovery}"/> in its CYCLONEDDS_URI'
+        "start a participant there with the same ROS_DOMAIN_ID, and publish the range for UDP. "
+        "Cyclone DDS with multicast takes ports that the proxy does not know: run rosproxy "
+        f'lan-relay (--ros2-lan-relay), or add <Peer address="{domain.discovery}"/> to the '
+        "CYCLONEDDS_URI of the participant"
     )
     if not domain.outside:
-        text = f"no participant outside has been heard; announced at {domain.discovery}"
+        text = "no participant outside has been heard. The proxy receives announcements from "
+        text += f"outside at {domain.discovery}"
         yield note("outside", f"domain {domain.domain}", text, fix)
         return
     heard = {participant.address for participant in domain.outside}
@@ -107,7 +112,7 @@ def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
         # A name may have an address of each family, and be heard by one of them.
         is_main_family = (":" in host) == domain.discovery.startswith("[")
         if host not in heard and is_main_family:
-            yield note("outside", f"peer {peer}", "no participant there has been heard", fix)
+            yield note("outside", f"peer {peer}", "no participant at this peer has been heard", fix)
 
 
 def _finding(problem: DomainProblem) -> DoctorFinding:
@@ -118,33 +123,32 @@ def _finding(problem: DomainProblem) -> DoctorFinding:
 def _heard(
     participant: HeardParticipant, domains: tuple[DomainStatus, ...]
 ) -> Iterator[DoctorFinding]:
-    """What is to be said of a participant on a network inside that the proxy has not heard."""
+    """The finding about a participant on a network inside that the proxy has not heard."""
     served = [domain.domain for domain in domains]
     prefixes = {p.guid_prefix for domain in domains for p in (*domain.inside, *domain.outside)}
-    label = f"at {participant.address} ({participant.vendor}, inside)"
+    label = f"participant at {participant.address} ({participant.vendor}, inside)"
     if participant.domain not in served:
-        text = f"{label}: it is in domain {participant.domain}; this proxy serves "
+        text = f"{label}: is in domain {participant.domain}, but this proxy serves "
+        text += f"{'domain' if len(served) == 1 else 'domains'} {listed(map(str, served))}"
         fix = (
-            f"ROS_DOMAIN_ID={served[0]} for it, or --ros2-domain {participant.domain} for the "
-            "proxy as well"
+            f"set ROS_DOMAIN_ID={served[0]} for the participant, or add "
+            f"--ros2-domain {participant.domain} to the options of the proxy"
         )
-        yield warning(OTHER_DOMAIN, participant.guid_prefix, text + listed(map(str, served)), fix)
+        yield warning(OTHER_DOMAIN, participant.guid_prefix, text, fix)
     elif participant.guid_prefix not in prefixes:
-        text = f"{label}: it answers, but does not announce itself to the network, so that the "
-        text += "proxy does not hear it: its discovery range is its own machine"
-        fix = (
-            "where it runs: ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, and unset ROS_LOCALHOST_ONLY; or "
-        )
-        fix += "ROS_STATIC_PEERS with the proxy's address"
+        text = f"{label}: answers the doctor, but does not announce itself to the network: its "
+        text += "discovery range is its own machine. So the proxy does not hear the participant"
+        fix = "where the participant runs: set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET and unset "
+        fix += "ROS_LOCALHOST_ONLY; or set ROS_STATIC_PEERS to the proxy's address"
         yield warning(OWN_MACHINE, participant.guid_prefix, text, fix)
 
 
 def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[DoctorFinding]:
-    """Who has a topic or service, and whether the two sides match."""
+    """The participants that have a topic or service, and whether the two sides match."""
     participants = [p for domain in domains for side in _sides(domain) for p in side]
     if not any(name in (*p.publishes, *p.subscribes, *p.services) for p in participants):
         text = "no participant has a topic or service of this name"
-        yield error(UNKNOWN_NAME, name, text, "compare with those that rosproxy status lists")
+        yield error(UNKNOWN_NAME, name, text, "compare with the names that rosproxy status lists")
     for domain in domains:
         yield from _name_in_domain(domain, name)
 
@@ -158,17 +162,19 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
             yield ok(
                 "service",
                 name,
-                f"served by {participant.guid_prefix} {participant_label(participant, is_inside)}",
+                f"served by participant {participant.guid_prefix} "
+                f"{participant_label(participant, is_inside)}",
             )
     for own_side, other_side, lacks in (
         (publishers, subscribers, "subscribes to"),
         (subscribers, publishers, "publishes"),
     ):
         if own_side and not other_side:
-            yield note("topic", name, f"nobody {lacks} it", "check the name, and that it runs")
+            text = f"no participant {lacks} {name}"
+            yield note("topic", name, text, "check the name; check that the other program runs")
     pairs = [(p, s) for p in publishers for s in subscribers]
     if pairs and all(p[1] is s[1] for p, s in pairs):
-        text = "all that have it are on one side, so that it does not pass the proxy"
+        text = "all publishers and subscribers are on one side, so no message passes the proxy"
         yield note("topic", name, text)
     troubled = {problem.subject for problem in domain_problems(domain) if problem.grave}
     mismatched = {(m.writer, m.reader) for m in domain.mismatches if m.name == name}
@@ -176,8 +182,8 @@ def _name_in_domain(domain: DomainStatus, name: str) -> Iterator[DoctorFinding]:
         guids = participant.guid_prefix, peer.guid_prefix
         if from_inside is not to_inside and guids not in mismatched and not troubled & {*guids}:
             text = (
-                f"{guids[0]} {participant_label(participant, from_inside)} to "
-                f"{guids[1]} {participant_label(peer, to_inside)}: they match"
+                f"the publisher {guids[0]} {participant_label(participant, from_inside)} and "
+                f"the subscription {guids[1]} {participant_label(peer, to_inside)} match"
             )
             yield ok("topic", name, text)
 
