@@ -82,7 +82,7 @@ def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named
         shown = page()["nodes"]
         assert shown[f"{the_proxy().name} /{node.node}"]["lane"] == "container"
         assert shown[f"{named.master_uri} master"]["lane"] == "robot"
-        assert "nobody subscribes to it" in text
+        assert "no node subscribes to /out" in text
 
         url = "http://127.0.0.1:11312/policy"
         body = '{"layers": [{"name": "a", "mode": "enforce", "rules": "deny everything"}]}'
@@ -117,7 +117,7 @@ def test_what_has_ended_is_nothing_wrong(process: Process, net: Inside, named: R
         asking.options = process.options
         wait_until(lambda: wrong(asking) == (0, []), 60, lambda: str(wrong(asking)))
         said = docker("exec", the_proxy().name, "rosproxy", "doctor")
-        assert "1 of 1 answer; those that have ended still hold" in said
+        assert "1 of 1 answer; ended nodes still hold" in said
     finally:
         process.stop()
         remove_proxies()
@@ -138,7 +138,7 @@ def test_a_removed_container_is_nothing_wrong(process: Process, net: Inside, nam
 
         docker("rm", "--force", node.name)
 
-        held = "1 of 1 answer; those that have ended still hold 1 port"
+        held = "1 of 1 answer; ended nodes still hold 1 port"
         doctor = ("exec", the_proxy().name, "rosproxy", "doctor")
         wait_until(lambda: held in docker(*doctor, check=False), 25, asking.logs)
         assert not [f for f in wrong(asking)[1] if node.node in str(f)]

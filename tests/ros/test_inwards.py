@@ -83,7 +83,7 @@ def test_who_wants_datagrams_alone_is_told_what_that_needs(lab: Lab) -> None:
     deaf = lab.node("roscpp", "c1", "sub", topic=topic, udp=1)
     deaf.wait_for("^ready")
     report = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
-    assert "if it wants UDP alone: --udp" in report, report
+    assert "If the subscriber accepts UDPROS only, set --udp" in report, report
     assert "got " not in deaf.output()
 
 

@@ -1,7 +1,7 @@
-"""A finding: what is well or wrong, and what mends it.
+"""A finding: what is right or wrong, and the fix.
 
-The doctor tells of findings when it is asked (`rosproxy.doctor`), a proxy of those about its own
-setting-up by itself (`rosproxy.app.self_check`).
+The doctor reports all findings on request (`rosproxy.doctor`). A proxy reports the findings about
+its own set-up by itself (`rosproxy.app.self_check`).
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import msgspec
 
 
 class Severity(IntEnum):
-    """How bad it is: an error keeps somebody from hearing somebody."""
+    """How bad a finding is. ERROR: at least one connection fails."""
 
     OK = 0
     INFO = 1
@@ -25,7 +25,7 @@ UNKNOWN_NAME = "unknown name"
 
 
 class DoctorFinding(msgspec.Struct, frozen=True):
-    """One result: of which ``check``, about which ``subject``, what, and what mends it."""
+    """A result of a ``check`` about a ``subject``: what is right or wrong, and what to do."""
 
     severity: Severity
     check: str

@@ -13,25 +13,34 @@ from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import listed, plural, quoted
 
+LOOPBACK_MEANING = "Other machines reach only themselves at this address"
+"""What a loopback address leads to, for findings."""
 FEW_FREE = 0.1
 """Share of the range that should be free at least."""
 
 HOST = "advertised host"
 RANGE = "published range"
-BY_ADDRESS = "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
+BY_ADDRESS = (
+    "set an address instead of the name: --advertise-host ADDRESS (ROSPROXY_ADVERTISE_HOST)"
+)
 _OF_THIS_HOST = (
-    "--advertise-host ADDRESS, the address of this host in the network of the robots "
+    "set the address of this host in the network of the robots: --advertise-host ADDRESS "
     "(ROSPROXY_ADVERTISE_HOST)"
 )
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
 """How the proxy's own try may end although outside gets through: NAT has no hairpin."""
 TEXT_BY_OUTCOME = {
-    "refused": "nothing listens there: the range is not published, or the host is another machine",
-    "silent": "no answer: a firewall drops it, or the host is not this one",
-    "unreachable": "there is no route to it",
-    "unresolvable": "the host name is unknown here",
-    "closed": "something takes the connection and drops it: published to another port or container",
-    "stranger": "something else answers there, not this proxy",
+    "refused": (
+        "connection refused. The range is not published, or the address is not that of this host"
+    ),
+    "silent": ("no answer. A firewall drops the packets, or the address is not that of this host"),
+    "unreachable": "there is no route to this address",
+    "unresolvable": "the host name can't be resolved here",
+    "closed": (
+        "the connection is accepted, but does not reach the proxy. The port is published to "
+        "another port or container"
+    ),
+    "stranger": "another program accepts the connection, not this proxy",
 }
 
 
@@ -42,14 +51,15 @@ def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iter
     """
     loopback = [address for address in addresses if is_loopback(address)]
     if is_loopback(host) and not all_here:
-        text = f"{host} is a loopback address: to every other machine it means that machine itself"
+        text = f"{host} is a loopback address. {LOOPBACK_MEANING}"
         yield error(HOST, HOST, text, _OF_THIS_HOST)
     elif not addresses:
         yield error(HOST, HOST, f"the host name {host} can't be resolved here", BY_ADDRESS)
     elif len(loopback) == len(addresses) and not all_here:
         text = (
-            f"{host} leads to {listed(loopback)} here, a loopback address (/etc/hosts of many "
-            "systems gives that to the host's own name): fine only if outside finds another address"
+            f"{host} leads to {listed(loopback)} here, a loopback address (in /etc/hosts, many "
+            "systems give their own name such an address). Outside must resolve the name to "
+            "another address"
         )
         yield warning(HOST, HOST, text, BY_ADDRESS)
 
@@ -94,48 +104,53 @@ def _is_reached(trial: PortProbe) -> bool | None:
 
 
 def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
-    """How many ports are left, and who else has some."""
+    """How many ports are free, and how many other programs hold."""
     used = ports.used
     free = ports.free
     blocked = ports.blocked
     larger_range = (
-        "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
-        "was refused"
+        "set a larger --port-range (ROSPROXY_PORT_RANGE), and publish the new range. rosproxy "
+        "status names the nodes and participants that got no port"
     )
     if blocked:
         first, _, last = ports.listen.partition("-")
-        text = f"{plural(blocked, 'port')} of the range {ports.listen} held by other programs"
+        text = f"other programs hold {plural(blocked, 'port')} of the range {ports.listen}"
         if ports.held_by:
             text += f": {'; '.join(ports.held_by)}"
-            fix = "give one of the two another --port-range (ROSPROXY_PORT_RANGE), published too"
+            fix = (
+                "set another --port-range (ROSPROXY_PORT_RANGE) for one of the proxies, and "
+                "publish the new range"
+            )
         else:
             sockets = quoted(f"sport >= :{first} and sport <= :{last}")
-            fix = f"ss -ltnp {sockets}; or another --port-range"
+            fix = f"find the programs: ss -ltnp {sockets}; or set another --port-range"
         yield warning("ports", "ports", text, fix)
     if not free:
-        text = f"none is free, {used} used: no further node gets in"
+        text = f"no port is free, {used} used. Further nodes get no port"
         yield error("ports", "ports", text, larger_range)
     elif free < FEW_FREE * (used + free + blocked):
-        yield warning("ports", "ports", f"only {free} left, {used} used", larger_range)
+        yield warning("ports", "ports", f"only {free} free, {used} used", larger_range)
     else:
-        text = f"{ports.listen} as {ports.advertise}, {used} used, {free} free"
+        text = f"{ports.listen}, advertised as {ports.advertise}: {used} used, {free} free"
         yield ok("ports", "ports", text)
 
 
 def _reached(host: str, from_proxy: str, from_master: str, target: str) -> DoctorFinding:
     """The finding where a try at free ports came through, the proxy's own or the master's."""
     if from_master == "ok":
-        aside = "" if from_proxy == "ok" else f" (the proxy itself does not, {from_proxy}: no harm)"
+        aside = (
+            "" if from_proxy == "ok" else f" (the proxy does not: {from_proxy}. This is no fault)"
+        )
         return ok(RANGE, RANGE, f"the master reaches {target}{aside}")
     if from_master == "unknown":
-        return ok(RANGE, RANGE, f"the proxy reaches {target}; the master could not be asked to try")
+        return ok(RANGE, RANGE, f"the proxy reaches {target}. The master could not be asked to try")
     text = (
-        f"{target}: reached from here, but not from the master's machine. There this host is known "
-        "as another machine or by another address, or a firewall is in between"
+        f"{target}: reached by the proxy, but not from the master's machine. There this host has "
+        "another address, or the name leads to another machine, or a firewall blocks the connection"
     )
     fix = (
-        "--advertise-host ADDRESS: this host as the master's machine knows it "
-        "(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz"
+        "set the address of this host as the master's machine sees it: --advertise-host ADDRESS "
+        "(ROSPROXY_ADVERTISE_HOST). Test on the master's machine: nc -vz"
     )
     # `target` ends with the last port that was tried.
     return error(RANGE, RANGE, text, f"{fix} {quoted(host)} {target.rpartition(' ')[2]}")
@@ -145,18 +160,22 @@ def _not_reached(
     host: str, ports: PortsStatus, from_proxy: str, from_master: str, target: str, is_uniform: bool
 ) -> DoctorFinding:
     published = quoted(f"{ports.advertise}:{ports.listen}")
-    fix = f"docker run -p {published}"
+    publish = f"docker run -p {published}"
     if from_proxy == "unresolvable":
         fix = BY_ADDRESS
     elif is_uniform:
-        fix += f", and let it through the firewall; or correct --advertise-host, now {quoted(host)}"
+        fix = (
+            f"publish the range: {publish}, and let the firewall accept it; or correct "
+            f"--advertise-host, now {quoted(host)}"
+        )
     else:
-        fix = f"publish the whole range: {fix}"
+        fix = f"publish the whole range: {publish}"
     text = f"{target}: {TEXT_BY_OUTCOME.get(from_proxy, from_proxy)}"
     if from_master == "missed":
-        return error(RANGE, RANGE, f"{text}. The master does not get through either", fix)
+        return error(RANGE, RANGE, f"{text}. A call from the master does not arrive either", fix)
     if from_proxy in _NO_WAY_BACK:
-        text += ". Or only the way back is missing; the master could not be asked to try"
+        text += ". Or only the proxy can't reach its own published ports, as with some NAT. "
+        text += "The master could not be asked to try"
         return warning(RANGE, RANGE, text, fix)
     return error(RANGE, RANGE, text, fix)
 
@@ -164,14 +183,19 @@ def _not_reached(
 def _by_udp(host: str, ports: PortsStatus, from_proxy: str, target: str) -> DoctorFinding:
     """The finding from a try by UDP; failing proves nothing where NAT has no way back.
 
-    Who outside does not get through is reported once somebody there is heard (`domain_problems`).
+    A participant outside that does not reach the range is reported once the proxy has heard its
+    announcement (`domain_problems`).
     """
     if from_proxy == "ok":
         return ok(RANGE, RANGE, f"the proxy reaches {target} by UDP")
     text = (
-        f"{target}: what the proxy sends there by UDP does not come back to it. Perhaps only the "
-        "way back is missing; perhaps the range is not published for UDP, or a firewall drops it"
+        f"{target}: datagrams from the proxy to this address do not arrive at the proxy. The "
+        "range is not published for UDP, or a firewall drops the datagrams. Or only the proxy "
+        "can't reach its own published ports, as with some NAT"
     )
     published = quoted(f"{ports.advertise}:{ports.listen}/udp")
-    fix = f"if nobody outside is heard: docker run -p {published}; is "
-    return note(RANGE, RANGE, text, f"{fix}--advertise-host {quoted(host)} this host?")
+    fix = (
+        f"if no participant outside is heard, publish the range: docker run -p {published}, and "
+        f"check that --advertise-host {quoted(host)} is this host"
+    )
+    return note(RANGE, RANGE, text, fix)

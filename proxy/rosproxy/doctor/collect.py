@@ -1,8 +1,8 @@
 """Gathering the facts for ``rosproxy doctor``: asks the proxy, the master and the nodes.
 
 First the proxy (`AdminClient`), which knows its nodes and whether its ports can be reached; then
-the master and nodes of ROS 1 (`graph_survey`). Of ROS 2 it asks who is on the networks inside
-(`domain_survey`). The rules judge what was found.
+the master and nodes of ROS 1 (`graph_survey`). For ROS 2 it asks the participants on the networks
+inside (`domain_survey`). The rules judge the facts.
 
 It changes nothing, apart from the short-lived parameter by which the proxy has the master try its
 ports (see `range_probe`). Names and addresses are tried from where it runs; that should be where
@@ -30,7 +30,7 @@ async def collect(
     names: tuple[str, ...] = (),
     master_address: str | None = None,
 ) -> DoctorFacts:
-    """Ask everybody, and change nothing.
+    """Ask the proxy, the master, the nodes and the participants, and change nothing.
 
     Without ``admin`` no proxy is asked, as from an outside machine. ``master_uri``,
     ``advertise_host`` and ``master_address`` count where the proxy doesn't answer; the last is the
@@ -80,7 +80,7 @@ async def _ask_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
 
 
 def _all_here(status: ProxyStatus) -> bool:
-    """Whether a proxy for ROS 2 alone has nobody outside but peers on loopback."""
+    """Whether a proxy serves ROS 2 only, and outside has only peers on loopback."""
     peers = [peer for domain in status.domains for peer in domain.peers]
     hosts = [target.host if (target := parse_host_port(peer)) else peer for peer in peers]
     lan_relays = [domain.lan_relay for domain in status.domains if domain.lan_relay]
@@ -90,10 +90,10 @@ def _all_here(status: ProxyStatus) -> bool:
 async def collect_running(
     status: ProxyStatus, admin: str, choose: Callable[[SystemState], tuple[str, ...]]
 ) -> DoctorFacts:
-    """What may be asked again and again: the master, all nodes, and those that have the names.
+    """The facts that may be asked again and again: of the master, of all nodes, and of some names.
 
-    ``choose`` picks the names from what the master knows. Nobody is asked to try the range, and few
-    are asked at once. Nodes say, too, how much they have counted (``getBusStats``).
+    ``choose`` picks the names from what the master knows. The range is not tried, and only a few
+    nodes are asked at once. Nodes also say how much they have counted (``getBusStats``).
     """
     host = status.settings.advertise_host
     master = status.master
@@ -108,7 +108,7 @@ async def collect_running(
 
 
 async def _survey(status: ProxyStatus) -> tuple[HeardParticipant, ...]:
-    """Who is on the networks inside, each participant once."""
+    """The participants on the networks inside, each one once."""
     domains = [domain.domain for domain in status.domains]
     networks = status.settings.inside_networks
     surveys = (asyncio.to_thread(ask_participants, network, domains) for network in networks)

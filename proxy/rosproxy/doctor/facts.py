@@ -22,18 +22,18 @@ from rosproxy.ros1.registry.graph import read_types
 
 
 class ReachOutcome(Enum):
-    """How an attempt to reach somebody ended."""
+    """How an attempt to reach a node, service or master ended."""
 
     ANSWERED = "answers"
     REFUSED = "connection refused"
     SILENT = "no answer"
-    STRANGER = "something else answers"
-    UNRESOLVABLE = "host name unknown"
+    STRANGER = "unexpected answer"
+    UNRESOLVABLE = "the host name can't be resolved here"
     UNTRIED = "not tried"
 
 
 class Attempt(msgspec.Struct, frozen=True):
-    """An attempt to reach somebody: how it ended and, in the words of the caller, why."""
+    """An attempt to reach a node, service or master: how it ended and, if known, why."""
 
     reach: ReachOutcome = ReachOutcome.UNTRIED
     reason: str = ""
@@ -130,7 +130,7 @@ class NodeFacts(msgspec.Struct, frozen=True):
 
 
 class SystemState(msgspec.Struct, frozen=True):
-    """The master's state: who publishes, subscribes to and provides what."""
+    """The master's state: the publishers, subscribers and providers by name."""
 
     publishers: dict[str, list[str]] = {}
     subscribers: dict[str, list[str]] = {}
@@ -138,7 +138,7 @@ class SystemState(msgspec.Struct, frozen=True):
 
     @property
     def topics(self) -> set[str]:
-        """All topics that anybody publishes or subscribes to."""
+        """All topics with a publisher or a subscriber."""
         return {*self.publishers, *self.subscribers}
 
     def sides(self, topic: str) -> list[str]:
@@ -235,7 +235,7 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     use simulated time. ``names`` are the nodes, topics and services that the user asked for;
     ``data_ports`` tells, by publisher and topic, where its subscribers have to connect to and
     whether that was reached from here. ``heard_participants`` are participants on the networks
-    inside. ``is_all_local``: of ROS 2 everybody outside is on this machine.
+    inside. ``is_all_local``: all participants outside are on this machine.
     """
 
     admin: str = ""

@@ -1,6 +1,6 @@
-"""What the master and the nodes of ROS 1 say: the graph, and who of it answers.
+"""What the master and the nodes of ROS 1 say: the graph, and which nodes answer.
 
-The master is asked for who publishes, subscribes to and provides what (``getSystemState``,
+The master is asked for all publishers, subscribers and services (``getSystemState``,
 ``lookupNode``); then every node whether it answers; then, where names were given, those nodes for
 their topics and connections (``getBusInfo``) and their data ports.
 """
@@ -123,7 +123,7 @@ class _Collector:
         return await self._ask_pid(HostPort(facts.advertise_host, port)) if port else Attempt()
 
     async def master_state(self, facts: DoctorFacts) -> DoctorFacts:
-        """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
+        """What the master knows, and which nodes answer. Raises Unreachable, MasterError."""
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
@@ -189,7 +189,7 @@ class _Collector:
         attempt, pid = await _attempt(self._nodes.call_node(target, WITHIN, "getPid"))
         if attempt.failed or isinstance(pid, int):
             return attempt
-        return Attempt(ReachOutcome.STRANGER, "its answer is not a node's")
+        return Attempt(ReachOutcome.STRANGER, "the answer is not that of a node")
 
     async def _ask_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
         """What a node says of itself, asked through the proxy if it is behind it."""
@@ -202,7 +202,7 @@ class _Collector:
             async with self._limit:
                 pubs, subs, bus = [await ask(slave, WITHIN, method) for method in methods]
                 at = time.monotonic()
-                # Not every library counts; who does not is asked for nothing else.
+                # Not every library counts; a node that does not is asked for nothing else.
                 _, stats = await _attempt(ask(slave, WITHIN, "getBusStats"))
         except (Unreachable, MasterError):
             return node
@@ -240,7 +240,7 @@ class _Collector:
             return Attempt(ReachOutcome.STRANGER, "no address")
         target = _reached_at(facts, provider)
         if target is None:
-            return Attempt(ReachOutcome.REFUSED, "its port is not held by a node")
+            return Attempt(ReachOutcome.REFUSED, "no node holds its port")
         header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
         return await _shake_hands(self._nodes.reach(target), header)
 
@@ -309,9 +309,9 @@ async def _attempt(question: Awaitable[Any]) -> tuple[Attempt, Any]:
         # The failure of the connection (`_failures_of`).
         if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
             return Attempt(ReachOutcome.SILENT), None
-        # Without the name of who was asked, which comes first; the finding has it already.
+        # Without the name of the node or master, which comes first; the finding has it already.
         reason = str(error).partition("\n")[0].partition(": ")[2][:200]
-        return Attempt(ReachOutcome.STRANGER, reason or "its answer can't be read"), None
+        return Attempt(ReachOutcome.STRANGER, reason or "the answer can't be read"), None
 
 
 async def _gather(

@@ -62,4 +62,4 @@ def _summary(findings: Sequence[DoctorFinding]) -> str:
     if len({f.fix for f in findings if f.severity >= Severity.WARNING}) == 1:
         return counts
     first = clean(worst[0].subject or worst[0].check)
-    return f"{counts} Begin with {first}: the others may follow from it."
+    return f"{counts} Begin with {first}: the other findings may follow from it."

@@ -137,7 +137,7 @@ async def test_a_misspelt_variable_is_told_with_the_one_that_was_meant(start_pro
     shown = await run("status", "--admin", f"http://{process.options['admin_bind']}")
     assert "ROSPROXY_PORT_RANG: is not a variable" in shown.out
     told = await run("doctor", ROSPROXY_PORT_RANG="1", ROSPROXY_ADMIN=process.options["admin_bind"])
-    assert "unset ROSPROXY_PORT_RANG, and set the one that was meant" in told.out
+    assert "unset ROSPROXY_PORT_RANG, and set the variable that was meant" in told.out
 
 
 KNOWN = ("ROSPROXY_PORT_RANGE", "ROSPROXY_ADMIN", "ROS_MASTER_URI", "ROS_DOMAIN_ID")

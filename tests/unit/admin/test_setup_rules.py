@@ -73,7 +73,7 @@ def test_no_try_proves_nothing() -> None:
 def test_another_proxy_on_the_range_is_named() -> None:
     ports = PortsStatus("1-9", "1-9", free=5, blocked=4, held_by=("another rosproxy (x)",))
     told = next(iter(few_ports(ports)))
-    assert "held by other programs: another rosproxy (x)" in told.text
+    assert "other programs hold 4 ports of the range 1-9: another rosproxy (x)" in told.text
     assert "another --port-range" in told.fix
 
 
@@ -81,5 +81,5 @@ def test_what_a_proxy_calls_its_range_is_no_command() -> None:
     """A proxy in hostile hands ended the quote that stood in the fix, and began a command."""
     ports = PortsStatus("1' ; touch pwned #-2", "1-9", free=5, blocked=4)
     told = next(iter(few_ports(ports)))
-    command = told.fix.partition("; or another --port-range")[0]
+    command = told.fix.removeprefix("find the programs: ").partition("; or set another")[0]
     assert shlex.split(command) == ["ss", "-ltnp", "sport >= :1' ; touch pwned # and sport <= :2"]

@@ -28,7 +28,7 @@ def test_the_worst_stands_last_each_with_what_mends_it() -> None:
         "ERROR    /talker: gone",
         "         > rosnode cleanup",
         "",
-        "2 errors, 1 warning. Begin with /talker: the others may follow from it.",
+        "2 errors, 1 warning. Begin with /talker: the other findings may follow from it.",
     ]
 
 

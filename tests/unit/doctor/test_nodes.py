@@ -58,7 +58,7 @@ def test_what_has_ended_is_no_node_that_does_not_answer(state: str) -> None:
     nameless = make_node(nodes=[], uri="http://10.0.0.5:40008/", port=45008, state=state)
     facts = make_facts(status=make_status(former, make_node(), nameless))
     assert [(f.severity, f.text) for f in check(facts) if f.subject != "nodes at the master"] == [
-        (Severity.OK, "1 of 1 answer; those that have ended still hold 2 ports for up to 30 s")
+        (Severity.OK, "1 of 1 answer; ended nodes still hold 2 ports for up to 30 s")
     ]
 
 
@@ -66,7 +66,7 @@ def test_a_node_whose_container_is_gone_is_no_fault() -> None:
     gone = make_node(nodes=["/other"], uri="http://10.0.0.5:40009/", port=45009, state="ended")
     findings = check(make_facts(status=make_status(gone, make_node())))
     assert [(f.severity, f.text) for f in findings if f.subject != "nodes at the master"] == [
-        (Severity.OK, "1 of 1 answer; those that have ended still hold 1 port for up to 30 s")
+        (Severity.OK, "1 of 1 answer; ended nodes still hold 1 port for up to 30 s")
     ]
 
 
@@ -90,7 +90,7 @@ def test_nobody_uses_the_proxy() -> None:
     finding = only(check(make_facts(status=make_status(), nodes={})))
     assert (finding.severity, finding.text) == (
         Severity.WARNING,
-        "none has registered through the proxy",
+        "no node has registered through the proxy",
     )
     assert "ROS_MASTER_URI=http://PROXY:11311" in finding.fix
 
@@ -107,7 +107,9 @@ def test_a_node_that_listens_on_loopback_only(host: str, state: str) -> None:
     finding = inside(uri=f"http://{host}:40001/", state=state)
     assert (finding.severity, finding.subject) == (Severity.ERROR, "/talker")
     assert "listens on loopback only" in finding.text
-    assert finding.fix.startswith("where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP=10.0.0.5;")
+    assert finding.fix.startswith(
+        "where the node runs: unset ROS_IP ROS_HOSTNAME, or set ROS_IP=10.0.0.5;"
+    )
 
 
 def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
@@ -119,11 +121,16 @@ def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
 @pytest.mark.parametrize(
     ("state", "severity", "text", "fix"),
     [
-        ("refused", Severity.ERROR, "10.0.0.5:40001 refuses connections", "unregisters it 30 s"),
+        (
+            "refused",
+            Severity.ERROR,
+            "10.0.0.5:40001 refuses connections",
+            "unregisters the node after 30 s",
+        ),
         ("silent", Severity.ERROR, "does not answer at 10.0.0.5:40001", "nc -vz 10.0.0.5 40001"),
-        ("failing", Severity.WARNING, "did not answer the last probe", "look again"),
+        ("failing", Severity.WARNING, "did not answer the last probe", "run the doctor again"),
         ("unverified", Severity.WARNING, "found at the master when the proxy started", "wait"),
-        ("cleaned", Severity.WARNING, "was unregistered", "restart it"),
+        ("cleaned", Severity.WARNING, "the proxy unregistered the node", "restart the node"),
     ],
 )
 def test_a_node_behind_the_proxy_that_does_not_answer(
@@ -152,12 +159,12 @@ def test_a_registration_with_a_port_that_nobody_holds() -> None:
     finding = only(check(make_facts(nodes=nodes)))
     assert (finding.check, finding.subject) == ("stale registration", "/old")
     assert "a port that no node holds any more" in finding.text
-    assert finding.fix == "rosnode cleanup (answer y)"
+    assert finding.fix == "run rosnode cleanup (answer y)"
 
 
 def test_a_registration_with_a_port_that_another_node_holds() -> None:
     nodes = by_name(NodeFacts("/old", "http://robot-host:45000/"))
-    assert "a port that /talker holds by now" in only(check(make_facts(nodes=nodes))).text
+    assert "a port that /talker holds now" in only(check(make_facts(nodes=nodes))).text
 
 
 def test_nodes_that_share_a_lease_are_sound() -> None:
@@ -178,7 +185,7 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
         (
             {"attempt": Attempt(ReachOutcome.STRANGER, "HTTP status 404")},
             Severity.ERROR,
-            "but gone: something else answers (HTTP status 404)",
+            "but gone: unexpected answer (HTTP status 404)",
             "rosnode cleanup (answer y)",
         ),
         (
@@ -191,8 +198,8 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
             {"uri": "http://laptop:4000/", "attempt": UNRESOLVABLE},
             Severity.ERROR,
             "the host name laptop can't be resolved here",
-            "ROS_IP=ADDRESS, then restart it; or make laptop known to proxy and inside nodes: "
-            "docker run --add-host laptop:ADDRESS",
+            "ROS_IP=ADDRESS, then restart the node; or make laptop known to the proxy and to all "
+            "inside nodes: docker run --add-host laptop:ADDRESS",
         ),
         (
             {"uri": "http://3f2a9c1b7d10:4000/", "attempt": UNRESOLVABLE},
@@ -203,7 +210,7 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
         (
             {"uri": "http://10.0.0.7:4000/", "addresses": ("10.0.0.7",)},
             Severity.WARNING,
-            "registered around it",
+            "but not through the proxy",
             "ROS_MASTER_URI=http://PROXY:11311",
         ),
         (
@@ -212,7 +219,7 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
             "registered through a rosproxy",
             "if this proxy had robot-host:47000 before",
         ),
-        ({"uri": ""}, Severity.ERROR, "no usable address for it: ''", "restart it"),
+        ({"uri": ""}, Severity.ERROR, "no usable address for this node: ''", "restart the node"),
     ],
 )
 def test_an_outside_node_that_cannot_be_reached(
@@ -234,7 +241,7 @@ def test_no_such_suspicion_where_the_master_is_in_that_network_too() -> None:
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
 def test_an_outside_node_that_calls_itself_loopback(host: str) -> None:
     finding = outside(uri=f"http://{host}:4000/")
-    assert "to every other machine that is the machine itself" in finding.text
+    assert "a loopback address. Other machines reach only themselves" in finding.text
     assert "ROS_IP=ADDRESS" in finding.fix
 
 
@@ -246,7 +253,7 @@ def test_loopback_is_fine_where_all_is_on_one_machine() -> None:
 def test_cleaning_up_is_no_advice_while_the_proxy_is_down() -> None:
     facts = without_proxy(nodes=by_name(talker(attempt=REFUSED)))
     finding = only(check(facts))
-    assert "on robot-host: rosproxy doctor" in finding.fix
+    assert "run rosproxy doctor on robot-host" in finding.fix
     assert "cleanup" not in finding.fix
 
 
@@ -255,11 +262,11 @@ def test_a_service_with_a_port_that_nobody_holds() -> None:
     uris = {"/add": "rosrpc://robot-host:45009", "/other": "rosrpc://192.168.0.9:4"}
     finding = only(check(make_facts(graph=graph, service_uris=uris)))
     assert (finding.subject, finding.check) == ("/listener", "stale registration")
-    assert "its service /add is registered as rosrpc://robot-host:45009" in finding.text
+    assert "the service /add is registered as rosrpc://robot-host:45009" in finding.text
 
 
 def test_simulated_time_without_a_clock() -> None:
-    assert "nobody publishes /clock" in only(check(make_facts(uses_simulated_time=True))).text
+    assert "no node publishes /clock" in only(check(make_facts(uses_simulated_time=True))).text
     graph = SystemState({"/clock": ["/talker"]}, {}, {})
     assert not faults(make_facts(uses_simulated_time=True, graph=graph))
 

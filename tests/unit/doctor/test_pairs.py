@@ -93,14 +93,14 @@ def test_without_a_graph_that_is_said() -> None:
 
 def test_a_name_that_nobody_knows() -> None:
     finding = only(check(["/chater"]))
-    assert finding.text.endswith("; there is /chatter")
+    assert finding.text.endswith("; similar names: /chatter")
     finding = only(check(["/listener2", "/nothing"])[:1])
     assert "/listener" in finding.text
 
 
 def test_a_name_without_its_namespace() -> None:
     graph = SystemState({"/robot1/scan": ["/talker"]}, {}, {})
-    assert "there is /robot1/scan" in only(check(["/scan"], graph=graph)).text
+    assert "similar names: /robot1/scan" in only(check(["/scan"], graph=graph)).text
 
 
 @pytest.mark.parametrize(
@@ -110,18 +110,18 @@ def test_a_name_without_its_namespace() -> None:
             SystemState(
                 {"/chatter": ["/talker"], "/ns/chatter": []}, {"/ns/chatter": ["/listener"]}
             ),
-            "published by /talker; nobody subscribes to it",
+            "published by /talker; no node subscribes to /chatter",
         ),
         (
             SystemState({"/ns/chatter": ["/talker"]}, {"/chatter": ["/listener"]}),
-            "subscribed to by /listener; nobody publishes it",
+            "subscribed to by /listener; no node publishes /chatter",
         ),
     ],
 )
 def test_a_topic_with_one_side_only(graph: SystemState, text: str) -> None:
     finding = only(check(["/chatter"], graph=graph))
     assert finding.text == text
-    assert finding.fix.startswith("there is also /ns/chatter: a namespace or remapping?")
+    assert finding.fix.startswith("compare with /ns/chatter, check namespaces and remappings; ")
 
 
 def test_the_lonely_topics_of_a_node_are_no_error() -> None:
@@ -180,15 +180,17 @@ def test_a_node_that_cannot_be_reached() -> None:
 
 def test_nodes_that_deny_what_the_master_says() -> None:
     giver = talker(report=SlaveReport())
-    assert "/talker says that it does not publish it" in apart(giver, listener()).text
+    assert "/talker is registered as a publisher, but does not" in apart(giver, listener()).text
     taker = listener(report=SlaveReport())
-    assert "/listener says that it is not subscribed" in apart(silent_talker(), taker).text
+    text = apart(silent_talker(), taker).text
+    assert "/listener is registered as a subscriber, but does not subscribe to /chatter" in text
 
 
 def test_types_that_differ() -> None:
     taker = listener(report=SlaveReport({}, {"/chatter": "std_msgs/Int32"}))
     finding = apart(silent_talker(), taker)
-    assert "types differ, std_msgs/String and std_msgs/Int32" in finding.text
+    assert "types differ: /talker publishes std_msgs/String, " in finding.text
+    assert "/listener subscribes to std_msgs/Int32" in finding.text
 
 
 def test_any_type_fits_all() -> None:
@@ -199,7 +201,7 @@ def test_any_type_fits_all() -> None:
 def test_a_subscriber_outside_that_does_not_come() -> None:
     finding = apart(silent_talker(), listener())
     assert "/listener has not connected to robot-host:45000" in finding.text
-    assert finding.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
+    assert finding.fix.startswith("test on the machine of /listener: nc -vz robot-host 45000")
 
 
 def subscriber_inside(**settings: str | bool) -> DoctorFinding:
@@ -213,10 +215,12 @@ def subscriber_inside(**settings: str | bool) -> DoctorFinding:
 def test_a_subscriber_inside_that_has_no_route_outwards() -> None:
     finding = subscriber_inside()
     assert (
-        "/listener, behind the proxy, has not connected to 192.168.0.9:5000 by itself"
+        "/listener, behind the proxy, has not connected to 192.168.0.9:5000 directly"
         in finding.text
     )
-    assert finding.fix.startswith("where /listener runs: nc -vz 192.168.0.9 5000; if there is no")
+    assert finding.fix.startswith(
+        "test where /listener runs: nc -vz 192.168.0.9 5000. If there is no"
+    )
     assert "--direction both" in finding.fix
 
 
@@ -224,7 +228,7 @@ def test_a_subscriber_inside_that_has_the_proxy_as_its_way() -> None:
     finding = subscriber_inside(direction="both")
     assert f"has not connected to the proxy's port for {OUTSIDE_URI}" in finding.text
     assert "--direction" not in finding.fix
-    assert "if it wants UDP alone: --udp" in finding.fix
+    assert "If the subscriber accepts UDPROS only, set --udp" in finding.fix
     assert "--udp" not in subscriber_inside(direction="both", udp=True).fix
 
 
@@ -237,16 +241,17 @@ def outside_pair(data_port: tuple[str, Attempt]) -> DoctorFinding:
 
 def test_a_data_port_that_cannot_be_reached() -> None:
     finding = outside_pair(("laptop:5000", Attempt(ReachOutcome.UNRESOLVABLE)))
-    assert "/talker gives laptop:5000 as its data port, host name unknown" in finding.text
+    text = "/talker gives laptop:5000 as its data port: the host name can't be resolved here"
+    assert text in finding.text
     assert "ROS_IP=ADDRESS" in finding.fix
     finding = outside_pair(("", Attempt(ReachOutcome.STRANGER, "no TCPROS address")))
-    assert "gives nothing as its data port" in finding.text
+    assert "gives no data port" in finding.text
     assert "(no TCPROS address)" in finding.text
 
 
 def test_a_data_port_on_loopback() -> None:
     finding = outside_pair(("127.0.0.1:5000", Attempt(ReachOutcome.ANSWERED)))
-    assert "which is loopback" in finding.text
+    assert "as its data port, a loopback address" in finding.text
 
 
 def test_what_is_left_is_the_message_definition() -> None:
@@ -271,7 +276,10 @@ def service(attempt: Attempt) -> DoctorFinding:
 def test_services() -> None:
     assert service(Attempt(ReachOutcome.ANSWERED)).severity is Severity.OK
     dead = service(Attempt(ReachOutcome.REFUSED))
-    assert dead.text == "/talker provides it at rosrpc://robot-host:45000: connection refused"
+    assert (
+        dead.text
+        == "/talker provides this service at rosrpc://robot-host:45000: connection refused"
+    )
     assert "rosnode cleanup" in dead.fix
     assert "ROS_IP" in service(Attempt(ReachOutcome.UNRESOLVABLE)).fix
 

@@ -38,7 +38,7 @@ def test_a_status_that_leaves_something_out() -> None:
     facts = make_facts(status=make_status(make_node(left_out=1234)))
     (whole, cut) = of("admin", facts)
     assert (whole.severity, cut.severity) == (Severity.OK, Severity.INFO)
-    assert "leaves 1234 names and entries out" in cut.text
+    assert "leaves out 1234 names and entries" in cut.text
 
 
 def test_no_proxy_answers() -> None:
@@ -73,7 +73,7 @@ def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
             make_master(
                 ReachOutcome.STRANGER, "HTTP status 404", uri="http://robot:11311/x", at_root=True
             ),
-            "not at the path /x (it knows only / and /RPC2)",
+            "not at the path /x. A ROS master answers only / and /RPC2",
             "--master-uri http://robot:11311/",
         ),
         (
@@ -90,7 +90,7 @@ def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
             make_master(
                 ReachOutcome.REFUSED, uri="http://localhost:11311", addresses=("127.0.0.1",)
             ),
-            "In a container localhost is the container itself",
+            "In a container, localhost is the container itself",
             "--master-uri http://ADDRESS:11311",
         ),
     ],
@@ -106,7 +106,7 @@ def test_the_master_answers_the_doctor_but_not_the_proxy() -> None:
     status = make_status(make_node(), master={"up": False, "error": "no answer in time"})
     finding = only(check(make_facts(status=status)))
     assert finding.severity is Severity.WARNING
-    assert "answers here, but the proxy says: no answer in time" in finding.text
+    assert "answers the doctor, but the proxy reports: no answer in time" in finding.text
 
 
 def test_a_proxy_that_has_not_asked_its_master_yet_is_sound() -> None:
@@ -115,7 +115,7 @@ def test_a_proxy_that_has_not_asked_its_master_yet_is_sound() -> None:
 
 
 def test_a_master_that_keeps_its_state_to_itself() -> None:
-    assert "does not tell its state" in only(check(make_facts(graph=None))).text
+    assert "does not list its nodes and topics" in only(check(make_facts(graph=None))).text
 
 
 def test_a_loopback_address_is_advertised() -> None:
@@ -144,29 +144,29 @@ def test_an_advertised_name_that_is_unknown_here() -> None:
     ("outcome", "severity", "text", "fix"),
     [
         (("ok", "ok"), Severity.OK, "the master reaches robot-host, port 45001 and 45099", ""),
-        (("ok", "unknown"), Severity.OK, "the master could not be asked", ""),
-        (("refused", "ok"), Severity.OK, "(the proxy itself does not, refused: no harm)", ""),
+        (("ok", "unknown"), Severity.OK, "The master could not be asked", ""),
+        (("refused", "ok"), Severity.OK, "(the proxy does not: refused. This is no fault)", ""),
         (
             ("ok", "missed"),
             Severity.ERROR,
-            "reached from here, but not from the master's machine",
+            "reached by the proxy, but not from the master's machine",
             "nc -vz robot-host 45099",
         ),
         (
             ("refused", "missed"),
             Severity.ERROR,
-            "The master does not get through either",
-            "docker run -p 46000-46099:45000-45099, and let it through the firewall",
+            "A call from the master does not arrive either",
+            "docker run -p 46000-46099:45000-45099, and let the firewall accept it",
         ),
-        (("silent", "missed"), Severity.ERROR, "a firewall drops it", "docker run -p"),
-        (("refused", "unknown"), Severity.WARNING, "only the way back is missing", "docker run -p"),
-        (("closed", "unknown"), Severity.ERROR, "takes the connection and drops it", "docker run"),
-        (("stranger", "missed"), Severity.ERROR, "something else answers there", "docker run -p"),
+        (("silent", "missed"), Severity.ERROR, "A firewall drops the packets", "docker run -p"),
+        (("refused", "unknown"), Severity.WARNING, "as with some NAT. The master", "docker run -p"),
+        (("closed", "unknown"), Severity.ERROR, "does not reach the proxy", "docker run"),
+        (("stranger", "missed"), Severity.ERROR, "another program accepts", "docker run -p"),
         (
             ("unresolvable", "missed"),
             Severity.ERROR,
-            "the host name is unknown here",
-            "--advertise-host ADDRESS instead of a name",
+            "the host name can't be resolved here",
+            "set an address instead of the name: --advertise-host ADDRESS",
         ),
     ],
 )
@@ -183,7 +183,7 @@ def test_tries_at_the_published_range(
 def test_a_range_that_is_published_in_part() -> None:
     facts = make_facts(probe=probes(("ok", "ok"), ("refused", "missed")))
     finding = only(of("published range", facts))
-    assert finding.text.startswith("robot-host, port 45099: nothing listens there")
+    assert finding.text.startswith("robot-host, port 45099: connection refused")
     assert finding.fix == "publish the whole range: docker run -p 45000-45099:45000-45099"
 
 
@@ -199,8 +199,8 @@ def test_no_port_is_left_to_try() -> None:
 @pytest.mark.parametrize(
     ("ports", "severity", "text"),
     [
-        ({"used": 100, "free": 0}, Severity.ERROR, "none is free, 100 used"),
-        ({"used": 95, "free": 5}, Severity.WARNING, "only 5 left, 95 used"),
+        ({"used": 100, "free": 0}, Severity.ERROR, "no port is free, 100 used"),
+        ({"used": 95, "free": 5}, Severity.WARNING, "only 5 free, 95 used"),
         ({"used": 90, "free": 10}, Severity.OK, "90 used, 10 free"),
     ],
 )
@@ -212,7 +212,7 @@ def test_how_many_ports_are_left(ports: dict[str, int], severity: Severity, text
 
 def test_ports_that_other_programs_hold() -> None:
     finding = only(of("ports", make_facts(status=make_status(ports={"blocked": 1, "free": 99}))))
-    assert finding.text == "1 port of the range 45000-45099 held by other programs"
+    assert finding.text == "other programs hold 1 port of the range 45000-45099"
     assert "ss -ltnp 'sport >= :45000 and sport <= :45099'" in finding.fix
 
 

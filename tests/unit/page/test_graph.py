@@ -143,7 +143,7 @@ def test_a_node_that_is_wrong_is_the_first_cause_on_its_links() -> None:
     document = made(judged(nodes=by_name(silent, gone)))
     assert document["nodes"]["/listener"]["state"] == "broken"
     assert document["links"][LINK]["text"].startswith("/listener: registered as ")
-    assert document["links"][LINK]["fix"] == "rosnode cleanup (answer y)"
+    assert document["links"][LINK]["fix"] == "run rosnode cleanup (answer y)"
 
 
 def counted(*rounds: tuple[float, int, int]) -> tuple[Measures, DoctorFacts]:
@@ -206,7 +206,7 @@ def test_a_service_of_a_node_that_is_wrong_has_the_fix() -> None:
     link = made(judge(facts), status)["links"]["service /add /talker "]
     assert link["state"] == "broken"
     assert link["text"].startswith("/talker: does not answer")
-    assert link["fix"].startswith("restart it")
+    assert link["fix"].startswith("restart the node")
 
 
 def test_what_every_node_has_is_quiet() -> None:

@@ -7,7 +7,7 @@ from rosproxy.doctor.rules import proxy as proxy_rules
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
-    """Everything that can be said: about the proxy, the nodes, and the names asked for."""
+    """All findings: about the proxy, the nodes, and the names asked for."""
     domains = participant.check(facts)
     if not facts.proxy.settings.for_ros1:
         return [*proxy_rules.alive(facts), *proxy_rules.setup(facts), *domains]
@@ -15,7 +15,7 @@ def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
 
 
 def diagnose_running(facts: DoctorFacts) -> list[DoctorFinding]:
-    """What can be said again and again while the proxy runs, but for pairs and domains."""
+    """The findings of a running proxy that are made again and again, without pairs and domains."""
     if not facts.proxy.settings.for_ros1:
         return []
     return [*proxy_rules.running(facts), *node.check(facts)]
@@ -23,4 +23,4 @@ def diagnose_running(facts: DoctorFacts) -> list[DoctorFinding]:
 
 def unknown_variable(name: str, text: str) -> DoctorFinding:
     """A variable that is set where the doctor runs and that nothing reads."""
-    return warning("variable", name, text, f"unset {name}, and set the one that was meant")
+    return warning("variable", name, text, f"unset {name}, and set the variable that was meant")

@@ -7,6 +7,7 @@ from ipaddress import ip_network
 from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, ok, warning
+from rosproxy.admin.setup_rules import LOOPBACK_MEANING
 from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
@@ -21,7 +22,7 @@ TWO_PROXIES = "two proxies"
 _ENDED = ("refused", "silent", "failing", "cleaned")
 FIRST_NODE = 10.0
 """Seconds after the proxy's start in which no node is missed: an operator starts it with them."""
-CLEANUP = "rosnode cleanup (answer y)"
+CLEANUP = "run rosnode cleanup (answer y)"
 # The host name of a container that was given none (moby daemon/container.go).
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
 
@@ -38,7 +39,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _cause_first(findings: list[DoctorFinding]) -> list[DoctorFinding]:
-    """While two proxies take each other's nodes away, none that seems dead is cleaned up."""
+    """Findings that advise no clean-up while two proxies take each other's nodes away."""
     first = [f for f in findings if f.check == TWO_PROXIES]
     if not first:
         return findings
@@ -54,12 +55,12 @@ def _counts(facts: DoctorFacts, findings: list[DoctorFinding]) -> Iterator[Docto
         text = f"{states.count('ok')} of {len(states)} answer"
         if ended:
             ports = f"{plural(len(ended), 'port')} for up to {facts.proxy.settings.linger:g} s"
-            text += f"; those that have ended still hold {ports}"
+            text += f"; ended nodes still hold {ports}"
         yield ok(INSIDE, "inside nodes", text)
     elif facts.status is not None:
-        text = "none has registered through the proxy"
+        text = "no node has registered through the proxy"
         report = warning if facts.proxy.uptime >= FIRST_NODE else note
-        yield report(INSIDE, "inside nodes", text, _start_inside(facts, "them"))
+        yield report(INSIDE, "inside nodes", text, _start_inside(facts, "the nodes"))
     if facts.graph is not None:
         faulty = {f.subject for f in findings if f.severity is Severity.ERROR}
         faults = len(faulty & set(facts.nodes))
@@ -95,29 +96,36 @@ def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterato
     state = node.state
     address = node.address
     if state in ("refused", "silent", "failing", "ok") and _only_on_loopback(node):
-        text = f"calls itself {node.uri} and so listens on loopback only: nobody can reach it"
-        host = address.rpartition(":")[0]
-        fix = f"where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP={quoted(host)}; then restart it"
+        text = (
+            f"registered as {node.uri}, so the node listens on loopback only. Nodes in other "
+            "containers or on other machines can't connect"
+        )
+        host = quoted(address.rpartition(":")[0])
+        fix = f"where the node runs: unset ROS_IP ROS_HOSTNAME, or set ROS_IP={host}; "
+        fix += "then restart the node"
         yield error(INSIDE, name, text, fix)
     elif state == "refused":
         after = facts.proxy.settings.cleanup_after
-        cleanup = f"the proxy unregisters it {after:g} s after that" if after else CLEANUP
+        cleanup = f"the proxy unregisters the node after {after:g} s" if after else CLEANUP
         text = f"has ended without unregistering: {address} refuses connections"
-        yield error(INSIDE, name, text, f"restart it; {cleanup}")
+        yield error(INSIDE, name, text, f"restart the node; without a restart, {cleanup}")
     elif state == "failing":
         text = f"did not answer the last probe at {address}"
-        yield warning(INSIDE, name, text, "look again in some seconds")
+        yield warning(INSIDE, name, text, "run the doctor again in some seconds")
     elif state == "silent":
-        text = f"does not answer at {address}: it hangs, or something drops the packets"
+        text = f"does not answer at {address}: the node hangs, or the network drops the packets"
         host, _, port = address.rpartition(":")
-        fix = f"restart it; from the proxy: nc -vz {quoted(host)} {quoted(port)}"
+        fix = f"restart the node; test from the proxy: nc -vz {quoted(host)} {quoted(port)}"
         yield error(INSIDE, name, text, fix)
     elif state == "unverified":
         text = f"was found at the master when the proxy started; {address} has not answered yet"
-        yield warning(INSIDE, name, text, "wait some seconds, then restart it")
+        yield warning(INSIDE, name, text, "wait some seconds, then restart the node")
     elif state == "cleaned":
-        text = f"did not answer at {address} and was unregistered; it is taken back if it answers"
-        yield warning(INSIDE, name, text, "restart it")
+        text = (
+            f"did not answer at {address}, so the proxy unregistered the node. If the node "
+            "answers, the proxy registers it again"
+        )
+        yield warning(INSIDE, name, text, "restart the node")
     elif state == "ok":
         yield from _namesakes(facts, node, name)
 
@@ -134,10 +142,10 @@ def _namesakes(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[
     registered = facts.nodes.get(name)
     if registered and registered.uri and registered.uri != node.advertised_uri:
         text = (
-            f"two nodes have this name: the master has {registered.uri}, "
-            f"behind the proxy {node.uri}"
+            f"two nodes have this name: one is registered at the master as {registered.uri}, the "
+            f"other runs behind the proxy as {node.uri}"
         )
-        yield error(INSIDE, name, text, "give one another name: __name:=OTHER")
+        yield error(INSIDE, name, text, "start one of the two with another name: __name:=OTHER")
 
 
 def _registered(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -150,12 +158,14 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     lease = facts.lease(node.slave)
     if lease is None and _is_of_another_proxy(facts, node):
         text = (
-            f"is alive as {node.uri}, and this proxy knows no such node: another rosproxy "
-            "advertises the same host and ports, and outside reaches now the one, now the other"
+            f"is alive as {node.uri}, but this proxy knows no such node: another rosproxy "
+            "advertises the same host and ports. Outside reaches sometimes this proxy, sometimes "
+            "the other"
         )
         fix = (
-            "end one of the two proxies, or give it another --port-range (ROSPROXY_PORT_RANGE), "
-            "published as well. No rosnode cleanup: it would unregister nodes that are alive"
+            "stop one of the two proxies; or set another --port-range (ROSPROXY_PORT_RANGE) for "
+            "one, and publish the new range. Do not run rosnode cleanup: it unregisters nodes that "
+            "are alive"
         )
         yield error(TWO_PROXIES, node.name, text, fix)
     elif lease is None:
@@ -163,8 +173,8 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
         yield error(STALE, node.name, text, CLEANUP)
     elif node.name not in lease.nodes:
         holder = ", ".join(lease.nodes) or lease.uri
-        text = f"registered as {node.uri}, a port that {holder} holds by now"
-        yield error(STALE, node.name, text, f"restart it, or {CLEANUP}")
+        text = f"registered as {node.uri}, a port that {holder} holds now"
+        yield error(STALE, node.name, text, f"restart the node, or {CLEANUP}")
 
 
 def _is_of_another_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
@@ -177,24 +187,25 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     slave = node.slave
     reach = node.attempt.reach
     if slave is None:
-        text = f"the master gives no usable address for it: {node.uri!r}"
-        yield error(OUTSIDE, node.name, text, "restart it")
+        text = f"the master gives no usable address for this node: {node.uri!r}"
+        yield error(OUTSIDE, node.name, text, "restart the node")
     elif node.attempt.failed and node.inside:
         text = f"registered through a rosproxy as {node.uri}: {reach.value}"
         yield error(OUTSIDE, node.name, text, _fix_proxied(facts, node, slave))
     # With the master on loopback, too, all of ROS is on this machine, where that is right.
     elif is_loopback(slave.host) and not (local_master(facts) and not node.attempt.failed):
-        text = f"registered as {node.uri}: to every other machine that is the machine itself"
+        text = f"registered as {node.uri}, a loopback address. {LOOPBACK_MEANING}"
         fix = (
-            "where it runs: ROS_IP=ADDRESS with its address in the network of the master "
-            "(and no ROS_HOSTNAME=localhost), then restart it"
+            "where the node runs: set ROS_IP=ADDRESS, the address of that machine in the network "
+            "of the master, and unset ROS_HOSTNAME; then restart the node"
         )
         yield error(OUTSIDE, node.name, text, fix)
     elif reach is ReachOutcome.UNRESOLVABLE:
         yield _unresolvable(facts, node, slave)
     elif reach is ReachOutcome.SILENT:
-        text = f"no answer at {node.uri}: it hangs, or its machine is off or cut off"
-        fix = f"from here: nc -vz {quoted(slave.host)} {slave.port}; if it is gone: {CLEANUP}"
+        text = f"no answer at {node.uri}: the node hangs, or its machine is off or cut off"
+        fix = f"test from here: nc -vz {quoted(slave.host)} {slave.port}; if the node is gone, "
+        fix += CLEANUP
         yield error(OUTSIDE, node.name, text, fix)
     elif node.attempt.failed:
         reason = f" ({node.attempt.reason})" if node.attempt.reason else ""
@@ -202,8 +213,8 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
         yield error(STALE, node.name, text, CLEANUP)
     elif _past_the_proxy(facts, node):
         text = (
-            f"registered as {node.uri}, in an inside network: if it is meant to be behind the "
-            "proxy, it has registered around it, and outside can't reach it"
+            f"registered as {node.uri}, an address in an inside network, but not through the "
+            "proxy. If the node belongs behind the proxy, outside can't reach it"
         )
         yield warning(OUTSIDE, node.name, text, _start_inside(facts))
 
@@ -215,8 +226,8 @@ def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> Docto
         return error(OUTSIDE, node.name, text, _start_inside(facts))
     host = quoted(slave.host)
     fix = (
-        f"where it runs: ROS_IP=ADDRESS, then restart it; or make {host} known to proxy and "
-        f"inside nodes: docker run --add-host {host}:ADDRESS"
+        f"where the node runs: set ROS_IP=ADDRESS, then restart the node; or make {host} known to "
+        f"the proxy and to all inside nodes: docker run --add-host {host}:ADDRESS"
     )
     return error(OUTSIDE, node.name, text, fix)
 
@@ -225,16 +236,17 @@ def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
     """Cleaning up would lose nodes that a proxy takes back when it starts again."""
     host = quoted(slave.host)
     if node.attempt.reach is ReachOutcome.UNRESOLVABLE:
-        return f"start its proxy with --advertise-host ADDRESS instead of the name {host}"
+        return f"start the node's proxy with --advertise-host ADDRESS instead of the name {host}"
     if facts.status is None:
         return (
-            f"on {host}: rosproxy doctor. Does the proxy run there, does the firewall let "
-            "its ports through? Started again with the same ports it takes its nodes back"
+            f"run rosproxy doctor on {host}. Check that the proxy runs there, and that the "
+            "firewall accepts its ports. A proxy that starts again with the same ports takes its "
+            "nodes back"
         )
     return (
-        f"if this proxy had {quoted(str(slave))} before, start it with its old --advertise-host "
-        "and --port-range, or restart the node; if it is of another proxy, look there; else "
-        f"{CLEANUP}"
+        f"if this proxy had {quoted(str(slave))} before, start the proxy with its old "
+        "--advertise-host and --port-range, or restart the node. If the node belongs to another "
+        f"proxy, check that proxy. Else {CLEANUP}"
     )
 
 
@@ -248,13 +260,13 @@ def _past_the_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
     return any(is_inside(address, apart) for address in node.addresses)
 
 
-def _start_inside(facts: DoctorFacts, pronoun: str = "it") -> str:
-    port = facts.proxy.settings.master_port
-    return f"start {pronoun} with ROS_MASTER_URI=http://PROXY:{port}, the proxy's address inside"
+def _start_inside(facts: DoctorFacts, nodes: str = "the node") -> str:
+    uri = f"http://PROXY:{facts.proxy.settings.master_port}"
+    return f"start {nodes} with ROS_MASTER_URI={uri} (PROXY: the proxy's address inside)"
 
 
 def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    """Services that are registered with a port of this proxy which nobody holds."""
+    """Services that are registered with a port of this proxy that no node holds."""
     for service, uri in facts.service_uris.items():
         provider = parse_service_uri(uri)
         if facts.is_ours(provider) and not facts.lease(provider):
@@ -262,12 +274,13 @@ def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
             # `_leased` tells of the other proxy already.
             if subject in facts.nodes and _is_of_another_proxy(facts, facts.nodes[subject]):
                 continue
-            text = f"its service {service} is registered as {uri}, a port that no node holds"
-            yield error(STALE, subject, text, f"restart it, or {CLEANUP}")
+            text = f"the service {service} is registered as {uri}, a port that no node holds"
+            yield error(STALE, subject, text, f"restart the node, or {CLEANUP}")
 
 
 def _clock(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.uses_simulated_time and facts.graph and not facts.graph.publishers.get("/clock"):
-        text = "/use_sim_time is true and nobody publishes /clock: nodes wait for the time"
-        fix = "rosparam set /use_sim_time false and restart them; or start what gives the clock"
+        text = "/use_sim_time is true, but no node publishes /clock. The nodes wait for the time"
+        fix = "start the node that publishes /clock; or run rosparam set /use_sim_time false, and "
+        fix += "restart the nodes"
         yield warning("time", "", text, fix)

@@ -5,6 +5,7 @@ from difflib import get_close_matches
 
 from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome
+from rosproxy.doctor.rules.node import CLEANUP
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, quoted, size
@@ -18,7 +19,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if not facts.names:
         return
     if facts.graph is None:
-        text = "nothing can be said: the master does not answer"
+        text = "not checked: the doctor got no list of nodes and topics from the master"
         yield note(PAIR, ", ".join(facts.names), text)
         return
     scope = facts.scope
@@ -28,9 +29,9 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     yield from (_service(facts, service) for service in scope.services)
     together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
     if scope.named_nodes and len(together) > 1 and not scope.pairs:
-        text = "none publishes what another of them subscribes to"
+        text = "no topic in common: none of these publishes a topic to which another subscribes"
         nodes = " ".join(map(quoted, together))
-        fix = f"compare: rosnode info {nodes}; look for namespaces and remappings"
+        fix = f"compare: rosnode info {nodes}; check namespaces and remappings"
         yield error(PAIR, " and ".join(together), text, fix)
 
 
@@ -40,7 +41,7 @@ def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     alike = get_close_matches(name, names, 3, 0.7)
     # /scan was asked for, and there is /robot/scan: a namespace was left out.
     alike += [n for n in names if n.endswith(name) and n not in alike][:3]
-    hint = f"; there is {listed(alike)}" if alike else ""
+    hint = f"; similar names: {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
     fix = "compare with rosnode list and rostopic list; check namespaces and remappings"
     return error(UNKNOWN_NAME, name, text, fix)
@@ -50,11 +51,15 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
     graph = facts.system
     published = bool(graph.publishers.get(topic))
     verb, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
-    text = f"{verb} by {listed(graph.sides(topic))}; nobody {lacks} it"
+    text = f"{verb} by {listed(graph.sides(topic))}; no node {lacks} {topic}"
     topics = sorted(graph.topics - {topic})
     alike = [t for t in topics if t.rpartition("/")[2] == topic.rpartition("/")[2]]
-    fix = f"there is also {listed(map(quoted, alike))}: a namespace or remapping? " if alike else ""
-    fix += f"rostopic info {quoted(topic)}; after a restart of roscore, restart the nodes outside"
+    fix = (
+        f"run rostopic info {quoted(topic)}; after a restart of roscore, restart the nodes outside"
+    )
+    if alike:
+        shown = listed(map(quoted, alike))
+        fix = f"compare with {shown}, check namespaces and remappings; {fix}"
     return (error if topic in facts.names else note)(PAIR, topic, text, fix)
 
 
@@ -108,16 +113,18 @@ def _why(
     wanted = subscriber.report.subscribes.get(topic) if subscriber.report else ANY
     if offered is None:
         return (
-            f"{publisher.name} says that it does not publish it",
+            f"{publisher.name} is registered as a publisher, but does not publish {topic}",
             f"restart {quoted(publisher.name)}",
         )
     if wanted is None:
         return (
-            f"{subscriber.name} says that it is not subscribed to it",
+            f"{subscriber.name} is registered as a subscriber, but does not subscribe to {topic}",
             f"restart {quoted(subscriber.name)}",
         )
     if ANY not in (offered, wanted) and offered != wanted:
-        return f"types differ, {offered} and {wanted}", "use the same message type on both sides"
+        text = f"types differ: {publisher.name} publishes {offered}, "
+        text += f"{subscriber.name} subscribes to {wanted}"
+        return text, "use the same message type on both sides"
     return _why_no_transport(facts, topic, publisher, subscriber)
 
 
@@ -135,52 +142,55 @@ def _why_no_transport(
     target = parse_host_port(address)
     restart = f"restart {quoted(subscriber.name)}"
     if attempt.failed:
-        description = (
-            f"{publisher.name} gives {address or 'nothing'} as its data port, {attempt.reach.value}"
-        )
-        set_ip = "ROS_IP=ADDRESS and no firewall, then restart it"
-        set_ip = f"where {quoted(publisher.name)} runs: {set_ip}"
-        return f"{description} ({attempt.reason})" if attempt.reason else description, set_ip
+        given = f"gives {address} as its data port" if address else "gives no data port"
+        text = f"{publisher.name} {given}: {attempt.reach.value}"
+        fix = "set ROS_IP=ADDRESS, let the firewall accept connections, then restart the node"
+        fix = f"where {quoted(publisher.name)} runs: {fix}"
+        return f"{text} ({attempt.reason})" if attempt.reason else text, fix
     elsewhere = not facts.is_ours(publisher.slave) and not local_master(facts)
     if target and is_loopback(target.host) and elsewhere:
-        text = f"{publisher.name} gives {address} as its data port, which is loopback"
-        return text, f"where {quoted(publisher.name)} runs: ROS_IP=ADDRESS, then restart it"
+        text = f"{publisher.name} gives {address} as its data port, a loopback address"
+        fix = "set ROS_IP=ADDRESS, then restart the node"
+        return text, f"where {quoted(publisher.name)} runs: {fix}"
     if facts.is_ours(publisher.slave) and not facts.is_ours(subscriber.slave) and publisher.slave:
         slave = publisher.slave
         return (
-            f"{publisher.name} is behind the proxy and fine; "
+            f"{publisher.name}, behind the proxy, has no fault. "
             f"{subscriber.name} has not connected to {slave}",
-            f"on the machine of {quoted(subscriber.name)}: "
+            f"test on the machine of {quoted(subscriber.name)}: "
             f"nc -vz {quoted(slave.host)} {slave.port}; then {restart}",
         )
     if facts.is_ours(subscriber.slave) and not facts.is_ours(publisher.slave):
         return _why_not_from_inside(facts, address, publisher, subscriber)
-    text = "both answer and their types fit; perhaps their message definitions differ (md5sum)"
-    return text, f"look into the log of {quoted(subscriber.name)}; {restart}"
+    text = "both nodes answer and the types match. Perhaps the message definitions differ (md5sum)"
+    return text, f"read the log of {quoted(subscriber.name)}; {restart}"
 
 
 def _why_not_from_inside(
     facts: DoctorFacts, address: str, publisher: NodeFacts, subscriber: NodeFacts
 ) -> tuple[str, str]:
     """Why a subscriber behind the proxy has not connected to a publisher that is well."""
-    text = f"{publisher.name} is fine; {subscriber.name}, behind the proxy, has not connected to"
-    differ = "or their message definitions differ (md5sum)"
-    log = f"look into the log of {quoted(subscriber.name)}"
+    text = (
+        f"{publisher.name} has no fault. {subscriber.name}, behind the proxy, has not connected to"
+    )
+    differ = "or the message definitions differ (md5sum)"
+    log = f"read the log of {quoted(subscriber.name)}"
     if facts.proxy.settings.direction == "both":
         text = f"{text} the proxy's port for {publisher.uri}, {differ}"
         fix = f"{log} and of the proxy; restart {quoted(subscriber.name)}"
         if not facts.proxy.settings.udp:
-            fix += "; if it wants UDP alone: --udp (label rosproxy.udp=true, spec.udp: true)"
+            fix += ". If the subscriber accepts UDPROS only, set --udp (label rosproxy.udp=true, "
+            fix += "spec.udp: true)"
         return text, fix
     target = parse_host_port(address)
     test = f"a connection to {quoted(publisher.uri)}"
     if target:
         test = f"nc -vz {quoted(target.host)} {target.port}"
     return (
-        f"{text} {address or publisher.uri} by itself, {differ}",
-        f"where {quoted(subscriber.name)} runs: {test}; if there is no route outwards, the proxy "
-        "can be the way: --direction both (label rosproxy.direction=both, spec.direction: Both); "
-        f"else {log}",
+        f"{text} {address or publisher.uri} directly, {differ}",
+        f"test where {quoted(subscriber.name)} runs: {test}. If there is no route outwards, set "
+        "--direction both (label rosproxy.direction=both, spec.direction: Both). "
+        f"Else {log}",
     )
 
 
@@ -188,11 +198,11 @@ def _service(facts: DoctorFacts, service: str) -> DoctorFinding:
     uri = facts.service_uris.get(service, "")
     attempt = facts.services.get(service, Attempt())
     providers = listed(facts.system.services.get(service, ()))
-    text = f"{providers} provides it at {uri}: {attempt.reach.value}"
+    text = f"{providers} provides this service at {uri}: {attempt.reach.value}"
     if not attempt.failed:
         return ok(PAIR, service, text)
     shown = listed(map(quoted, facts.system.services.get(service, ())))
-    fix = f"restart {shown}; if it is gone: rosnode cleanup"
+    fix = f"restart {shown}; if the node is gone, {CLEANUP}"
     if attempt.reach is ReachOutcome.UNRESOLVABLE:
-        fix = f"where {shown} runs: ROS_IP=ADDRESS, then restart it"
+        fix = f"where {shown} runs: set ROS_IP=ADDRESS, then restart the node"
     return error(PAIR, service, text, fix)

@@ -10,7 +10,7 @@ from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import duration, quoted
 
-_OTHER_URI = "give the real master's address: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
+_OTHER_URI = "set the address of the real master: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -40,19 +40,22 @@ def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         up = duration(facts.status.uptime)
         yield ok("admin", "proxy", f"rosproxy {facts.status.version} at {facts.admin}, up {up}")
         if missing := left_out(facts.status):
-            text = f"its status leaves {missing} names and entries out, of which nothing is found"
-            yield note("admin", "proxy", text, "rosproxy status shows which container has so many")
+            text = f"the bounded status leaves out {missing} names and entries. The doctor does "
+            text += "not check these"
+            fix = "run rosproxy status to see which container has so many"
+            yield note("admin", "proxy", text, fix)
     elif facts.admin_error:
-        text = f"{facts.admin_error}. All other findings were made without it"
-        fix = "docker ps; docker logs CONTAINER; docker exec CONTAINER rosproxy doctor"
+        text = f"{facts.admin_error}. All other findings are made without the proxy"
+        fix = "check that the proxy runs: docker ps; docker logs CONTAINER. Then run "
+        fix += "docker exec CONTAINER rosproxy doctor"
         yield error("admin", "proxy", text, fix)
 
 
 def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     master = facts.master
     if master is None:
-        text = "not checked: no address is known"
-        yield note("master", "master", text, "give --master-uri (ROS_MASTER_URI)")
+        text = "not checked: the address of the master is unknown"
+        yield note("master", "master", text, "set --master-uri (ROS_MASTER_URI)")
     elif master.is_this_proxy:
         text = f"{master.uri} leads back to this proxy itself"
         yield error("master", "master", text, _OTHER_URI)
@@ -63,12 +66,12 @@ def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         yield ok("master", "master", f"{master.uri} answers{trip}")
         status = facts.proxy.master
         if not status.up and status.error:
-            text = f"{master.uri} answers here, but the proxy says: {status.error}"
-            fix = "wait some seconds; if it stays, run this where the proxy runs"
+            text = f"{master.uri} answers the doctor, but the proxy reports: {status.error}"
+            fix = "wait some seconds. If the finding stays, run the doctor where the proxy runs"
             yield warning("master", "master", text, fix)
         if facts.graph is None:
-            text = f"{master.uri} answers, but does not tell its state"
-            yield error("master", "master", text, "rosnode list")
+            text = f"{master.uri} answers, but does not list its nodes and topics"
+            yield error("master", "master", text, "test the master: rosnode list")
 
 
 def _unanswered(master: MasterFacts) -> tuple[str, str]:
@@ -82,24 +85,24 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
         case ReachOutcome.UNRESOLVABLE:
             text = f"{uri}: the host name {host} can't be resolved here"
             add_host = f"docker run --add-host {quoted(host)}:ADDRESS, in Kubernetes hostAliases"
-            return text, f"{add_host}; or {by_address}"
+            return text, f"add the name: {add_host}; or set the address: {by_address}"
         case ReachOutcome.STRANGER if master.at_root:
-            text = f"a master answers there, but not at the path {split_uri.path}"
+            text = f"a ROS master answers at this port, but not at the path {split_uri.path}"
             return (
-                f"{uri}: {text} (it knows only / and /RPC2)",
-                f"--master-uri {quoted(f'http://{split_uri.netloc}/')}",
+                f"{uri}: {text}. A ROS master answers only / and /RPC2",
+                f"set --master-uri {quoted(f'http://{split_uri.netloc}/')}",
             )
         case ReachOutcome.STRANGER:
-            text = f"{uri}: what answers there is no ROS master ({master.attempt.reason})"
+            text = f"{uri}: the program that answers is no ROS master ({master.attempt.reason})"
             return text, _OTHER_URI
         case ReachOutcome.REFUSED if is_loopback(host):
-            text = f"{uri} refuses connections. In a container {host} is the container itself"
-            return text, f"{by_address} with an address of the master's machine"
+            text = f"{uri} refuses connections. In a container, {host} is the container itself"
+            return text, f"set the address of the master's machine: {by_address}"
         case ReachOutcome.REFUSED:
             text = f"{uri} refuses connections: no roscore runs there"
-            return text, f"on {quoted(host)}: roscore -p {port}; or {_OTHER_URI}"
-    text = "its machine is down or cut off, a firewall drops it, or the address is wrong"
-    fix = f"from here: nc -vz {quoted(host)} {port}; on {quoted(host)}: rosnode list"
+            return text, f"start roscore on {quoted(host)}: roscore -p {port}; or {_OTHER_URI}"
+    text = "the machine is off or cut off, a firewall drops the packets, or the address is wrong"
+    fix = f"test from here: nc -vz {quoted(host)} {port}; test on {quoted(host)}: rosnode list"
     return f"{uri} does not answer: {text}", fix
 
 
@@ -107,8 +110,8 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     host = facts.advertise_host
     if not host:
         if facts.admin_error:
-            fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
-            yield note(HOST, HOST, "not checked: it is not known", fix)
+            fix = "set --advertise-host (ROSPROXY_ADVERTISE_HOST)"
+            yield note(HOST, HOST, "not checked: the advertised host is unknown", fix)
         return
     probes = facts.probe.probes if facts.probe else ()
     if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
@@ -155,9 +158,10 @@ def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if not attempt.failed:
         yield ok(check, check, text)
     elif facts.probe and any(probe.from_proxy == "ok" for probe in facts.probe.probes):
-        yield error(check, check, text, f"docker run -p {port}:{port}")
+        yield error(check, check, text, f"publish the port: docker run -p {port}:{port}")
     else:
-        text += ". From here that proves little: no port of this host was reached"
+        text += ". This proves little, since no port of this host was reached from here"
         host = quoted(facts.advertise_host)
-        fix = f"docker run -p {port}:{port}; to try outside: nc -vz {host} {port}"
+        fix = f"publish the port: docker run -p {port}:{port}; "
+        fix += f"test from outside: nc -vz {host} {port}"
         yield warning(check, check, text, fix)
