@@ -107,7 +107,7 @@ class _Collector:
         attempt, _ = await _attempt(self._master.call_master("getPid"))
         trip = time.monotonic() - started
         # The words of a proxy that is called by itself (`MasterApi._refuse_loop`).
-        looped = "leads back to the proxy itself" in attempt.reason
+        looped = "leads back to the proxy" in attempt.reason
         master = MasterFacts(uri, attempt, addresses, is_this_proxy=looped, round_trip=trip)
         # rosmaster answers at / and /RPC2 alone (xmlrpc.server, rpc_paths): a URI with another path
         # looks as if no master was there.
