@@ -17,6 +17,7 @@ from rosproxy.ros2.protocol.rtps import (
     require_size,
     source_vendor,
     submessages,
+    walk_submessages,
 )
 
 MOST_OF_USERS = 16
@@ -114,7 +115,7 @@ def may_be_discovery(datagram: bytes) -> bool:
     """
     try:
         nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
-        for count, (kind, _, body) in enumerate(submessages(datagram)):
+        for count, (kind, _, body) in enumerate(walk_submessages(datagram)):
             if count >= MOST_OF_USERS or (
                 kind not in nameless and _names_built_in(datagram, kind, body)
             ):

@@ -19,6 +19,7 @@ those of versions and vendors that it does not know among them.
 import struct
 from collections.abc import Iterable, Iterator
 from enum import IntEnum
+from functools import lru_cache
 
 import msgspec
 
@@ -244,8 +245,17 @@ def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
     return bytes(changed)
 
 
-def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
-    """Each submessage's id, flags and body.
+@lru_cache(maxsize=4)
+def submessages(datagram: bytes) -> tuple[tuple[int, int, Span], ...]:
+    """Each submessage's id, flags and body. Raises RtpsError as `walk_submessages` does.
+
+    Discovery is looked at ten times in a row, so the last results are kept.
+    """
+    return tuple(walk_submessages(datagram))
+
+
+def walk_submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
+    """Each submessage's id, flags and body, one after the other.
 
     Raises RtpsError if a length leads outside, is none that all read alike, or an INFO_DST is too
     short: so what is kept of a message can be read again later.
