@@ -9,6 +9,7 @@ that reason for some minutes.
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
@@ -80,7 +81,7 @@ class Refusals:
     """Tells of refusals; ``now`` is the monotonic clock."""
 
     def __init__(self, metrics: Metrics, problems: Problems, now: Callable[[], float]) -> None:
-        self._metrics = metrics
+        self._of_reason = cache(metrics.refused.labels)
         self._problems = problems
         self._now = now
         self._logged_at: dict[tuple[str, str], float] = {}
@@ -89,7 +90,7 @@ class Refusals:
 
     def note(self, reason: str, source: str, text: str) -> None:
         """Tell that something from a source was refused, and why."""
-        self._metrics.refused.labels(reason).inc()
+        self._of_reason(reason).inc()
         now = self._now()
         key = reason, source
         span = self._spans.setdefault(reason, _Span(now, now))

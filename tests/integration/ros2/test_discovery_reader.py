@@ -9,7 +9,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_rates import Standing
 from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.discovery.fair_queue import MOST_OF_SOURCE, OVERHEAD
-from rosproxy.ros2.servers.discovery_reader import ROUND, DiscoveryReader
+from rosproxy.ros2.servers.discovery_reader import LONGEST_ROUND, ROUND, DiscoveryReader
 
 
 def reading(
@@ -56,6 +56,22 @@ async def test_short_datagrams_share_a_round() -> None:
         reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     await asyncio.sleep(0)
     assert len(names) == 20
+
+
+async def test_a_round_is_longer_after_much_has_come() -> None:
+    """With rounds of one length, receiving from a crowd took all the time, and all was late."""
+    reader = DiscoveryReader()
+    names = list[str]()
+    count = ROUND // OVERHEAD
+    for _ in range(4 * count):
+        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
+    await asyncio.sleep(0)
+    assert len(names) == 4 * count
+    for _ in range(2 * LONGEST_ROUND // OVERHEAD):
+        reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
+    names.clear()
+    await asyncio.sleep(0)
+    assert len(names) == LONGEST_ROUND // OVERHEAD
 
 
 async def test_what_comes_while_none_waits_is_read_at_once() -> None:

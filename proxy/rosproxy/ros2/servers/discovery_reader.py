@@ -15,6 +15,13 @@ from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue
 ROUND = 8 * 1024
 """Bytes that are read and sent in a round. The longest datagram has a round of its own, of 5 ms."""
 
+LONGEST_ROUND = 64 * 1024
+PER_RECEIVED = 512
+"""Bytes of a round for each datagram that has come since the last one, up to `LONGEST_ROUND`. To
+read so many takes about as long as to receive a datagram. With rounds of one length, a crowd of
+sockets leaves no time to read what they receive (receive livelock; Mogul, Ramakrishnan: TOCS 1997).
+"""
+
 Read = Callable[[], Sequence[Outgoing]]
 """Reads a datagram, sends what follows from it, and returns that."""
 
@@ -28,6 +35,8 @@ class DiscoveryReader:
         self._round: asyncio.Handle | None = None
         self._spent = 0
         """Bytes that were read and sent in this round."""
+        self._received = 0
+        """Datagrams that have come since this round."""
 
     def read(self, source: str, standing: Standing, size: int, read: Read) -> bool:
         """Read a datagram of so many bytes now if none waits, or when the turn of its source comes.
@@ -45,6 +54,7 @@ class DiscoveryReader:
 
         Return False if it is lost.
         """
+        self._received += 1
         has_room = self._queue.put(source, standing, read, size)
         self._schedule()
         return has_room
@@ -63,8 +73,10 @@ class DiscoveryReader:
     def _begin_round(self) -> None:
         self._round = None
         self._spent = 0
+        budget = max(ROUND, min(self._received * PER_RECEIVED, LONGEST_ROUND))
+        self._received = 0
         try:
-            while self._spent < ROUND and (waiting := self._queue.pop()):
+            while self._spent < budget and (waiting := self._queue.pop()):
                 led_to = _size_of(waiting.item())
                 self._queue.charge(waiting.source, led_to)
                 self._spent += waiting.size + led_to
