@@ -177,7 +177,7 @@ def _refusal(alias: str, places: Iterable[tuple[str, str]], facts: _NameFacts) -
     former = next((facts.former[place] for place in places if place in facts.former), "")
     if not former or is_allowed_by_administrator(alias, facts.settings):
         return ""
-    return f"container {former} had the name, and may come back"
+    return f"container {former} had the name, and may return"
 
 
 def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
@@ -191,35 +191,39 @@ def _problems(claim: _Claim, common: _Claim | None) -> Iterator[Problem]:
             continue
         host = ALIAS if common and _has_name(common, key) else proxy_name(key)
         for member in _seekers(claimant, claim.network, claim.alias):
-            fix = f"set ROS_MASTER_URI=http://{host}:{master(key).port}"
+            fix = f"ROS_MASTER_URI=http://{host}:{master(key).port}"
             if MASTER_URI not in member.container.labels:
                 # Without it a variable that names a proxy leaves open which master is meant.
                 fix += f" and the label {MASTER_URI}={key.master_uri}"
             text = (
-                f"looks for its proxy by the name {claim.alias}, but {_obstacle(claim, key, fix)}"
+                f"the nodes look for the proxy by the name {claim.alias}, but "
+                f"{_obstacle(claim, key, fix)}"
             )
             yield Problem(f"container {member.container.name}", text, fatal=False)
 
 
 def _obstacle(claim: _Claim, key: Key, fix: str) -> str:
-    """What keeps a proxy from a name, and what the user or the administrator can do."""
+    """What keeps a proxy from a name, and what the user or the administrator can do.
+
+    ``fix`` is the variable to set, and perhaps a label.
+    """
     if claim.refusal and not claim.containers:
         return (
             f"labels may not give a proxy that name on network {claim.network}: {claim.refusal}. "
-            "Its nodes go around their proxy. Start the operator with --allow-alias "
-            f"{claim.alias}, or {fix}"
+            "So the nodes bypass the proxy. Start the operator with --allow-alias "
+            f"{claim.alias}, or set {fix}"
         )
     holders = [f"container {name}" for name in claim.containers]
     rivals = {*claim.holders, claim.owner or key} - {key}
     holders += [_holder(claim, rival) for rival in sorted(rivals)]
     return (
-        f"on network {claim.network} {listed(holders)} answers to it, so its nodes go around "
-        f"their proxy: {fix}"
+        f"on network {claim.network} that name belongs to {listed(holders)}. So the nodes bypass "
+        f"the proxy. Set {fix}"
     )
 
 
 def _has_name(claim: _Claim, key: Key) -> bool:
-    """Whether a proxy, and nobody else, answers to the name, or will."""
+    """Whether the proxy answers to the name, or will, and no other proxy does."""
     return key == claim.owner and len(claim.holders) <= 1
 
 

@@ -131,9 +131,9 @@ def _before_uplink(observed: HostState, uplink: str) -> set[str]:
 def _bad_network(name: str, uplink: str) -> Problem:
     return Problem(
         f"network {name}",
-        f"can't be joined: its name sorts before that of the uplink network {uplink}, so the "
-        "engine would move the proxy's published ports to it: give it another name, or start the "
-        "operator with an --uplink that sorts first",
+        f"proxies can't join this network: its name sorts before the name of the uplink network "
+        f"{uplink}, so the engine would move the published ports of the proxies there. Create the "
+        "network under another name, or start the operator with an --uplink that sorts first",
     )
 
 
@@ -141,19 +141,20 @@ def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
     """Warn the containers whose proxy is not as their labels ask."""
     for wanted in desired:
         winners = [m.container.name for m in wanted.members if m.data_plane == wanted.data_plane]
+        rival = f"container {winners[0]}" if winners else "an exited container"
         for member in wanted.members:
             if member.udp and wanted.direction == "out":
                 yield Problem(
                     f"container {member.container.name}",
-                    f"label {UDP}=true is ignored: datagrams from outside need both directions; "
-                    f"add the label {DIRECTION}=both, or take this one off",
+                    f"label {UDP}=true is ignored: datagrams from outside need both directions. "
+                    f"Add the label {DIRECTION}=both, or remove the label {UDP}",
                     fatal=False,
                 )
             if member.data_plane not in (None, wanted.data_plane):
                 yield Problem(
                     f"container {member.container.name}",
-                    f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves "
-                    f"{next(iter(winners), 'another one')}, which asks for {wanted.data_plane}; "
-                    "give both the same",
+                    f"label {DATA_PLANE}={member.data_plane} is ignored: the proxy also serves "
+                    f"{rival}, whose label asks for {wanted.data_plane}. Give both containers the "
+                    "same value",
                     fatal=False,
                 )

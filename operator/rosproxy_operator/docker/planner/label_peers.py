@@ -33,9 +33,9 @@ def with_bounded_peers(
         else:
             named[member.key] = peers
     text = (
-        f"label {PEERS} is ignored: its proxy takes {MOST_OF_PROXY} peers of the labels of all its "
-        "containers, and others name fewer. Name fewer, or give the operator common ones by "
-        "--ros2-peer"
+        f"label {PEERS} is ignored: a proxy takes at most {MOST_OF_PROXY} peers from all labels of "
+        "its containers, and ignores the labels with the most peers. Name fewer peers, or start "
+        "the operator with --ros2-peer for common peers"
     )
     return (
         tuple(replace(m, peers=frozenset()) if m in ignored else m for m in members),

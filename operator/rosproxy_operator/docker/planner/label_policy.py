@@ -41,8 +41,9 @@ def with_bounded_rules(
         rules[key] += len(member.policy)
         layers[key] += 1
     text = (
-        f"label {POLICY}: its proxy can't hold its rules besides those of others (at most "
-        f"{MOST_RULES} of all together): join some by globs, here or there"
+        f"label {POLICY}: the container gets no proxy, since the containers of one proxy have too "
+        f"many rules together (at most {MOST_RULES} rules in {MOST_LAYERS} policies). Join rules "
+        "by globs, in this label or in the labels of the other containers"
     )
     return (
         tuple(member for member in members if member not in crowded),

@@ -94,19 +94,19 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
     image must at least have the user and the command of one.
     """
     if not has_own_name(own, name):
-        return f"its name is not {_name(own)}"
+        return f"the name is not {_name(own)}"
     user = HELPER_USER if own.role in _HELPERS else USER
     if making.user != user:
-        return f"its user is not {user}"
+        return f"the user is not {user}"
     if own.role == ROLE_FLUSH and making.command != flush_command(own.key, own.range):
-        return "its command is not the operator's"
+        return "the command is not the operator's"
     command = _COMMANDS.get(own.role, making.command)
     of_image = own.role == ROLE_PROXY and making.image == image_id
     # What a redirect runs ends with its rules: they are in its fingerprint, and so in its name.
     actual = making.command[:1] if own.role == ROLE_REDIRECT else making.command
     is_former = own.role == ROLE_LAN_RELAY and actual == _FORMER_COMMAND
     if actual != command and not of_image and not is_former:
-        return f"its command is not {' '.join(command)}"
+        return f"the command is not {' '.join(command)}"
     odd = {
         ROLE_SANDBOX: _odd_sandbox(own, making.host),
         ROLE_PROXY: _odd_proxy(making.host),
@@ -114,7 +114,7 @@ def forgery_reason(own: OwnLabels, name: str, making: CreationFacts, image_id: s
         ROLE_REDIRECT: _odd_redirect(making.host),
         ROLE_FLUSH: _odd_flush(making.host),
     }
-    return next((f"its HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
+    return next((f"HostConfig.{name} is not the operator's" for name in odd[own.role]), "")
 
 
 def _name(own: OwnLabels) -> str:

@@ -164,9 +164,10 @@ def unresolved_master(host: str) -> str:
     An address in its place is no fix: nodes that have one in ROS_MASTER_URI go around the proxy.
     """
     return (
-        f"the name {host} can't be resolved where the operator runs: let it know the name, and "
-        f"change nothing else: a line 'ADDRESS {host}' in /etc/hosts of this host; an operator in "
-        f"a container: docker run --add-host {host}:ADDRESS (Compose: extra_hosts)"
+        f"the operator can't resolve the host name {host}. Add the line 'ADDRESS {host}' to "
+        "/etc/hosts of this host; if the operator runs in a container, start that container with "
+        f"docker run --add-host {host}:ADDRESS (Compose: extra_hosts). Do not replace the name by "
+        "an address"
     )
 
 

@@ -220,7 +220,7 @@ class Engine:
             udp_ports=box.udp,
             started_at=box.started_at,
             exit_code=box.exit_code,
-            forged="" if box.own or read_own(box.labels) is None else "its name is not its own",
+            forged="" if box.own or read_own(box.labels) is None else "the name is not its own",
         )
 
     # what the operator does

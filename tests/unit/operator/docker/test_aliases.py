@@ -78,29 +78,29 @@ def test_names_of_a_lan_need_no_option(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("kubernetes.default.svc", "neither one word nor in"),
-        ("kubernetes.default.svc.cluster.local", "those of a cluster's services"),
-        ("db.cluster.local", "those of a cluster's services"),
-        ("cluster.local", "those of a cluster's services"),
-        ("pypi.org", "neither one word nor in"),
-        ("robot.example.com", "neither one word nor in"),
-        ("gitlab.corp", "neither one word nor in"),
+        ("kubernetes.default.svc", "has a dot, and is not in"),
+        ("kubernetes.default.svc.cluster.local", "belong to services of a Kubernetes cluster"),
+        ("db.cluster.local", "belong to services of a Kubernetes cluster"),
+        ("cluster.local", "belong to services of a Kubernetes cluster"),
+        ("pypi.org", "has a dot, and is not in"),
+        ("robot.example.com", "has a dot, and is not in"),
+        ("gitlab.corp", "has a dot, and is not in"),
         ("notlan", ""),
-        ("robot.notlan", "neither one word nor in"),
-        ("host.docker.internal", "neither one word nor in"),
-        ("gateway.docker.internal", "neither one word nor in"),
-        ("metadata.google.internal", "neither one word nor in"),
-        ("home.arpa.evil.com", "neither one word nor in"),
-        ("rosproxy-operator", "the operator's own"),
-        ("rosproxy-robot-1f3a9c-ports.lan", "the operator's own"),
-        ("pypi.org.", "no host name"),
-        ("db.", "no host name"),
-        (".db", "no host name"),
-        ("a..lan", "no host name"),
-        ("-db", "no host name"),
-        ("db-", "no host name"),
-        ("d" * 64, "no host name"),
-        (".".join(["d" * 63] * 4), "no host name"),
+        ("robot.notlan", "has a dot, and is not in"),
+        ("host.docker.internal", "has a dot, and is not in"),
+        ("gateway.docker.internal", "has a dot, and is not in"),
+        ("metadata.google.internal", "has a dot, and is not in"),
+        ("home.arpa.evil.com", "has a dot, and is not in"),
+        ("rosproxy-operator", "reserved for the operator"),
+        ("rosproxy-robot-1f3a9c-ports.lan", "reserved for the operator"),
+        ("pypi.org.", "not a host name"),
+        ("db.", "not a host name"),
+        (".db", "not a host name"),
+        ("a..lan", "not a host name"),
+        ("-db", "not a host name"),
+        ("db-", "not a host name"),
+        ("d" * 64, "not a host name"),
+        (".".join(["d" * 63] * 4), "not a host name"),
     ],
 )
 def test_names_of_services_need_an_option(name: str, why: str) -> None:
@@ -115,7 +115,7 @@ def test_the_administrator_says_which_names_there_are() -> None:
     assert alias_refusal("arm1", settings) == ""
     for name in ("robot", "robot.lan", "lab.example", "robot.lab.example.evil.com"):
         assert alias_refusal(name, settings) == (
-            "it matches none of the operator's --allow-alias (*.lab.example, arm?)"
+            "the name matches no --allow-alias of the operator (*.lab.example, arm?)"
         )
     own = allowing("arm", master_uri="http://Robot.example.com:11311")
     assert alias_refusal("robot.example.com", own) == ""
@@ -137,9 +137,9 @@ def test_a_refused_name_costs_that_name_alone() -> None:
     assert aliases(plan) == {"rosproxy", proxy_name(key)}
     (text,) = told(plan)
     assert text == (
-        "looks for its proxy by the name robot.example.com, but labels may not give a proxy that "
-        "name on network app: it is neither one word nor in .local, .lan, .home, .localdomain, "
-        ".home.arpa, .test. Its nodes go around their proxy. Start the operator with "
+        "the nodes look for the proxy by the name robot.example.com, but labels may not give a "
+        "proxy that name on network app: the name has a dot, and is not in .local, .lan, .home, "
+        ".localdomain, .home.arpa, .test. So the nodes bypass the proxy. Start the operator with "
         "--allow-alias robot.example.com, or set ROS_MASTER_URI=http://rosproxy:11311 and the "
         f"label rosproxy.master-uri={uri}"
     )
@@ -195,7 +195,7 @@ def test_the_name_of_a_container_that_is_gone_stays_its_own() -> None:
     plan = look(hostile(env=DB.master_uri), memory=before.memory)
     assert "db" not in aliases(plan)
     (text,) = told(plan)
-    assert "container x-db-1 had the name, and may come back. Its nodes" in text
+    assert "container x-db-1 had the name, and may return. So the nodes" in text
     assert "--allow-alias db," in text
     allowed = look(hostile(env=DB.master_uri), memory=before.memory, settings=allowing("db"))
     assert "db" in aliases(allowed)
@@ -214,7 +214,7 @@ def test_a_name_on_another_network_of_a_neighbour_is_taken() -> None:
     db = container("db", {}, ("back",))
     plan = look(hostile(env=DB.master_uri), web, db)
     assert "db" not in aliases(plan)
-    assert "container db (network back) answers to it" in told(plan)[0]
+    assert "that name belongs to container db (network back)." in told(plan)[0]
     assert "db" in aliases(look(hostile(), db))
 
 
@@ -224,7 +224,7 @@ def test_a_name_with_the_name_of_a_network_is_that_of_a_container_there() -> Non
     db = container("db", {}, ("lan",))
     plan = look(hostile(uri, uri), db)
     assert "db.lan" not in aliases(plan)
-    assert "container db answers to it" in told(plan)[0]
+    assert "that name belongs to container db." in told(plan)[0]
     gone = look(hostile(uri, uri), memory=plan.memory)
     assert "db.lan" not in aliases(gone)
     assert "db.lan" in aliases(look(hostile(uri, uri)))

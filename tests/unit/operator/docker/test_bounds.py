@@ -95,10 +95,10 @@ def test_a_master_that_is_not_allowed() -> None:
         members, (problem,) = read_members(observed(talker), allowing("robot", "arm*:11311"))
         assert members == ()
         assert (problem.subject, problem.fatal) == ("container talker", True)
-        source = "its variable ROS_MASTER_URI" if env else "label rosproxy.master-uri"
+        source = "variable ROS_MASTER_URI" if env else "label rosproxy.master-uri"
         assert problem.text == (
-            f"{source}='http://api.example.com:8080' matches none of the operator's --allow-master "
-            "(robot:*, arm*:11311): if it is one, start the operator with --allow-master "
+            f"{source}='http://api.example.com:8080' matches no --allow-master of the operator "
+            "(robot:*, arm*:11311). To allow this master, start the operator with --allow-master "
             "api.example.com:8080"
         )
 
@@ -115,7 +115,7 @@ def test_by_default_no_master_is_below_port_1024(uri: str) -> None:
     member, problems = read(master_uri=uri)
     assert member is None
     (problem,) = problems
-    assert "names a port below 1024, where no ROS master is" in problem.text
+    assert "has a port below 1024, which is not allowed for a master by default" in problem.text
     assert f"--allow-master {uri.removeprefix('http://')}" in problem.text
     assert read(allowing(uri), master_uri=uri)[0] is not None
 
@@ -148,8 +148,8 @@ def test_more_ports_than_labels_may_ask_for(option: int, label: int, gets: int) 
     member, told = asked(replace(SETTINGS, max_ports=option), ports=str(label))
     assert member.ports == gets
     assert told == (
-        f"label rosproxy.ports={label} asks for more than labels may: its proxy gets {gets}; "
-        f"start the operator with --max-ports {label} if it is to have them"
+        f"label rosproxy.ports={label} exceeds the bound of labels: the proxy gets {gets} ports. "
+        f"To allow more, start the operator with --max-ports {label}"
     )
     seen = observed(container(labels={**ENABLED, "rosproxy.ports": str(label)}))
     plan = planned(seen, replace(SETTINGS, max_ports=option), DockerMemory(), 0.0)
@@ -183,8 +183,8 @@ def test_a_data_plane_that_is_not_allowed() -> None:
     member, told = asked(data_plane="kernel")
     assert member.data_plane is None
     assert told == (
-        "label rosproxy.data-plane=kernel asks for what labels may not: its proxy is as without "
-        "it; start the operator with --allow-data-plane kernel if it is to have that"
+        "label rosproxy.data-plane=kernel is ignored: the operator does not allow this value in "
+        "labels. To allow it, start the operator with --allow-data-plane kernel"
     )
     assert asked(replace(SETTINGS, allow_data_plane=("kernel",)), data_plane="kernel")[1] == ""
 
@@ -207,7 +207,7 @@ def test_slave_control(option: SlaveControl, label: str | None, gets: str, told:
     settings = replace(SETTINGS, slave_control=option)
     labels = {"slave_control": label} if label else {}
     text = asked(settings, **labels)[1]
-    assert ("--slave-control is master, which labels can't widen" in text) == told
+    assert ("--slave-control master, and a label can only narrow this option" in text) == told
     names = {"rosproxy.slave-control": label} if label else {}
     others = container("other")
     seen = observed(container(labels={**ENABLED, **names}), others)
@@ -219,7 +219,7 @@ def test_slave_control(option: SlaveControl, label: str | None, gets: str, told:
 def test_a_slave_control_that_can_not_be() -> None:
     member, (problem,) = read(slave_control="nobody")
     assert member is None
-    assert problem.text.startswith("label rosproxy.slave-control='nobody' is none of any, master:")
+    assert problem.text.startswith("label rosproxy.slave-control='nobody' is none of any, master.")
 
 
 def test_who_has_exited_keeps_the_control_narrow_for_the_grace() -> None:

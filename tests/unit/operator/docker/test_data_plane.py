@@ -96,8 +96,8 @@ def test_who_is_outvoted_is_told() -> None:
         ("container d", False),
     ]
     assert plan.problems[0].text == (
-        "label rosproxy.data-plane=copy is ignored: its proxy also serves b, which asks for "
-        "kernel; give both the same"
+        "label rosproxy.data-plane=copy is ignored: the proxy also serves container b, whose "
+        "label asks for kernel. Give both containers the same value"
     )
 
 

@@ -122,7 +122,7 @@ def test_a_network_that_would_take_the_published_ports_is_not_joined(network: Ne
         return
     assert desired[KEY].networks == {"app"}
     assert [problem.subject for problem in problems] == [f"network {network.name}"]
-    assert "its name sorts before that of the uplink network 0-rosproxy" in problems[0].text
+    assert "its name sorts before the name of the uplink network 0-rosproxy" in problems[0].text
 
 
 def test_an_early_network_that_nobody_asks_for_is_no_problem() -> None:
@@ -176,8 +176,9 @@ def test_who_looks_for_the_masters_name_then_is_told() -> None:
     assert named(seen).problems == (
         Problem(
             "container talker",
-            "looks for its proxy by the name robot, but on network app container robot answers to "
-            "it, so its nodes go around their proxy: set ROS_MASTER_URI=http://rosproxy:11311",
+            "the nodes look for the proxy by the name robot, but on network app that name belongs "
+            "to container robot. So the nodes bypass the proxy. Set "
+            "ROS_MASTER_URI=http://rosproxy:11311",
             fatal=False,
         ),
     )
@@ -285,9 +286,10 @@ def test_a_wrong_port_that_came_first_is_named_to_those_who_are_right() -> None:
     problems = named(seen).problems
     assert [problem.subject for problem in problems] == ["container good"]
     assert problems[0].text == (
-        f"looks for its proxy by the name robot, but on network app proxy {proxy_name(WRONG)} (for "
-        f"the master {WRONG.master_uri} of bad) answers to it, so its nodes go around their proxy: "
-        f"set ROS_MASTER_URI=http://{NAME}:11311 and the label rosproxy.master-uri={KEY.master_uri}"
+        "the nodes look for the proxy by the name robot, but on network app that name belongs to "
+        f"proxy {proxy_name(WRONG)} (for the master {WRONG.master_uri} of bad). So the nodes "
+        f"bypass the proxy. Set ROS_MASTER_URI=http://{NAME}:11311 and the label "
+        f"rosproxy.master-uri={KEY.master_uri}"
     )
 
 

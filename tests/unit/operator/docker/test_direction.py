@@ -77,7 +77,7 @@ def test_the_network_that_the_label_names_is_what_counts() -> None:
 def test_a_direction_that_can_not_be() -> None:
     members, (problem,) = read_members(observed(labelled("a", "inwards")))
     assert members == ()
-    assert problem.text.startswith("label rosproxy.direction='inwards' is none of out, both:")
+    assert problem.text.startswith("label rosproxy.direction='inwards' is none of out, both.")
 
 
 def test_who_has_exited_keeps_it_for_the_grace() -> None:

@@ -23,7 +23,8 @@ def test_unknown_labels_are_told_up_to_a_number() -> None:
     problems = told(**{f"rosproxy.x{n:05}": "y" for n in range(10_000)})
     assert len(problems) == MOST_UNKNOWN + 1
     assert problems[-1].text == (
-        f"{10_000 - MOST_UNKNOWN} more labels rosproxy.… are unknown and ignored; take them off"
+        f"{10_000 - MOST_UNKNOWN} more labels rosproxy.… are unknown and ignored. Remove these "
+        "labels"
     )
     assert not any(problem.fatal for problem in problems)
 
@@ -31,7 +32,9 @@ def test_unknown_labels_are_told_up_to_a_number() -> None:
 def test_labels_without_the_one_that_counts_are_told_in_short() -> None:
     labels = {f"rosproxy.x{n:05}" + "y" * 1000: "" for n in range(100)}
     _, problems = read_members(observed(container(labels=labels)))
-    assert problems[-1].text.endswith("and 95 more ignored: add the label rosproxy.enable=true")
+    assert problems[-1].text.endswith(
+        "and 95 more ignored, since the label rosproxy.enable=true is missing. Add that label"
+    )
     assert all(len(problem.text) < LONGEST_PROBLEM for problem in problems)
 
 

@@ -80,14 +80,17 @@ def test_the_label_alone_is_enough(value: str) -> None:
 
 
 URI = "is not of the form http://HOST:11311"
-HOST = "is neither a host name nor an address: give the one under which others reach this host"
+HOST = (
+    "is neither a host name nor an address. Give the name or address at which outside reaches this "
+    "host"
+)
 BAD = {
-    "rosproxy.enable": ("is neither true nor false: write rosproxy.enable=true", [
+    "rosproxy.enable": ("is neither true nor false. Write rosproxy.enable=true", [
         "yes", "1", "", "ture",
     ]),
     "rosproxy.ports": (
-        "is not a number from 1 to 1000: give how many ports the whole proxy is to have, one for "
-        "each node, e.g. rosproxy.ports=32", [
+        "is not a number from 1 to 1000. Give the number of ports of the whole proxy, one for each "
+        "node, such as rosproxy.ports=32", [
         "0", "1001", "-1", "many", "", "1.5", "٣", "9" * 5000,
     ]),
     "rosproxy.master-uri": (URI, [
@@ -96,8 +99,8 @@ BAD = {
     ]),
     "rosproxy.advertise-host": (HOST, ["", "a b", "http://host", "host:1", "-x", "x" * 300]),
     "rosproxy.data-plane": (
-        "is none of auto, kernel, splice, copy: write rosproxy.data-plane=kernel for a proxy that "
-        "lets the kernel forward, or leave it out", ["", "fast", "kernel,splice", "true"],
+        "is none of auto, kernel, splice, copy. Write rosproxy.data-plane=kernel to let the "
+        "kernel forward topics, or remove the label", ["", "fast", "kernel,splice", "true"],
     ),
 }  # fmt: skip
 
@@ -127,7 +130,10 @@ def test_a_label_without_enable_is_ignored_and_told() -> None:
     member, problems = read(container(labels={"rosproxy.ports": "8"}, env=ROBOT))
     assert member is None
     assert [problem.fatal for problem in problems] == [False]
-    assert problems[0].text == "label rosproxy.ports ignored: add the label rosproxy.enable=true"
+    assert problems[0].text == (
+        "label rosproxy.ports ignored, since the label rosproxy.enable=true is missing. Add that "
+        "label"
+    )
 
 
 @pytest.mark.parametrize(
@@ -145,12 +151,12 @@ def test_a_label_without_enable_is_ignored_and_told() -> None:
 )
 def test_an_unknown_label_and_the_nearest_right_one(name: str, near: str) -> None:
     text = warning(container(labels={**ENABLED, name: "1"}))
-    assert text == f"label {name} is unknown and ignored; did you mean {near}?"
+    assert text == f"label {name} is unknown and ignored. Did you mean {near}?"
 
 
 def test_an_unknown_label_that_is_near_to_none() -> None:
     text = warning(container(labels={**ENABLED, "rosproxy.colour-scheme": "1"}))
-    assert "there are rosproxy.enable, rosproxy.master-uri, rosproxy.ports," in text
+    assert "Known labels: rosproxy.enable, rosproxy.master-uri, rosproxy.ports," in text
 
 
 @pytest.mark.parametrize("name", ["rosproxy-test", "rosproxy-version", "rosproxy", "com.rosproxy"])
@@ -193,7 +199,7 @@ def test_a_master_on_loopback_is_nobodys(host: str) -> None:
         (ON, f"http://{host}:11311"),
     ):
         text = refusal(container(labels=labels, env=env))
-        assert "is the container itself" in text
+        assert "means the container itself" in text
         assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
 
 
@@ -202,7 +208,7 @@ def test_a_master_on_loopback_is_nobodys(host: str) -> None:
 )
 def test_a_proxy_is_no_master(host: str) -> None:
     labels = {**ON, "rosproxy.master-uri": f"http://{host}:11311"}
-    assert "names a proxy: give the real master" in refusal(container(labels=labels))
+    assert "names a proxy. Give the real master" in refusal(container(labels=labels))
 
 
 def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
@@ -213,7 +219,7 @@ def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> Non
     member, told = read(container(labels=ON, env=""), settings)
     assert member is not None
     assert member.key == arm
-    assert "so it is taken for ROS 1" in told[0].text
+    assert "so the operator assumes ROS 1" in told[0].text
     member, _ = read(container(labels=ON, env="http://rosproxy-zoo-0a1b2c:11311"), settings)
     assert member is not None
     assert good(container(labels=ON, env=ROBOT), settings).key == KEY
@@ -221,7 +227,7 @@ def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> Non
 
 def test_no_master() -> None:
     text = refusal(container(labels=ON))
-    assert text.startswith("no master is known: add the label rosproxy.master-uri=http://HOST:")
+    assert text.startswith("the ROS master is not known. Add the label rosproxy.master-uri=")
     text = refusal(container(labels=ON), replace(SETTINGS, master_uri="robot"))
     assert text == f"the operator's --master-uri 'robot' {URI}"
 
@@ -230,22 +236,22 @@ def test_no_master() -> None:
 
 
 ASTRAY = {
-    "http://rosproxy:11312": "has another port than its proxy, 11311: set ROS_MASTER_URI=",
-    "http://robot:11312": "has another port than its proxy, 11311: set ROS_MASTER_URI=",
-    "http://other:11311": "is not its master http://robot:11311, so its nodes go elsewhere: set ",
-    "http://localhost:11311": "is the container itself: set ROS_MASTER_URI=",
-    "http://rosproxy-arm-0a1b2c:11311": "names another master's proxy, its own is rosproxy-robot-",
-    "robot:11311": f"{URI}: set ROS_MASTER_URI=",
-    "http://192.0.2.7:11399": "is an address, so its nodes go around the proxy and can't be",
+    "http://rosproxy:11312": "has the wrong port, the proxy listens on 11311. Set ROS_MASTER_URI=",
+    "http://robot:11312": "has the wrong port, the proxy listens on 11311. Set ROS_MASTER_URI=",
+    "http://other:11311": "is not the container's master http://robot:11311, so the nodes ",
+    "http://localhost:11311": "means the container itself. Set ROS_MASTER_URI=",
+    "http://rosproxy-arm-0a1b2c:11311": "names the proxy of another master, not rosproxy-robot-",
+    "robot:11311": f"{URI}. Set ROS_MASTER_URI=",
+    "http://192.0.2.7:11399": "is an address, so the nodes bypass the proxy, and outside can't",
 }
 
 
 @pytest.mark.parametrize(("env", "told"), ASTRAY.items())
 def test_a_variable_that_leads_astray(env: str, told: str) -> None:
     text = warning(container(env=env))
-    assert text.startswith(f"its variable ROS_MASTER_URI={env!r}")
+    assert text.startswith(f"variable ROS_MASTER_URI={env!r}")
     assert told in text
-    assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
+    assert "Set ROS_MASTER_URI=http://rosproxy:11311" in text
 
 
 @pytest.mark.parametrize("env", ["http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
@@ -259,7 +265,7 @@ def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
     uri = "http://192.0.2.7:11311"
     settings = replace(SETTINGS, redirect=False)
     _, (problem,) = read(container(labels=ON, env=uri), settings)
-    advice = f"set ROS_MASTER_URI=http://rosproxy:11311 and the label rosproxy.master-uri={uri}, or"
+    advice = f"Set ROS_MASTER_URI=http://rosproxy:11311 and the label rosproxy.master-uri={uri}, or"
     assert advice in problem.text
     cured = container(labels={**ON, "rosproxy.master-uri": uri}, env="http://rosproxy:11311")
     assert good(cured, settings).key.master_uri == uri
@@ -268,8 +274,8 @@ def test_an_address_is_told_the_variable_and_the_label_at_once() -> None:
 def test_no_variable_leads_to_localhost() -> None:
     """Nodes that are started with one of their own find the proxy all the same."""
     assert warning(container(env="")) == (
-        "has no variable ROS_MASTER_URI, so its nodes look for a master on localhost, unless a "
-        "script of its own sets one: set ROS_MASTER_URI=http://rosproxy:11311"
+        "has no variable ROS_MASTER_URI, so the nodes look for a master on localhost, unless a "
+        "script sets the variable. Set ROS_MASTER_URI=http://rosproxy:11311"
     )
     member, _ = read(container(env=""))
     assert member is not None
@@ -292,18 +298,18 @@ def test_who_says_what_this_host_is_called() -> None:
 
 def test_loopback_is_no_address_for_others() -> None:
     labels = {**ENABLED, "rosproxy.advertise-host": "127.0.0.1"}
-    assert "means another host to everybody else" in refusal(container(labels=labels))
+    assert "is loopback, which no other host can reach" in refusal(container(labels=labels))
 
 
 def test_an_address_that_is_not_known() -> None:
     text = refusal(container(), PlanSettings())
-    assert text.startswith("this host's address towards the master http://robot:11311 is not known")
+    assert text.startswith("the operator does not know this host's address towards the master ")
     assert "--advertise-host" in text
 
 
 def test_a_masters_name_that_leads_nowhere_is_the_cause_and_its_fix_the_whole() -> None:
     text = refusal(container(), PlanSettings(), masters={"robot": ""})
-    assert text.startswith("its master is not found: the name robot can't be resolved")
+    assert text.startswith("no address of the master: the operator can't resolve the host name")
     assert "--add-host robot:ADDRESS" in text
     assert "advertise-host" not in text
 
@@ -321,7 +327,7 @@ def test_a_masters_name_that_leads_nowhere_is_the_cause_and_its_fix_the_whole() 
 def test_a_misspelt_label_is_told_with_the_one_that_was_meant(label: str, meant: str) -> None:
     member, (told, *_) = read(container(labels={label: "true"}))
     assert member is None
-    assert f"label {label} is unknown and ignored; did you mean {meant}?" in told.text
+    assert f"label {label} is unknown and ignored. Did you mean {meant}?" in told.text
 
 
 @pytest.mark.parametrize(
@@ -362,7 +368,8 @@ def test_one_network_of_several(
 def test_a_network_that_it_is_not_on() -> None:
     talker = container(labels={**ENABLED, "rosproxy.network": "app2"}, networks=("lab", "app"))
     assert refusal(talker) == (
-        "label rosproxy.network='app2' names no network of the container; it has: app, lab"
+        "label rosproxy.network='app2' is no network of the container. The container's networks: "
+        "app, lab"
     )
 
 
@@ -371,7 +378,7 @@ def test_a_network_that_it_is_not_on() -> None:
     [
         (("bridge",), "bridge", "is only on the default bridge network, where no names resolve"),
         ((), "default", "is only on the default bridge network"),
-        (("host",), "host", "is on the host's own network, where its nodes need no proxy"),
+        (("host",), "host", "is on the host's own network, where nodes need no proxy"),
         (("none",), "none", "is on no network"),
         ((), "app", "is on no network"),
     ],
@@ -395,8 +402,8 @@ def test_the_network_of_another_container() -> None:
 
 def test_the_network_of_a_container_that_is_gone() -> None:
     talker = container(networks=(), mode="container:id-pod")
-    assert "shares the network of a container ('id-pod') that is not there" in refusal(talker)
-    assert "not there" in refusal(replace(talker, network_mode="container:id-talker"))
+    assert "shares the network of container 'id-pod', which does not exist" in refusal(talker)
+    assert "does not exist" in refusal(replace(talker, network_mode="container:id-talker"))
 
 
 # states
@@ -453,7 +460,9 @@ def test_one_bad_container_does_not_touch_the_others() -> None:
 
 def test_a_container_with_the_operators_own_label() -> None:
     _, problems = read(container(labels={"io.rosproxy.managed": "true"}))
-    assert problems[0].text.startswith("has the label io.rosproxy.managed, which is for proxies")
+    assert problems[0].text.startswith(
+        "has the label io.rosproxy.managed, but not the other labels"
+    )
 
 
 def test_whose_address_is_needed() -> None:

@@ -89,17 +89,17 @@ def test_the_process_of_a_former_image_is_known_by_user_and_command() -> None:
     assert wrong(MADE["proxy"], PROCESS.name, "another image") == ""
     wrapped = changed("proxy", "Config", "Cmd", value=["python3", "evil.py"])
     assert wrong(wrapped, PROCESS.name) == ""  # the present image's own
-    told = "its command is not rosproxy run"
+    told = "the command is not rosproxy run"
     assert wrong(wrapped, PROCESS.name, "another image") == told
-    assert wrong(changed("proxy", "Config", "User", value=""), PROCESS.name).startswith("its user")
+    assert wrong(changed("proxy", "Config", "User", value=""), PROCESS.name).startswith("the user")
 
 
 @pytest.mark.parametrize("role", MADE)
 def test_an_image_can_have_labels_command_user_and_variables_and_no_more(role: str) -> None:
     """``docker run --name …`` of it, with everything that it could have put in."""
     forged = {**MADE[role], "HostConfig": {"NetworkMode": "app", "IpcMode": "private"}}
-    assert wrong(forged, "evil") == f"its name is not {NAMES[role]}"
-    assert wrong(forged, NAMES[role]).startswith("its HostConfig.ReadonlyRootfs")
+    assert wrong(forged, "evil") == f"the name is not {NAMES[role]}"
+    assert wrong(forged, NAMES[role]).startswith("HostConfig.ReadonlyRootfs")
 
 
 FORGED: list[tuple[str, str, list[Any]]] = [
@@ -139,7 +139,7 @@ FORGED: list[tuple[str, str, list[Any]]] = [
 )
 def test_whoever_makes_one_by_hand_gives_himself_away(role: str, name: str, value: object) -> None:
     forged = changed(role, "HostConfig", name, value=value)
-    assert wrong(forged, NAMES[role]).startswith(f"its HostConfig.{name} ")
+    assert wrong(forged, NAMES[role]).startswith(f"HostConfig.{name} ")
 
 
 @pytest.mark.parametrize(

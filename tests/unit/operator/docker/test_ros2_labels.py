@@ -97,7 +97,8 @@ def test_where_nothing_says_it_ros_1_is_assumed_and_told() -> None:
     members, told = read(labelled_container(), settings)
     assert [member.key for member in members] == [KEY]
     assert told == [
-        "nothing says which ROS it is, so it is taken for ROS 1: add the label rosproxy.ros=1 or 2"
+        "no label and no variable states the ROS version, so the operator assumes ROS 1. Add the "
+        "label rosproxy.ros=1 or rosproxy.ros=2"
     ]
     assert read(labelled_container(env=ROBOT), settings)[1] == []
 
@@ -121,8 +122,8 @@ def test_a_label_for_ros_2_alone_says_it(labels: Mapping[str, str]) -> None:
 
 def test_where_nothing_says_it_and_no_master_is_known_both_ways_are_told() -> None:
     assert refusal(labelled_container()) == (
-        "nothing says which ROS it is: add the label rosproxy.ros=2 for ROS 2, or the label "
-        "rosproxy.master-uri=http://HOST:11311 for ROS 1"
+        "no label and no variable states the ROS version. Add the label rosproxy.ros=2 for ROS 2, "
+        "or the label rosproxy.master-uri=http://HOST:11311 for ROS 1"
     )
 
 
@@ -135,9 +136,7 @@ def test_the_domain_is_that_of_the_label_or_the_variable() -> None:
     assert keys(labelled_container(ON, {"ROS_DISTRO": "jazzy", "ROS_DOMAIN_ID": ""})) == [DOMAIN]
     text = refusal(labelled_container({**TWO, "rosproxy.domain": "233"}))
     assert text.startswith("label rosproxy.domain='233' is not a domain from 0 to 232")
-    assert "its variable ROS_DOMAIN_ID='x'" in refusal(
-        labelled_container(TWO, {"ROS_DOMAIN_ID": "x"})
-    )
+    assert "variable ROS_DOMAIN_ID='x'" in refusal(labelled_container(TWO, {"ROS_DOMAIN_ID": "x"}))
 
 
 def test_peers() -> None:
@@ -166,18 +165,18 @@ def test_peers_that_are_not_allowed_are_left_out() -> None:
 
     assert member.peers == {"robot", "arm:11400", "base:11400", "base"}
     assert told == (
-        "label rosproxy.peers names victim, which labels may not: it is not told of participants; "
-        "start the operator with --allow-peer victim if it is to be"
+        "label rosproxy.peers names victim, which the operator does not allow in labels. The proxy "
+        "announces no participants there. To allow it, start the operator with --allow-peer victim"
     )
 
 
 def test_labels_of_the_other_version_are_told() -> None:
     assert read(labelled_container({**TWO, "rosproxy.slave-control": "master"}))[1] == [
-        "label rosproxy.slave-control is for ROS 1, which this is not: ignored"
+        "label rosproxy.slave-control is ignored: the label is for ROS 1, the container is not"
     ]
     labels = {**ON, "rosproxy.master-uri": ROBOT, "rosproxy.peers": "robot"}
     told = read(labelled_container(labels, env=ROBOT))[1]
-    assert told == ["label rosproxy.peers is for ROS 2, which this is not: ignored"]
+    assert told == ["label rosproxy.peers is ignored: the label is for ROS 2, the container is not"]
 
 
 def test_plane_direction_and_rules_are_its_own() -> None:
@@ -194,9 +193,9 @@ def test_plane_direction_and_rules_are_its_own() -> None:
 
 
 def test_what_is_no_dds_or_no_ipv4_is_left_out() -> None:
-    assert "is no DDS" in refusal(labelled_container(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
+    assert "is not DDS" in refusal(labelled_container(TWO, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}))
     text = refusal(labelled_container(TWO), replace(SETTINGS, advertise_host="2001:db8::1"))
-    assert text.endswith("give an IPv4 address")
+    assert text.endswith("Give an IPv4 address")
 
 
 APP = Network("n1", "app", subnets=(IPv4Network("172.30.0.0/16"),))
@@ -207,7 +206,7 @@ def test_a_static_peer_outside_is_told(host: str) -> None:
     variables = {STATIC_PEERS: f"rosproxy;{host}"}
     _, (text,) = read(labelled_container(TWO, variables), networks=(UPLINK, APP))
     assert f"ROS_STATIC_PEERS names '{host.lower()}'" in text
-    assert text.endswith(f"unset the variable and add the label rosproxy.peers='{host.lower()}'")
+    assert text.endswith(f"Unset the variable, and add the label rosproxy.peers='{host.lower()}'")
 
 
 @pytest.mark.parametrize("peers", ["", "rosproxy", "172.30.0.9;127.0.0.1", "talker; localhost ;"])
@@ -235,4 +234,6 @@ def test_the_advertised_host_is_the_address_for_far_hosts() -> None:
     assert ([member.key for member in members], told) == ([DOMAIN], [])
     members, told = read(labelled_container(TWO), settings)
     assert not members
-    assert told[0].startswith("this host's address is not known: add the label rosproxy.advert")
+    assert told[0].startswith(
+        "the operator does not know this host's address. Add the label rosproxy.adv"
+    )

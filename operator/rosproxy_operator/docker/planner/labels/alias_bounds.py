@@ -45,12 +45,12 @@ def is_allowed_by_administrator(name: str, settings: PlanSettings) -> bool:
 def alias_refusal(name: str, settings: PlanSettings) -> str:
     """Why labels may not give a proxy a name (in lower case); empty for a name that they may."""
     if not _HOST_NAME.fullmatch(name) or len(name) > LONGEST_HOST:
-        return "it is no host name"
+        return "the name is not a host name"
     if is_allowed_by_administrator(name, settings):
         return ""
     if settings.allow_alias:
         return (
-            f"it matches none of the operator's --allow-alias ({', '.join(settings.allow_alias)})"
+            f"the name matches no --allow-alias of the operator ({', '.join(settings.allow_alias)})"
         )
     return _lan_refusal(name)
 
@@ -58,11 +58,11 @@ def alias_refusal(name: str, settings: PlanSettings) -> str:
 def _lan_refusal(name: str) -> str:
     """Why a name is not that of a LAN's host; empty for the name of one."""
     if name.startswith(_OWN_PREFIX):
-        return f"names that begin with {_OWN_PREFIX} are the operator's own"
+        return f"names that begin with {_OWN_PREFIX} are reserved for the operator"
     if _ends_in(name, _CLUSTER_SUFFIX):
-        return f"names in .{_CLUSTER_SUFFIX} are those of a cluster's services"
+        return f"names in .{_CLUSTER_SUFFIX} belong to services of a Kubernetes cluster"
     if "." in name and not any(_ends_in(name, suffix) for suffix in LAN_SUFFIXES):
-        return f"it is neither one word nor in .{', .'.join(LAN_SUFFIXES)}"
+        return f"the name has a dot, and is not in .{', .'.join(LAN_SUFFIXES)}"
     return ""
 
 

@@ -34,9 +34,9 @@ def refused_master(uri: str, settings: PlanSettings) -> str:
     if master is None or master == option or _is_allowed_master(master, settings.allow_master):
         return ""
     names = ", ".join(settings.allow_master)
-    usual = f"names a port below {LEAST_PORT}, where no ROS master is"
-    reason = f"matches none of the operator's --allow-master ({names})" if names else usual
-    return f"{reason}: if it is one, start the operator with --allow-master {master}"
+    usual = f"has a port below {LEAST_PORT}, which is not allowed for a master by default"
+    reason = f"matches no --allow-master of the operator ({names})" if names else usual
+    return f"{reason}. To allow this master, start the operator with --allow-master {master}"
 
 
 def allowed_planes(settings: PlanSettings) -> frozenset[DataPlane]:
@@ -52,33 +52,33 @@ def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str
     limit = max(settings.max_ports, settings.ports)
     if request.ports > limit:
         warnings.append(
-            f"label rosproxy.ports={request.ports} asks for more than labels may: its proxy gets "
-            f"{limit}; start the operator with --max-ports {request.ports} if it is to have them"
+            f"label rosproxy.ports={request.ports} exceeds the bound of labels: the proxy gets "
+            f"{limit} ports. To allow more, start the operator with --max-ports {request.ports}"
         )
         request = replace(request, ports=limit)
     if request.data_plane and request.data_plane not in allowed_planes(settings):
         warnings.append(
-            f"label rosproxy.data-plane={request.data_plane} asks for what labels may not: its "
-            "proxy is as without it; start the operator with --allow-data-plane "
-            f"{request.data_plane} if it is to have that"
+            f"label rosproxy.data-plane={request.data_plane} is ignored: the operator does not "
+            "allow this value in labels. To allow it, start the operator with --allow-data-plane "
+            f"{request.data_plane}"
         )
         request = replace(request, data_plane=None)
     if request.slave_control == "any" and settings.slave_control == "master":
         warnings.append(
-            "label rosproxy.slave-control=any is ignored: the operator's --slave-control is "
-            "master, which labels can't widen"
+            "label rosproxy.slave-control=any is ignored: the operator has --slave-control master, "
+            "and a label can only narrow this option"
         )
         request = replace(request, slave_control=None)
     if request.redirect and not settings.redirect:
         warnings.append(
-            "label rosproxy.redirect=true is ignored: the operator's --no-redirect says otherwise, "
-            "which labels can't widen"
+            "label rosproxy.redirect=true is ignored: the operator has --no-redirect, and a label "
+            "can't override this option"
         )
     if refused := {peer for peer in request.peers if not _is_allowed_peer(peer, settings)}:
         warnings.append(
-            f"label rosproxy.peers names {', '.join(sorted(refused))}, which labels may not: it is "
-            "not told of participants; start the operator with "
-            f"{' '.join(f'--allow-peer {peer}' for peer in sorted(refused))} if it is to be"
+            f"label rosproxy.peers names {', '.join(sorted(refused))}, which the operator does not "
+            "allow in labels. The proxy announces no participants there. To allow it, start the "
+            f"operator with {' '.join(f'--allow-peer {peer}' for peer in sorted(refused))}"
         )
         request = replace(request, peers=request.peers - refused)
     return request, tuple(warnings)

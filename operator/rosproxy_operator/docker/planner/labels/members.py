@@ -113,13 +113,22 @@ def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tup
         return replace(request, wanted_alias=needs), text
     internal = {network.name for network in observed.networks if network.internal}
     if not settings.redirect:
-        text += "; the operator's --no-redirect keeps it from being led to the proxy"
+        text += (
+            ". Or start the operator without --no-redirect: the operator then redirects the "
+            "address to the proxy"
+        )
     elif request.redirect is False:
-        text += f"; without {readers.named(REDIRECT, container.labels)} it is led to the proxy"
+        text += (
+            f". Or remove {readers.named(REDIRECT, container.labels)}: the operator then redirects "
+            "the address to the proxy"
+        )
     # Without a route to the master's address connect(2) fails before the rule could take effect:
     # the kernel looks for a route before there is a packet (net/ipv4/tcp_ipv4.c, tcp_v4_connect).
     elif (joined := readers.network_owner(container, observed).networks) and joined <= internal:
-        text += "; it is not led to the proxy, since its networks have no way outwards"
+        text += (
+            ". The operator can't redirect the address to the proxy, since all networks of the "
+            "container are internal"
+        )
     else:
         return replace(request, redirected_master=by_address), ""
     return request, text
@@ -131,11 +140,11 @@ def _why_no_host(key: Key, observed: HostState) -> str:
     It follows from the master's address, which often is what is not known.
     """
     if not key.is_ros2 and observed.masters.get(master(key).host.lower()) == "":
-        return f"its master is not found: {unresolved_master(master(key).host)}"
+        return f"no address of the master: {unresolved_master(master(key).host)}"
     towards = "" if key.is_ros2 else f" towards the {key.graph}"
     return (
-        f"this host's address{towards} is not known: add the label "
-        f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host"
+        f"the operator does not know this host's address{towards}. Add the label "
+        f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host ADDRESS"
     )
 
 
@@ -201,8 +210,10 @@ def _master_uri(container: Container, settings: PlanSettings, proxies: Collectio
     except NoMaster:
         if not ros_versions.is_guessed(container):
             raise
-        text = f"nothing says which ROS it is: add the label {ROS}=2 for ROS 2, or the label "
-        raise UnusableLabel(f"{text}{MASTER_URI}=http://HOST:11311 for ROS 1") from None
+        raise UnusableLabel(
+            f"{ros_versions.UNKNOWN}. Add the label {ROS}=2 for ROS 2, or the label "
+            f"{MASTER_URI}=http://HOST:11311 for ROS 1"
+        ) from None
 
 
 def _problem(container: Container, text: str, fatal: bool) -> Problem:
@@ -210,7 +221,7 @@ def _problem(container: Container, text: str, fatal: bool) -> Problem:
 
 
 def _unusable(container: Container, text: str) -> Problem:
-    """Nobody has asked for a container that merely has a variable: that is no failure."""
+    """A failure only if a label asks for a proxy; a mere variable is no request."""
     return _problem(container, text, fatal=bool(_own(container)))
 
 
@@ -235,15 +246,15 @@ def _own(container: Container) -> list[str]:
 def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     if container.forged:
         yield (
-            f"has the labels of a container that this operator makes, but {container.forged}: an "
-            "image may carry labels, so it is left alone and nothing that they say is believed: "
-            f"docker rm -f {container.name}, or take them off"
+            f"has the labels of the operator's own containers, but {container.forged}. An image "
+            "can carry such labels, so the operator ignores them. Remove the container (docker rm "
+            f"-f {container.name}) or the labels"
         )
     elif container.labels.get(MANAGED) == "true":
         yield (
-            f"has the label {MANAGED}, which is for proxies made by this operator, but not the "
-            f"others that go with it, so it is left alone: docker rm -f {container.name}, or take "
-            "the label off"
+            f"has the label {MANAGED}, but not the other labels of the operator's own containers, "
+            "so the operator ignores this label. Remove the container (docker rm -f "
+            f"{container.name}) or the label"
         )
     own = _own(container)
     if container.labels.get(ENABLE, "").strip().lower() == "false":
@@ -252,14 +263,14 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     told = unknown[:MOST_UNKNOWN]
     for name in told:
         near = nearest(name, LABELS, NEAR)
-        fix = f"did you mean {near}?" if near else f"there are {', '.join(LABELS)}"
-        yield f"label {bounded(name, LONGEST_NAME)} is unknown and ignored; {fix}"
+        fix = f"Did you mean {near}?" if near else f"Known labels: {', '.join(LABELS)}"
+        yield f"label {bounded(name, LONGEST_NAME)} is unknown and ignored. {fix}"
     if left_out := len(unknown) - len(told):
-        yield f"{left_out} more labels {_PREFIX}.… are unknown and ignored; take them off"
+        yield f"{left_out} more labels {_PREFIX}.… are unknown and ignored. Remove these labels"
     misspelt = any(nearest(name, LABELS, NEAR) == ENABLE for name in told)  # warned of above
     if own and not misspelt and ENABLE not in container.labels and not settings.expose_by_default:
         names = listed(f"label {bounded(name, LONGEST_NAME)}" for name in own)
-        yield f"{names} ignored: add the label {ENABLE}=true"
+        yield f"{names} ignored, since the label {ENABLE}=true is missing. Add that label"
 
 
 def _advertised(request: Member, observed: HostState) -> str:

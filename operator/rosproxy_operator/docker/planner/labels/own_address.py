@@ -18,16 +18,16 @@ def wrong_own_address(container: Container, key: Key, observed: HostState) -> st
     """What is wrong with how a container of ROS 1 calls its own host; empty if nothing is."""
     for name in VARIABLES:
         value = container.variables.get(name, "").strip().lower()
-        fix = f"leave {name} out, no node behind a proxy needs it"
+        fix = f"Unset {name}: no node behind a proxy needs this variable"
         if value and is_loopback(value):
             return (
-                f"its variable {name}={bounded(value, 80)} has its nodes listen on loopback only, "
-                f"where nobody reaches them, their proxy neither: {fix}"
+                f"variable {name}={bounded(value, 80)} makes the nodes listen on loopback only, so "
+                f"the proxy can't reach them. {fix}"
             )
         if value and value in _of_this_host(key, observed):
             return (
-                f"its variable {name}={value} is this host's address and not its own, so that "
-                f"roslaunch there ends with 'Unable to contact my own server': {fix}"
+                f"variable {name}={value} is the address of this host, not of the container. So "
+                f"roslaunch ends with 'Unable to contact my own server'. {fix}"
             )
     return ""
 

@@ -77,8 +77,8 @@ def refuse_long_values(labels: Labels) -> None:
     """Raise UnusableLabel for a value that is too long to be read with each look."""
     for label in LABELS:
         if len(labels.get(label, "")) > LONGEST_VALUE:
-            fix = "join rules by globs" if label == POLICY else "shorten the value"
-            raise UnusableLabel(f"label {label} has more than {LONGEST_VALUE} characters: {fix}")
+            fix = "Join rules by globs" if label == POLICY else "Shorten the value"
+            raise UnusableLabel(f"label {label} has more than {LONGEST_VALUE} characters. {fix}")
 
 
 def enabled(labels: Labels, otherwise: bool) -> bool:
@@ -99,15 +99,15 @@ def ports(labels: Labels) -> int:
     digits = labels[PORTS].strip()
     if not re.fullmatch(r"[0-9]{1,6}", digits) or not 1 <= int(digits) <= MOST_PORTS:
         raise UnusableLabel(
-            f"{named(PORTS, labels)} is not a number from 1 to {MOST_PORTS}: give how many "
-            f"ports the whole proxy is to have, one for each node, e.g. {PORTS}=32"
+            f"{named(PORTS, labels)} is not a number from 1 to {MOST_PORTS}. Give the number of "
+            f"ports of the whole proxy, one for each node, such as {PORTS}=32"
         )
     return int(digits)
 
 
 def data_plane(labels: Labels) -> DataPlane | None:
     """One of the proxy's data planes, or None."""
-    fix = "kernel for a proxy that lets the kernel forward, or leave it out"
+    fix = "kernel to let the kernel forward topics, or remove the label"
     return _choice(DATA_PLANE, labels, get_args(DataPlane), fix)
 
 
@@ -120,7 +120,7 @@ def direction(
     """
     if DIRECTION not in labels:
         return "both" if any(n.internal and n.name in joined for n in networks) else None
-    fix = "both where its nodes have no way outwards but the proxy, or leave it out"
+    fix = "both if the nodes reach outside only through the proxy, or remove the label"
     return _choice(DIRECTION, labels, get_args(Direction), fix)
 
 
@@ -130,8 +130,9 @@ def udp(labels: Labels) -> bool | None:
 
 
 def slave_control(labels: Labels) -> SlaveControl | None:
-    """Who may call what controls a node, or None."""
-    fix = "master to keep shutdown, publisherUpdate and paramUpdate to the master, or leave it out"
+    """Which outside hosts may call the methods that control a node, or None."""
+    methods = "shutdown, publisherUpdate and paramUpdate"
+    fix = f"master to let only the master's host call {methods}, or remove the label"
     return _choice(SLAVE_CONTROL, labels, get_args(SlaveControl), fix)
 
 
@@ -145,8 +146,8 @@ def policy(labels: Labels) -> tuple[Rule, ...]:
     except ValueError as error:
         raise UnusableLabel(f"label {POLICY}: {error}") from None
     if len(rules) > MOST_LABEL_RULES:
-        cause = f"label {POLICY} has {len(rules)} rules, more than {MOST_LABEL_RULES}: join some by"
-        raise UnusableLabel(f"{cause} globs")
+        text = f"label {POLICY} has {len(rules)} rules, at most {MOST_LABEL_RULES} are accepted"
+        raise UnusableLabel(f"{text}. Join rules by globs")
     return rules
 
 
@@ -173,7 +174,7 @@ def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
     """Whether a label says true or false, None without it; ``usual`` is what most would want."""
     value = labels.get(label, "").strip().lower()
     if label in labels and value not in ("true", "false"):
-        text = f"{named(label, labels)} is neither true nor false: write {label}={usual}"
+        text = f"{named(label, labels)} is neither true nor false. Write {label}={usual}"
         raise UnusableLabel(text)
     return value == "true" if value else None
 
@@ -186,7 +187,7 @@ def _choice(label: str, labels: Labels, choices: tuple[_Choice, ...], fix: str) 
         if labels[label].strip().lower() == choice:
             return choice
     raise UnusableLabel(
-        f"{named(label, labels)} is none of {', '.join(choices)}: write {label}={fix}"
+        f"{named(label, labels)} is none of {', '.join(choices)}. Write {label}={fix}"
     )
 
 
@@ -194,13 +195,13 @@ def _host(source: str, value: str) -> str:
     bare = value.strip().removeprefix("[").removesuffix("]").lower()
     if not is_address(bare) and not _HOST.fullmatch(bare):
         raise UnusableLabel(
-            f"{source} is neither a host name nor an address: give the one under which others "
-            "reach this host"
+            f"{source} is neither a host name nor an address. Give the name or address at which "
+            "outside reaches this host"
         )
     if is_loopback(bare):
         raise UnusableLabel(
-            f"{source} means another host to everybody else: give the name or address under which "
-            "others reach this host"
+            f"{source} is loopback, which no other host can reach. Give the name or address at "
+            "which outside reaches this host"
         )
     return bare
 
@@ -221,7 +222,8 @@ def _named_network(labels: Labels, own: frozenset[str]) -> str:
             return name
     names = ", ".join(sorted(own)) or "none that is user-defined"
     raise UnusableLabel(
-        f"{named(NETWORK, labels)} names no network of the container; it has: {names}"
+        f"{named(NETWORK, labels)} is no network of the container. The container's networks: "
+        f"{names}"
     )
 
 
@@ -232,8 +234,8 @@ def network_owner(container: Container, observed: HostState) -> Container:
         sharer = next((c for c in observed.containers if target in (c.id, c.name)), None)
         if sharer is None or sharer.id in visited:
             raise UnusableLabel(
-                f"shares the network of a container ({quoted(target)}) that is not there: start "
-                "that one, then create this one anew"
+                f"shares the network of container {quoted(target)}, which does not exist. Start "
+                "that container, then create this container again"
             )
         visited.add(sharer.id)
         container = sharer
@@ -244,15 +246,16 @@ def _why_no_network(owner: Container) -> str:
     anew = "docker network create ros; docker run --network ros"
     if "host" in (*owner.networks, owner.network_mode):
         return (
-            "is on the host's own network, where its nodes need no proxy: attach it to a "
-            f"user-defined network: {anew}, or take its labels off"
+            "is on the host's own network, where nodes need no proxy. Remove the labels, or start "
+            f"the container on a user-defined network: {anew}"
         )
     if owner.network_mode == "none":  # the engine lets it join no other
-        return f"is on no network: start it with one: {anew}"
+        return f"is on no network. Start the container on a user-defined network: {anew}"
     live = f"docker network create ros; docker network connect ros {owner.name}"
     if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
-        return f"is only on the default bridge network, where no names resolve: {live}"
-    return f"is on no network: {live}"
+        where = "is only on the default bridge network, where no names resolve"
+        return f"{where}. Attach the container to another network: {live}"
+    return f"is on no network. Attach the container to a network: {live}"
 
 
 def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
@@ -266,14 +269,14 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
         return _allowed_master(source, container.labels[MASTER_URI], settings, proxies)
     host_port = parse_slave_uri(container.master_uri)
     if container.master_uri and not (host_port and _names_proxy(host_port.host.lower(), proxies)):
-        source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
+        source = f"variable ROS_MASTER_URI={quoted(container.master_uri)}"
         return _allowed_master(source, container.master_uri, settings, proxies)
     if settings.master_uri:
         source = f"the operator's --master-uri {quoted(settings.master_uri)}"
         return _parse_master(source, settings.master_uri, proxies)
     raise NoMaster(
-        f"no master is known: add the label {MASTER_URI}=http://HOST:11311 with the real master, "
-        "or start the operator with --master-uri"
+        f"the ROS master is not known. Add the label {MASTER_URI}=http://HOST:11311 with the real "
+        "master, or start the operator with --master-uri http://HOST:11311"
     )
 
 
@@ -283,20 +286,20 @@ def proxy_alias(container: Container, key: Key) -> tuple[str, str]:
     The name is empty if no alias can help. The second text is empty if nothing is wrong.
     """
     real = master(key)
-    fix = f"set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
+    fix = f"Set ROS_MASTER_URI=http://{ALIAS}:{real.port}"
     if not container.master_uri:
         # Which ROS's setup script takes (ros_comm/tools/roslaunch/env-hooks/10.roslaunch.sh.in).
-        nodes = "its nodes look for a master on localhost, unless a script of its own sets one"
-        return ALIAS, f"has no variable ROS_MASTER_URI, so {nodes}: {fix}"
+        nodes = "the nodes look for a master on localhost, unless a script sets the variable"
+        return ALIAS, f"has no variable ROS_MASTER_URI, so {nodes}. {fix}"
     target = parse_slave_uri(container.master_uri)
-    variable = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
+    variable = f"variable ROS_MASTER_URI={quoted(container.master_uri)}"
     if target is None:
-        return "", f"{variable} is not of the form http://HOST:11311: {fix}"
+        return "", f"{variable} is not of the form http://HOST:11311. {fix}"
     host = target.host.lower()
     if not is_address(host) and host in (ALIAS, real.host, proxy_name(key)):
         if target.port == real.port:
             return host, ""
-        return host, f"{variable} has another port than its proxy, {real.port}: {fix}"
+        return host, f"{variable} has the wrong port, the proxy listens on {real.port}. {fix}"
     if MASTER_URI not in container.labels:
         # A variable that names the proxy no longer says which master is meant.
         fix += f" and the label {MASTER_URI}={key.master_uri}"
@@ -322,15 +325,15 @@ def master_by_address(container: Container, key: Key) -> HostPort | None:
 
 def _wrong_master(host: str, key: Key, fix: str) -> str:
     if is_proxy_name(host):
-        return f"names another master's proxy, its own is {proxy_name(key)}: {fix}"
+        return f"names the proxy of another master, not {proxy_name(key)}. {fix}"
     if is_loopback(host):
-        return f"is the container itself: {fix}"
+        return f"means the container itself. {fix}"
     if is_address(host):
         return (
-            "is an address, so its nodes go around the proxy and can't be reached from outside: "
+            "is an address, so the nodes bypass the proxy, and outside can't reach them. "
             f"{fix}, or use the name of the master's host"
         )
-    return f"is not its master {key.master_uri}, so its nodes go elsewhere: {fix}"
+    return f"is not the container's master {key.master_uri}, so the nodes bypass the proxy. {fix}"
 
 
 def _names_proxy(host: str, proxies: Collection[str]) -> bool:
@@ -355,12 +358,12 @@ def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
     host = host_port.host.lower()
     if is_loopback(host):
         raise UnusableLabel(
-            f"{source} is the container itself, where no master runs: give the name of the "
-            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{host_port.port} and the label "
-            f"{MASTER_URI}"
+            f"{source} means the container itself, where no master runs. Give the name of the "
+            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{host_port.port} and give the "
+            f"master in the label {MASTER_URI}"
         )
     if _names_proxy(host, proxies):
         raise UnusableLabel(
-            f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
+            f"{source} names a proxy. Give the real master, such as {MASTER_URI}=http://robot:11311"
         )
     return slave_uri(HostPort(host, host_port.port), path)

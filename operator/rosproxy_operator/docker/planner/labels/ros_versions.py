@@ -35,6 +35,7 @@ from rosproxy_operator.docker.planner.model import Container, HostState
 
 _OF_ROS1 = (MASTER_URI, REDIRECT, SLAVE_CONTROL, UDP)
 _OF_ROS2 = (DOMAIN, PEERS)
+UNKNOWN = "no label and no variable states the ROS version"
 
 
 def versions(container: Container) -> frozenset[str]:
@@ -42,7 +43,9 @@ def versions(container: Container) -> frozenset[str]:
     if ROS in container.labels:
         tokens = frozenset(re.split(r"[,\s]+", container.labels[ROS].strip()))
         if not tokens <= {"1", "2"}:
-            text = f"{named(ROS, container.labels)} is none of 1, 2 and 1,2: write {ROS}=2"
+            text = (
+                f"{named(ROS, container.labels)} is none of 1, 2 and 1,2. Write {ROS}=2 for ROS 2"
+            )
             raise UnusableLabel(text)
         return tokens
     version = container.variables.get("ROS_VERSION", "")
@@ -70,11 +73,11 @@ def domain(container: Container) -> int:
         text = container.labels[DOMAIN]
     else:
         text = container.variables.get("ROS_DOMAIN_ID", "") or "0"
-        source = f"its variable ROS_DOMAIN_ID={quoted(text)}"
+        source = f"variable ROS_DOMAIN_ID={quoted(text)}"
     digits = text.strip()
     if not re.fullmatch(r"[0-9]{1,3}", digits, re.ASCII) or int(digits) > LAST_DOMAIN:
-        fix = f"write {DOMAIN}=0 or whatever the domain is"
-        raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}: {fix}")
+        fix = f"Write the domain of the nodes into the label, such as {DOMAIN}=0"
+        raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}. {fix}")
     return int(digits)
 
 
@@ -82,7 +85,7 @@ def peers(labels: Labels) -> frozenset[str]:
     """The hosts outside that are told of a container's participants; none without the label."""
     names = [name for name in re.split(r"[,\s]+", labels.get(PEERS, "")) if name]
     if len(names) > MOST_PEERS:
-        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts: name fewer")
+        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts. Name fewer hosts")
     try:
         return frozenset(map(read_peer_name, names))
     except ValueError as error:
@@ -93,11 +96,13 @@ def refuse_unserved(container: Container, host: str) -> None:
     """Raise UnusableLabel for what a proxy for ROS 2 can't do. ``host``: the advertised one."""
     rmw = container.variables.get("RMW_IMPLEMENTATION", "")
     if not is_dds(rmw):
-        text = f"its variable RMW_IMPLEMENTATION={quoted(rmw)} is no DDS, and only DDS is proxied"
-        raise UnusableLabel(f"{text}: use rmw_fastrtps_cpp or rmw_cyclonedds_cpp")
+        text = (
+            f"variable RMW_IMPLEMENTATION={quoted(rmw)} is not DDS, and a proxy forwards DDS only"
+        )
+        raise UnusableLabel(f"{text}. Use rmw_fastrtps_cpp or rmw_cyclonedds_cpp")
     if ":" in host:
-        text = f"{host} can't be advertised for ROS 2, which is proxied by IPv4 alone"
-        raise UnusableLabel(f"{text}: give an IPv4 address")
+        text = f"advertised host {host} is an IPv6 address, and for ROS 2 a proxy uses IPv4 only"
+        raise UnusableLabel(f"{text}. Give an IPv4 address")
 
 
 def past_the_proxy(
@@ -116,9 +121,9 @@ def past_the_proxy(
     for host in filter(None, (host.strip().lower() for host in named_hosts[:MOST_PEERS])):
         if host not in inside and not is_loopback(host) and not is_inside(host, subnets):
             yield (
-                f"its variable ROS_STATIC_PEERS names {quoted(host)}, which is not on its networks:"
-                " that host learns an address which it can't reach, and keeps that; unset the "
-                f"variable and add the label {PEERS}={quoted(host)}"
+                f"variable ROS_STATIC_PEERS names {quoted(host)}, which is not on a network of "
+                "this container. That host learns an address that it can't reach, and keeps that "
+                f"address. Unset the variable, and add the label {PEERS}={quoted(host)}"
             )
 
 
@@ -133,11 +138,11 @@ def warnings(container: Container, ros_versions: Collection[str]) -> Iterator[st
     """Warnings for a container of these versions, which has a proxy nevertheless."""
     labels = container.labels
     if is_guessed(container):
-        yield f"nothing says which ROS it is, so it is taken for ROS 1: add the label {ROS}=1 or 2"
+        yield f"{UNKNOWN}, so the operator assumes ROS 1. Add the label {ROS}=1 or {ROS}=2"
     for version, labels_of_version in (("1", _OF_ROS1), ("2", _OF_ROS2)):
         if version not in ros_versions:
             yield from (
-                f"label {label} is for ROS {version}, which this is not: ignored"
+                f"label {label} is ignored: the label is for ROS {version}, the container is not"
                 for label in labels_of_version
                 if label in labels
             )
