@@ -44,7 +44,7 @@ def test_it_gets_the_socket_of_the_new_engine(engine: PrivateEngine, controller_
     engine.end()
     engine.start(*LIVE)
 
-    wait_until(lambda: "the mounted /var/run/docker.sock is the former one" in logs(), 60, logs)
+    wait_until(lambda: "this container has the old /var/run/docker.sock" in logs(), 60, logs)
     wait_until(is_well, 60, logs)
     # The engine's own RestartCount leaves out a container that ended before the new engine saw it.
     assert logs().count("health and metrics at") == 2, logs()

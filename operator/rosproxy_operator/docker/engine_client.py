@@ -155,7 +155,8 @@ class DockerClient:
             self._idle.clear()
             raise unreachable(self.url, error) from error
         except (ValueError, KeyError, TypeError) as error:
-            raise Unavailable(f"what answers at {self.url} is no Docker engine: {error}") from error
+            text = f"the program that answers at {self.url} is not a Docker engine: {error}"
+            raise Unavailable(text) from error
 
 
 def listen(engine: DockerClient, tell: Callable[[Json | None], None]) -> None:

@@ -62,8 +62,8 @@ def refusal(status: int, text: str, request: str) -> EngineError:
         )
     elif status in (401, 403, 404, 405) and not _ENGINES_OWN.search(message):
         message = (
-            f"{request} is not allowed (HTTP {status}: {message[:100]}); "
-            "let it through the proxy in front of the engine's socket"
+            f"{request} is refused (HTTP {status}: {message[:100]}). If a proxy stands in front of "
+            "the engine's socket, allow this request there"
         )
     return EngineError(message)
 
@@ -77,22 +77,22 @@ def unreachable(url: str, error: BaseException) -> Unavailable:
     number = next((e.errno for e in chain if isinstance(e, OSError) and e.errno), None)
     if number in (errno.EACCES, errno.EPERM):
         return Unavailable(
-            f"no permission to use the Docker engine's socket {path}: run as root or with "
-            f"the socket's group (in a container: --group-add {_group(path)})"
+            f"no permission to open the socket {path} of the Docker engine. Run as root, or with "
+            f"the group of the socket (in a container: --group-add {_group(path)})"
         )
     if number == errno.ENOENT:
         return Unavailable(
-            f"there is no Docker engine's socket {path}: start the engine, or in a container "
-            f"mount it (-v {path}:{path}), or name the engine by DOCKER_HOST"
+            f"the socket {path} of the Docker engine does not exist. Start the engine; in a "
+            f"container, mount the socket (-v {path}:{path}); or name the engine in DOCKER_HOST"
         )
     if number == errno.ECONNREFUSED and _is_removed(path):
         return FormerSocket(
-            f"the Docker engine has been started again and has a new socket; the mounted {path} is "
-            "the former one: start this container again (a restart policy does: --restart always)"
+            f"the Docker engine was restarted and has a new socket, but this container has the old "
+            f"{path}. Restart this container (docker run --restart always does so)"
         )
     if number == errno.ECONNREFUSED:
-        return Unavailable(f"no Docker engine answers at {url}: is it running?")
-    return Unavailable(f"the Docker engine at {url} can't be asked: {str(chain[-1])[:200]}")
+        return Unavailable(f"no Docker engine answers at {url}. Start the engine")
+    return Unavailable(f"a request to the Docker engine at {url} failed: {str(chain[-1])[:200]}")
 
 
 def _is_removed(path: str) -> bool:

@@ -209,7 +209,7 @@ class Executor:
                 self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
-                fix = f"; {group.fix}" if group.fix else ""
+                fix = f". {group.fix}" if group.fix else ""
                 subject = _subject((group.key, group.subject))
                 problem = Problem(subject, f"{action}: {error}{fix}", group.fatal)
                 if not isinstance(action, Connect | Disconnect):
@@ -323,10 +323,12 @@ class DockerApplier:
         while (state := self._engine.container(name)["State"])["Running"]:
             if time.monotonic() > since + LONGEST_RUN:
                 self._engine.do("remove_container", name, force=True)
-                raise EngineError(f"has not ended in {LONGEST_RUN:.0f} s, and is removed")
+                raise EngineError(
+                    f"not ended after {LONGEST_RUN:.0f} s, and removed by the operator"
+                )
             time.sleep(RUNNING)
         if state["ExitCode"]:
-            raise EngineError(f"ended with {state['ExitCode']}, docker logs {name} says why")
+            raise EngineError(f"ended with exit code {state['ExitCode']}. Read docker logs {name}")
 
     def _config(self, action: Creation, snapshot: DockerSnapshot) -> Json:
         if isinstance(action, CreateSandbox):
@@ -349,7 +351,7 @@ class DockerApplier:
             try:
                 self._engine.do("stop", name, timeout=STOP_TIMEOUT)
             except EngineError as error:
-                log.debug("%s is killed, as it can't be stopped: %s", name, error)
+                log.debug("container not stopped, so it is killed: %s: %s", name, error)
         # The engine lays the published ports anew over each network that a container still has
         # when it ends, which takes 2 s per network.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
@@ -369,6 +371,6 @@ class DockerApplier:
             making = engine_json.read_making(container)
             if own is None or forgery_reason(own, name, making, image_id):
                 raise EngineError(
-                    f"the name is taken by a container {name} that this operator did not make; "
-                    f"rename it (docker rename {name} …) or remove it"
+                    f"a container {name} exists already that this operator did not create. Rename "
+                    f"that container (docker rename {name} …) or remove it"
                 ) from None

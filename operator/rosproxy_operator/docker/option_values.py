@@ -53,8 +53,9 @@ def read_shared_master_uri(text: str) -> str:
     master = parse_slave_uri(read_master_uri(text)) if text else None
     if master and is_loopback(master.host):
         raise ValueError(
-            f"{text!r} means another machine to each container; give the address or name of the "
-            "master's host, or http://host.docker.internal:PORT for this one"
+            f"{text!r} is a loopback address: for a container, that is the container itself. Give "
+            "the name or address of the master's host, or http://host.docker.internal:PORT for a "
+            "master on this host"
         )
     return text
 
@@ -65,7 +66,9 @@ def read_lan(text: str) -> str:
         return text
     address = read_address(text)
     if address is None or ":" in address:
-        raise ValueError(f"{text[:40]!r} is not an IPv4 address such as 192.0.2.10, or {NOWHERE}")
+        raise ValueError(
+            f"{text[:40]!r} is neither an IPv4 address such as 192.0.2.10 nor {NOWHERE}"
+        )
     return address
 
 
@@ -74,7 +77,9 @@ def read_memory(text: str) -> int:
     match = _MEMORY.fullmatch(text.strip().lower())
     size = int(match[1]) * _UNITS[match[2]] if match else -1
     if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
-        raise ValueError(f"{text[:40]!r} is not a size from 64m on, such as 1g; or 0 for no bound")
+        raise ValueError(
+            f"{text[:40]!r} is neither a size from 64m to 1024g, such as 1g, nor 0 for no bound"
+        )
     return size
 
 
@@ -83,7 +88,9 @@ def read_pids(text: str) -> int:
     digits = text.strip()
     count = int(digits) if re.fullmatch(r"[0-9]{1,7}", digits, re.ASCII) else -1
     if count and count < LEAST_PIDS:
-        raise ValueError(f"{text[:40]!r} is not a number from {LEAST_PIDS} on, or 0 for no bound")
+        raise ValueError(
+            f"{text[:40]!r} is neither a number from {LEAST_PIDS} on nor 0 for no bound"
+        )
     return count
 
 
@@ -94,11 +101,12 @@ def read_secret(path: str) -> str:
     try:
         secret = Path(path).read_text("utf-8").strip()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8"
+        reason = getattr(error, "strerror", None) or "not UTF-8"
         raise ValueError(f"{path} can't be read: {reason}") from None
     if len(secret) < LEAST_SECRET:
         raise ValueError(
-            f"{path} must hold at least {LEAST_SECRET} characters: openssl rand -hex 32 gives them"
+            f"{path} has fewer than {LEAST_SECRET} characters. openssl rand -hex 32 prints a new "
+            "secret"
         )
     return secret
 
@@ -106,7 +114,7 @@ def read_secret(path: str) -> str:
 def read_uplink(text: str) -> str:
     """The name of a network. Raises ValueError."""
     if not _NETWORK.fullmatch(text):
-        raise ValueError(f"{text!r} is not a network's name")
+        raise ValueError(f"{text!r} can't be the name of a Docker network")
     return text
 
 

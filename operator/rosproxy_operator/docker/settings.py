@@ -272,5 +272,7 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
     window = settings.port_window
     ports = settings.ports
     if len(window) < ports:
-        raise SettingError("--port-window", f"{window} has {len(window)} ports, --ports is {ports}")
+        raise SettingError(
+            "--port-window", f"{window} has {len(window)} ports, fewer than --ports {ports}"
+        )
     return settings

@@ -83,8 +83,8 @@ def test_a_conflict_without_the_long_ids() -> None:
 )
 def test_a_proxy_before_the_engine_does_not_let_a_call_through(status: int, text: str) -> None:
     told = str(refusal(status, text, "POST /v1.41/networks/create"))
-    assert told.startswith("POST /v1.41/networks/create is not allowed (HTTP ")
-    assert "let it through the proxy in front of the engine's socket" in told
+    assert told.startswith("POST /v1.41/networks/create is refused (HTTP ")
+    assert "If a proxy stands in front of the engine's socket, allow this request there" in told
 
 
 def test_what_the_engine_itself_forbids_is_told_as_it_is() -> None:
@@ -104,8 +104,8 @@ def wrapped(error: OSError) -> Exception:
 @pytest.mark.parametrize(
     ("number", "words"),
     [
-        (errno.EACCES, "no permission to use the Docker engine's socket /var/run/docker.sock"),
-        (errno.ENOENT, "mount it (-v /var/run/docker.sock:/var/run/docker.sock)"),
+        (errno.EACCES, "no permission to open the socket /var/run/docker.sock"),
+        (errno.ENOENT, "mount the socket (-v /var/run/docker.sock:/var/run/docker.sock)"),
         (errno.ECONNREFUSED, f"no Docker engine answers at {SOCKET}"),
     ],
 )
@@ -126,15 +126,15 @@ def test_the_mounted_socket_of_a_former_engine_is_told(tmp_path: Path) -> None:
         file.unlink()
         error = unreachable(f"unix://{path}", refused)
     assert isinstance(error, FormerSocket)
-    assert f"the mounted {path} is the former one" in str(error)
+    assert f"this container has the old {path}. Restart this container" in str(error)
 
 
 def test_a_cause_is_found_too() -> None:
     outer = EngineError("Error while fetching server API version")
     outer.__cause__ = wrapped(OSError(errno.ECONNREFUSED, "refused"))
-    assert "is it running?" in str(unreachable("tcp://10.0.0.1:2375", outer))
+    assert "Start the engine" in str(unreachable("tcp://10.0.0.1:2375", outer))
 
 
 def test_anything_else_is_told_in_one_line() -> None:
     told = str(unreachable(SOCKET, requests.ReadTimeout("Read timed out.")))
-    assert told == f"the Docker engine at {SOCKET} can't be asked: Read timed out."
+    assert told == f"a request to the Docker engine at {SOCKET} failed: Read timed out."

@@ -106,7 +106,7 @@ async def test_what_fails_ends_its_group_and_is_tried_again_later(host: Host) ->
     assert host.done == [Start("c")]
     (problem,) = host.work.problems
     assert problem.subject.startswith("proxy rosproxy-one-")
-    assert problem.text.endswith(": no; do this")
+    assert problem.text.endswith(": no. do this")
     assert 0.5 < (host.work.again_in or 0) <= 1.0
     host.begin(group)
     assert not host.work.busy
