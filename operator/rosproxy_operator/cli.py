@@ -98,7 +98,7 @@ def main() -> None:
 @click.option(
     "--once",
     is_flag=True,
-    help="Do once what the labels ask for, and exit: with 0 if nothing is wrong, else with 1.",
+    help="Apply the labels once, and exit: with 0 if nothing is wrong, else with 1.",
 )
 @click.pass_context
 def docker(
@@ -130,7 +130,7 @@ def docker(
         mistakes = [Problem(f"variable {v.name}", v.text, fatal=False) for v in unknown]
         _run(settings, options["resync"], options["admin_bind"], once, mistakes)
     elif once:
-        raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
+        raise click.UsageError(f"--once and {context.invoked_subcommand} exclude each other")
 
 
 def _unknown_variables(log: bool = True) -> list[UnknownVariable]:
@@ -142,8 +142,8 @@ def _need(library: str, extra: str) -> None:
     """Exit if a library that an operator needs is missing, and print how to install it."""
     if importlib.util.find_spec(library) is None:
         fail(
-            f"the Python package {library} is not installed here: "
-            f"pip install 'rosproxy[{extra}]' (in its sources: pip install '.[{extra}]')"
+            f"the Python package {library} is not installed. Run pip install 'rosproxy[{extra}]' "
+            f"(in the sources of rosproxy: pip install '.[{extra}]')"
         )
 
 

@@ -34,7 +34,7 @@ class CommandContext:
         return None if self.given else self.admin
 
 
-_json_option = click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
+_json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
 def _wait_option(text: str) -> Callable[[Command], Command]:
@@ -43,19 +43,21 @@ def _wait_option(text: str) -> Callable[[Command], Command]:
 
 @click.command()
 @_json_option
-@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
-@_wait_option("Time in which all may come to be as wanted, before it is shown.")
+@click.option(
+    "--watch", is_flag=True, help="Draw the status again every two seconds, until Ctrl-C."
+)
+@_wait_option("Longest time to wait until nothing is wrong and no step is left, before printing.")
 @click.pass_obj
 def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> None:
-    """Show the proxies, the labelled containers, their nodes, and what is wrong.
+    """Show the proxies, the labelled containers, their nodes, and the problems.
 
-    The running operator tells it. Where none answers at --admin-bind, or options are given before
-    this command, it is what an operator with those options would see. Exits with 0 if all is as
-    wanted: nothing is wrong or left to be done, every proxy answers and has its master, and none is
-    cut off from outside; else with 1.
+    The running operator reports the status. If no operator answers at --admin-bind, or if options
+    stand before this command, the status is what an operator with those options would see. Exits
+    with 0 if nothing is wrong, no step is left, every proxy answers, and no proxy reports that its
+    master or outside can't be reached; else with 1.
     """
     if as_json and watch:
-        raise click.UsageError("--json or --watch, not both")
+        raise click.UsageError("--json and --watch exclude each other; give one of them")
     from rosproxy_operator.docker.errors import EngineError
     from rosproxy_operator.docker.host_status import HostStatus, show_status, watch_status
 
@@ -69,13 +71,13 @@ def status(context: CommandContext, as_json: bool, watch: bool, wait: float) -> 
 
 @click.command()
 @_json_option
-@_wait_option("Time in which all may come to be done and well, before it is shown.")
+@_wait_option("Longest time to wait until no step is left and nothing is wrong, before printing.")
 @click.pass_obj
 def plan(context: CommandContext, as_json: bool, wait: float) -> None:
-    """Show what the operator would do now, and change nothing.
+    """Show the steps that the operator would take now, and change nothing.
 
-    The running operator tells it, as status does. Exits with 0 if there is nothing to do, with 3 if
-    there is, with 1 if something is wrong that the operator can't mend.
+    The running operator reports the steps, as for status. Exits with 0 if no step is left, with 3
+    if steps are left, with 1 if something is wrong that the operator can't repair.
     """
     from rosproxy_operator.docker.errors import EngineError
     from rosproxy_operator.docker.host_status import HostStatus, show_plan
@@ -87,11 +89,11 @@ def plan(context: CommandContext, as_json: bool, wait: float) -> None:
 @click.command()
 @click.pass_obj
 def uninstall(context: CommandContext) -> None:
-    """Remove all that the operator has made on this host: run it once the operator has ended.
+    """Remove everything that the operator has created on this host. Stop the operator first.
 
-    That is: redirects in containers' networks, proxies, which unregister their nodes at the master
-    first, and their networks. Labelled containers stay as they are. Exits with 0 if nothing is
-    left, else with 1.
+    The command removes the redirects in networks of containers, the proxies, and the operator's
+    networks. Each proxy first unregisters its nodes at the master. Labelled containers stay as they
+    are. Exits with 0 if nothing is left, else with 1.
     """
     from rosproxy_operator.docker.controller import uninstall as remove_all
     from rosproxy_operator.docker.errors import EngineError
@@ -99,9 +101,9 @@ def uninstall(context: CommandContext) -> None:
 
     if document := ask_operators(context.admin):
         fail(
-            f"an operator is running at {document['operator']} and would make all anew: end it "
-            "first (docker rm -f rosproxy-operator, or docker compose stop operator), then "
-            "uninstall again"
+            f"an operator is running at {document['operator']} and would create everything again. "
+            "Stop that operator (docker rm -f rosproxy-operator, or docker compose stop operator), "
+            "then run uninstall again"
         )
     with exit_on_error(EngineError):
         problems = remove_all(context.settings, context.resync)
@@ -113,11 +115,11 @@ def uninstall(context: CommandContext) -> None:
 @_json_option
 @click.pass_obj
 def doctor(context: CommandContext, names: tuple[str, ...], as_json: bool) -> None:
-    """Find out what is wrong on this host, and say what mends it, the first cause first.
+    """Find faults on this host, and print how to repair each, the first cause first.
 
-    Looks at images, networks, masters and labels, and asks the doctor of each proxy, in its
-    container. With names: about those nodes, topics and services. Exits with 0 if nothing is wrong,
-    with 1 if something is.
+    The command checks images, networks, masters and labels, and runs the doctor of each proxy in
+    the proxy's container. If names are given, the doctors of the proxies check only those nodes,
+    topics and services. Exits with 0 if nothing is wrong, else with 1.
     """
     from rosproxy.cli.questions import print_findings
     from rosproxy_operator.docker.doctor import examine
