@@ -33,7 +33,7 @@ def old_talker(net: Inside, network: str, robot: Robot) -> Container:
 
 def unregistered(controller: Controller) -> int:
     """How many nodes proxies have unregistered on the controller's word."""
-    return sum(map(int, re.findall(r"nodes (\d+) unregistered", controller.logs())))
+    return sum(map(int, re.findall(r"nodes updated: \S+, (\d+) unregistered", controller.logs())))
 
 
 @pytest.mark.parametrize(

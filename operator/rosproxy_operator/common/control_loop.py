@@ -71,7 +71,7 @@ class ControlLoop:
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._failures = 0
-        self._error: str | None = "has not looked yet"
+        self._error: str | None = f"the operator has not looked at the {pace.engine} yet"
         self._again_in: float | None = None
         self._looking_since: float | None = None
         self._looked_at = self._beat_at = 0.0
@@ -90,7 +90,7 @@ class ControlLoop:
                     raise
                 except Exception as error:
                     if not self._failures:
-                        log.exception("a look failed; going on")
+                        log.exception("look failed by an internal error, the operator goes on")
                     self._failed(LookFailed(f"the operator failed: {error!r}"))
                 await self._pause(self._pace.resync)
 
@@ -154,7 +154,7 @@ class ControlLoop:
         if now - self._beat_at > LONGEST_BEAT:
             return f"the event loop has not run for {now - self._beat_at:.0f} s"
         if since is not None and now - since > self._pace.longest:
-            return f"looking at the {self._pace.engine} for {now - since:.0f} s"
+            return f"a look at the {self._pace.engine} has lasted for {now - since:.0f} s"
         return None
 
     def unready(self) -> str | None:
@@ -175,7 +175,7 @@ class ControlLoop:
             async with asyncio.timeout(self._pace.longest):
                 self._again_in = await look()
         except TimeoutError:
-            reason = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
+            reason = f"a look at the {self._pace.engine} took more than {self._pace.longest:.0f} s"
             self._failed(LookFailed(reason, away=True))
         except LookFailed as error:
             is_final = isinstance(error, LookImpossible)

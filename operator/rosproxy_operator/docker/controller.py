@@ -176,7 +176,7 @@ class DockerController:
         snapshot = self._last[0]
         endpoints = {name: (p.admin, p.token) for name, p in snapshot.access.items()}
         stopped = {
-            proxy.container.name: f"its container is {proxy.container.state}"
+            proxy.container.name: f"the proxy's container is {proxy.container.state}"
             for proxy in snapshot.state.proxies
             if proxy.container.state not in ("created", "running")
         }
@@ -189,7 +189,7 @@ class DockerController:
         """What a new look sees and plans, and what proxies say now. Raises LookFailed."""
         await self._loop.look_anew()  # the last one may not have seen a container just started
         if self._last is None:
-            raise LookFailed("the engine has not been looked at yet")
+            raise LookFailed("the operator has not looked at the engine yet")
         snapshot, planned = self._last
         answers = await ask_proxies(self._proxies, snapshot, self._settings.uplink)
         problems = self._current(snapshot, planned)
@@ -214,7 +214,7 @@ class DockerController:
         )
         took = time.monotonic() - started
         log.debug(
-            "looked in %.3f s: %d actions, again in %s s",
+            "look ended in %.3f s: %d actions, next look in %s s",
             took,
             len(planned.actions),
             planned.again_in,
@@ -274,7 +274,8 @@ class DockerController:
 
     def _unsolved(self) -> list[Problem]:
         if self._last is None:
-            return [Problem("engine", self._loop.unready() or "has not been looked at yet")]
+            reason = self._loop.unready() or "the operator has not looked at the engine yet"
+            return [Problem("engine", reason)]
         snapshot, planned = self._last
         problems = [problem for problem in self._current(snapshot, planned) if problem.fatal]
         subjects = {problem.subject for problem in problems}
@@ -285,7 +286,8 @@ class DockerController:
         ]
         unfinished = _required(planned) or planned.deferred or snapshot.state.busy
         if unfinished and not problems:
-            problems.append(Problem("operator", "not all was done in time: run this again"))
+            text = "not all steps were done in time. Run this command again"
+            problems.append(Problem("operator", text))
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:

@@ -95,7 +95,7 @@ class ProxyUpdater:
                 # Not logged before all pauses are used up, which takes 19 s, and then once.
                 if not error.is_unreachable and failures >= len(PAUSES) and str(error) != logged:
                     logged = str(error)
-                    text = "%s could not be told which addresses may use it: %s"
+                    text = "proxy not updated: %s, does not know which addresses may use it: %s"
                     log.warning(text, self._name, error, extra={"proxy": self._name})
                 self._selecting.set()
                 await asyncio.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
@@ -134,18 +134,18 @@ class ProxyUpdater:
         address = self._update.facts.master_address
         if address and status.master.address != address:
             await self._session.tell_master_address(address)
-            text = "%s: its master is now at %s"
+            text = "master moved: %s, the master is now at %s"
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
         body = self._update.body(inside_addresses(status), now)
         if isinstance(refusal, PolicyRefused):
             body.pop("arrived", None)  # adopted nodes would not be kept to the policy
         if body:
-            log.debug("%s is told %s", self._name, body)
+            log.debug("updating proxy: %s, %s", self._name, body)
             answer = await self._session.tell_containers(body)
             counts = {change: answer.get(change) for change in ("unregistered", "moved", "adopted")}
             if text := ", ".join(f"{count} {change}" for change, count in counts.items() if count):
-                log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
+                log.info("nodes updated: %s, %s", self._name, text, extra={"proxy": self._name})
         self._update.mark_delivered(now)
         self._heard(refusal)
 
@@ -249,7 +249,9 @@ def silence(name: str, error: ProxyError, snapshot: DockerSnapshot, uplink: str)
     if isinstance(error, PolicyRefused):
         return Problem(f"proxy {name}", str(error))
     if error.is_unreachable and not snapshot.at_host:
-        advice = f"attach the operator to network {uplink} or run it with network_mode: host"
+        advice = (
+            f"Attach the operator to network {uplink}, or run the operator with network_mode: host"
+        )
     else:
-        advice = f"docker logs {name} may say why"
-    return Problem(f"proxy {name}", f"its admin endpoint {error}: {advice}")
+        advice = f"Read docker logs {name}"
+    return Problem(f"proxy {name}", f"admin endpoint {error}. {advice}")

@@ -223,7 +223,8 @@ class Inspector:
             log.debug("inspecting %s: %s", container[:12], error)
         except msgspec.ValidationError as error:
             if container not in self._unreadable:
-                log.warning("container %s: its inspection can't be read: %s", container[:12], error)
+                text = "container %s: the data of docker inspect can't be read: %s"
+                log.warning(text, container[:12], error)
             self._unreadable.add(container)
         finally:
             del self._asking[container]

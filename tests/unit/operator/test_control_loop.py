@@ -87,7 +87,7 @@ class Looks:
 async def looking(*errors: Exception, **more: Any) -> AsyncIterator[Looks]:
     looks = Looks(*errors, **more)
     looks.loop.wake_threadsafe()  # nobody looks yet
-    assert looks.loop.unready() == "has not looked yet"
+    assert looks.loop.unready() == "the operator has not looked at the engine yet"
     task = asyncio.create_task(looks.loop.run(looks.look))
     await asyncio.sleep(0)
     yield looks
@@ -226,7 +226,7 @@ async def test_a_mistake_of_ours_ends_nothing(caplog: pytest.LogCaptureFixture) 
 async def test_a_look_that_takes_too_long_is_given_up() -> None:
     async with looking(takes=100.0) as looks:
         await asyncio.sleep(60.2)
-        assert looks.loop.unready() == "the engine took more than 60 s"
+        assert looks.loop.unready() == "a look at the engine took more than 60 s"
         looks.takes = 0.0
         await asyncio.sleep(1)
         assert looks.loop.unready() is None
@@ -245,7 +245,7 @@ async def test_a_look_that_cannot_be_given_up_is_dead() -> None:
     await asyncio.sleep(59.5)
     assert loop.dead() is None
     await asyncio.sleep(3)
-    assert loop.dead() == "looking at the engine for 62 s"
+    assert loop.dead() == "a look at the engine has lasted for 62 s"
     await asyncio.sleep(30)
     assert loop.dead() is None
     task.cancel()

@@ -130,7 +130,7 @@ async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, nam
     (told,) = [
         problem.text for problem in planned.problems if problem.subject == f"container {name}"
     ]
-    assert "left alone" in told
+    assert "ignores them" in told
     assert f"docker rm -f {name}" in told
     assert not any(11400 in ports for ports in planned.memory.planned.values())
 
@@ -189,7 +189,7 @@ async def test_an_inspection_that_cannot_be_read_harms_no_other_container(
         assert [container.name for container in look.state.containers] == ["talker"]
         assert not look.state.busy
     (told,) = caplog.messages
-    assert told.startswith(f"container {'c' * 12}: its inspection can't be read: ")
+    assert told.startswith(f"container {'c' * 12}: the data of docker inspect can't be read: ")
     engine.knows[f"/containers/{'c' * 64}/json"] = captured.inspected()
     assert len((await looking.look(5.0)).state.containers) == 2
 
@@ -309,7 +309,7 @@ async def test_the_page_tells_of_a_proxy_that_has_ended(
     controller = DockerController(SETTINGS, 30.0, DockerMetrics())
     assert await controller.documents() == {}
     await controller.look()
-    wanted = {proxy_name(KEY): "its container is exited"} if is_told else {}
+    wanted = {proxy_name(KEY): "the proxy's container is exited"} if is_told else {}
     assert await controller.documents() == wanted
 
 
@@ -331,5 +331,5 @@ async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
 
 async def test_once_without_an_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DOCKER_HOST", "unix:///nowhere")
-    with pytest.raises(LookFailed, match="there is no Docker engine's socket /nowhere"):
+    with pytest.raises(LookFailed, match="socket /nowhere of the Docker engine does not exist"):
         await DockerController(SETTINGS, 30.0, DockerMetrics()).run_once(5.0)

@@ -203,7 +203,7 @@ async def test_what_was_not_heard_is_told_again(
     sync.update(*look("172.18.0.5"))
     assert await proxies.next() == ["172.18.0.5"]
     (told,) = caplog.messages
-    assert "could not be told which addresses may use it: answers HTTP 400" in told
+    assert "does not know which addresses may use it: answers HTTP 400" in told
 
 
 RULE = "deny publish /camera/*"
