@@ -154,8 +154,8 @@ def test_a_misspelt_label(process: Process, net: Inside) -> None:
     _, findings = wrong(process)
     (told,) = [finding for finding in findings if finding["subject"] == f"container {node.name}"]
     assert "label ros-proxy.enable is unknown and ignored" in told["text"]
-    assert "did you mean rosproxy.enable?" in told["text"]
-    assert "did you mean rosproxy.enable?" in process.once("status", check=False)
+    assert "Did you mean rosproxy.enable?" in told["text"]
+    assert "Did you mean rosproxy.enable?" in process.once("status", check=False)
 
 
 def test_a_masters_name_that_leads_nowhere_and_its_fix(
@@ -171,7 +171,7 @@ def test_a_masters_name_that_leads_nowhere_and_its_fix(
     assert findings[0]["subject"] == f"master {named.name}"
     (told,) = [finding for finding in findings if finding["subject"] == f"container {node.name}"]
     for finding in (findings[0], told):
-        assert f"the name {named.name} can't be resolved where the operator runs" in finding["text"]
+        assert f"the operator can't resolve the host name {named.name}" in finding["text"]
         assert f"--add-host {named.name}:ADDRESS" in finding["text"]
         assert "rosproxy.advertise-host" not in finding["text"]
     try:

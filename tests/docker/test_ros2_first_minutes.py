@@ -10,7 +10,7 @@ from tests.docker.engine import docker, wait_until
 from tests.docker.inside import ENABLE
 from tests.docker.ros2 import OPTIONS, THERE, Inside2, Outside, wait_for_line
 
-STATIC_PEERS = f"unset the variable and add the label rosproxy.peers='{THERE}'"
+STATIC_PEERS = f"Unset the variable, and add the label rosproxy.peers='{THERE}'"
 DISCOVERY_SERVER = "ROS_DISCOVERY_SERVER", "192.0.2.1:11811"
 EXTERNAL_ADDRESS = (
     "CYCLONEDDS_URI",
@@ -39,9 +39,9 @@ def names(controller: Controller, variable: str, fix: str) -> bool:
         ("jazzy", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
         ("kilted", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
         ("cyclone", "ROS_STATIC_PEERS", THERE, STATIC_PEERS),
-        ("jazzy", *DISCOVERY_SERVER, "unset it"),
-        ("jazzy", "ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF", "or write SUBNET"),
-        ("jazzy", "FASTDDS_BUILTIN_TRANSPORTS", "SHM", "or write UDPv4"),
+        ("jazzy", *DISCOVERY_SERVER, "Unset the variable"),
+        ("jazzy", "ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF", "or set SUBNET"),
+        ("jazzy", "FASTDDS_BUILTIN_TRANSPORTS", "SHM", "or set UDPv4"),
         ("cyclone", *EXTERNAL_ADDRESS, "let it use the network that it shares with the proxy"),
     ],
 )
@@ -65,7 +65,7 @@ def test_a_setting_that_leads_past_the_proxy(
     assert "got hello" not in reader.log.read()
 
     docker("rm", "--force", node.name)
-    written = fix.partition("write ")[2]
+    written = fix.partition("or set ")[2]
     options = ("--env", f"{name}={written}") if written else ()
     labels = (ENABLE, f"rosproxy.peers={THERE}") if is_by_peers else (ENABLE,)
     inside2.node(network, vendor, "pub", "/out", options=options, labels=labels)

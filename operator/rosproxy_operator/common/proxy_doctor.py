@@ -29,7 +29,10 @@ def read_findings(proxy: str, output: bytes, fixes: Mapping[str, str]) -> list[D
         rows = json.loads(output)["findings"]
         return [_finding(proxy, row, fixes) for row in rows[:MOST_FINDINGS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        text = "its own doctor says nothing that can be read: its image may be of another release"
+        text = (
+            "the output of rosproxy doctor in the proxy's container can't be read. The image may "
+            "be of another release"
+        )
         return [warning("proxy", proxy, text)]
 
 

@@ -12,10 +12,10 @@ LONGEST_VALUE = 80
 """Characters of a variable's value that are told."""
 
 _PROFILE = (
-    "its profile may name other interfaces, addresses or a discovery server: try without it, or "
-    "have it use UDP on all interfaces and announce no address of its own"
+    "The DDS profile may name other interfaces, other addresses or a discovery server. Unset the "
+    "variable, or change the profile: UDP on all interfaces, no announced address"
 )
-_LOCAL = "its nodes look for others on their own machine alone: unset it"
+_LOCAL = "The nodes discover only nodes on their own machine. Unset the variable"
 
 
 def _always(_: str) -> bool:
@@ -33,16 +33,16 @@ def _is_without_udp(value: str) -> bool:
 _KEEP_APART: dict[str, tuple[Callable[[str], bool], str]] = {
     "ROS_DISCOVERY_SERVER": (
         _always,
-        "its nodes ask a discovery server and announce themselves to no other: unset it",
+        "The nodes announce themselves only to a discovery server. Unset the variable",
     ),
     "ROS_LOCALHOST_ONLY": (lambda value: value == "1", _LOCAL),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": (
         lambda value: value.upper() in ("LOCALHOST", "OFF"),
-        f"{_LOCAL}, or write SUBNET",
+        f"{_LOCAL}, or set SUBNET",
     ),
     "FASTDDS_BUILTIN_TRANSPORTS": (
         _is_without_udp,
-        "a proxy carries UDP alone: unset it, or write UDPv4",
+        "A proxy forwards UDP only. Unset the variable, or set UDPv4",
     ),
     "CYCLONEDDS_URI": (_always, _PROFILE),
     "FASTDDS_DEFAULT_PROFILES_FILE": (_always, _PROFILE),
@@ -60,5 +60,5 @@ def why_unheard(variables: Mapping[str, str]) -> str:
     for name, (keeps_apart, text) in _KEEP_APART.items():
         value = variables.get(name, "")
         if value and keeps_apart(value):
-            return f"its variable {name}={brief(value, LONGEST_VALUE)}: {text}"
+            return f"variable {name}={brief(value, LONGEST_VALUE)}. {text}"
     return ""

@@ -24,11 +24,15 @@ _CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
 """What may follow from what: the kinds of subjects, first causes first."""
 _BEING_MADE = ("absent", "created")
 """States of a proxy's container while an operator makes the proxy."""
-_ADDRESS = "label rosproxy.advertise-host=ADDRESS on its containers, or --advertise-host"
+_ADDRESS = (
+    "add the label rosproxy.advertise-host=ADDRESS to the containers of this proxy, or start the "
+    "operator with --advertise-host ADDRESS"
+)
 FIXES = {
     "advertised host": _ADDRESS,
-    "published range": f"let its ports through this host's firewall; or {_ADDRESS}",
-    "ports": "label rosproxy.ports=N on its containers, or --ports N",
+    "published range": f"open the ports in the firewall of this host; or {_ADDRESS}",
+    "ports": "add the label rosproxy.ports=N to a container of this proxy, or start the operator "
+    "with --ports N",
 }
 """What mends what proxies find about themselves, by their checks."""
 
@@ -48,8 +52,8 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
             try:
                 output = await in_thread(engine.run, name, *command(names))
             except EngineError as failure:
-                text = f"its own doctor could not be asked: {failure}"
-                return [warning("proxy", f"proxy {name}", text, f"docker logs {name}")]
+                text = f"rosproxy doctor could not run in the proxy's container: {failure}"
+                return [warning("proxy", f"proxy {name}", text, f"read docker logs {name}")]
         return read_findings(f"proxy {name}", output, FIXES)
 
     told = {problem["subject"] for problem in status["problems"]}
@@ -87,12 +91,12 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
     for proxy in status["proxies"]:
         if proxy["state"] != "running":
             report = note if runs and proxy["state"] in _BEING_MADE else error
-            text = f"its container is {proxy['state']}"
-            fix = f"docker logs {proxy['name']}; is the operator running?"
+            text = f"the proxy's container is {proxy['state']}"
+            fix = f"check that the operator runs; read docker logs {proxy['name']}"
             yield report("proxy", f"proxy {proxy['name']}", text, fix)
     if status["actions"]:
-        text = f"{plural(len(status['actions']), 'step')} yet to be done, the first: "
-        fix = "start the operator if it does not run; rosproxy-operator docker plan shows them"
+        text = f"{plural(len(status['actions']), 'step')} left, the first: "
+        fix = "start the operator if none runs; rosproxy-operator docker plan lists the steps"
         report = note if runs else warning
         yield report("operator", "operator", text + status["actions"][0], fix)
     members = {c["name"] for c in status["containers"] if c["proxy"]}
@@ -101,7 +105,7 @@ def host_findings(status: Json) -> Iterator[DoctorFinding]:
         yield ok("host", "host", text)
     elif not problems:
         fix = "docker run --label rosproxy.enable=true ..."
-        yield warning("host", "host", "no container is labelled, so that none has a proxy", fix)
+        yield warning("host", "host", "no container is labelled, so no container has a proxy", fix)
 
 
 def _order(problem: Json) -> tuple[bool, int]:

@@ -85,12 +85,13 @@ def _proxy(key: Key, observed: HostState, statuses: ProxyStatuses, settings: Pla
     status = statuses.get(proxy.container.name) if proxy else None
     problems = [f"{p.subject}: {p.text}" for p in (status.problems if status else ())]
     if sandbox_state != "running":
-        subject = f"the container {sandbox_name(key)}, which holds its ports and networks"
+        subject = f"the container {sandbox_name(key)}, which holds the proxy's ports and networks"
         problems.insert(0, f"{subject}, is {sandbox_state}")
     lan_relay = _best(observed.lan_relays_of(key), lan_relay_name(key))
     if lan_relay and lan_relay.container.state != "running":
         problems.append(
-            f"the container {lan_relay_name(key)}, its LAN relay, is {lan_relay.container.state}"
+            f"the container {lan_relay_name(key)}, the proxy's LAN relay, is "
+            f"{lan_relay.container.state}"
         )
     domain = status.domains[0] if status and status.domains else None
     return {
@@ -187,8 +188,8 @@ def _unheard(
         addresses = _addresses(container, observed).values()
         reason = why_unheard(container.variables)
         if reason and settled and not participants_by_address(status).keys() & {*addresses}:
-            text = f"the proxy has heard no participant of it, perhaps by {reason}"
-            yield Problem(f"container {container.name}", text)
+            text = "the proxy has discovered no participant of this container. Possible cause: "
+            yield Problem(f"container {container.name}", f"{text}{reason}")
 
 
 def _unix_time(text: str) -> float:

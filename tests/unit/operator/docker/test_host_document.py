@@ -100,7 +100,7 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
     own = replace(running.container, name="p", started_at=STARTED_AT)
     state = observed(proxies=[replace(running, container=own)])
     made = planned(state, SETTINGS, DockerMemory(), 0.0)
-    silence = Problem("proxy p", "its admin endpoint refuses connections")
+    silence = Problem("proxy p", "admin endpoint refuses connections")
     document = host_document(state, made, (), {"p": silence}, SETTINGS, STARTED + age)
     told = [problem["text"] for problem in document["problems"]]
     assert (silence.text in told) is is_told
@@ -109,13 +109,13 @@ def test_a_proxy_that_has_just_started_may_be_silent(age: float, is_told: bool) 
 @pytest.mark.parametrize(
     ("variables", "fix"),
     [
-        ({"ROS_DISCOVERY_SERVER": "10.0.0.9:11811"}, "unset it"),
-        ({"ROS_LOCALHOST_ONLY": "1"}, "unset it"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}, "or write SUBNET"),
-        ({"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}, "or write UDPv4"),
-        ({"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, "or write UDPv4"),
-        ({"CYCLONEDDS_URI": "file:///cyclone.xml"}, "try without it"),
-        ({"FASTRTPS_DEFAULT_PROFILES_FILE": "/profile.xml"}, "try without it"),
+        ({"ROS_DISCOVERY_SERVER": "10.0.0.9:11811"}, "Unset the variable"),
+        ({"ROS_LOCALHOST_ONLY": "1"}, "Unset the variable"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}, "or set SUBNET"),
+        ({"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}, "or set UDPv4"),
+        ({"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, "or set UDPv4"),
+        ({"CYCLONEDDS_URI": "file:///cyclone.xml"}, "or change the profile"),
+        ({"FASTRTPS_DEFAULT_PROFILES_FILE": "/profile.xml"}, "or change the profile"),
     ],
 )
 def test_a_variable_is_named_where_no_participant_is_heard(
@@ -123,7 +123,7 @@ def test_a_variable_is_named_where_no_participant_is_heard(
 ) -> None:
     (text,) = told_of_talker(variables)
     ((name, value),) = variables.items()
-    assert f"its variable {name}={value}: " in text
+    assert f"Possible cause: variable {name}={value}. " in text
     assert fix in text
     assert not told_of_talker(variables, inside=[TALKER.address]), "all is well"
     assert not told_of_talker(variables, age=1.0), "it has just started"
