@@ -146,7 +146,7 @@ def test_two_proxies_one_of_which_is_killed(lab: Lab, second: Second, browser: B
     (broken,) = node_rows(browser, "two (proxy)")
     admin = f"{lab.place('px2').address}:{ADMIN_PORT}"
     assert broken[0] == "BROKEN"
-    assert broken[-1] == f"it can't be asked: {admin} refuses connectionsdocker logs two"
+    assert broken[-1] == f"no data from this proxy: {admin} refuses connectionsdocker logs two"
     assert "docker logs two" in trouble(browser)
     assert box_colour(browser, "two") == red
     assert title(browser) == "(1 broken) rosproxy"

@@ -108,7 +108,9 @@ async def _show(exposition: SharedDocument[bytes], request: web.BaseRequest) -> 
 
 async def _tell(status: GetStatus, visitors: Visitors, request: web.BaseRequest) -> web.Response:
     if not visitors.may_look(request):
-        return web.Response(status=403, text="the status is for this machine's own loopback\n")
+        return web.Response(
+            status=403, text="/status answers only callers on loopback of this machine\n"
+        )
     try:
         return web.json_response(await status())
     except LookFailed as error:

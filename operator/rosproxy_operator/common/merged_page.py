@@ -76,7 +76,7 @@ def merged(
     inside = _inside(documents)
     for name, document in documents.items():
         if isinstance(document, str):
-            text = f"it can't be asked: {document}"
+            text = f"no data from this proxy: {document}"
             nodes[name] = PageNode(HOST, PROXY, name, BROKEN, text, logs(name))
             continue
         others = documents.keys() - {name}

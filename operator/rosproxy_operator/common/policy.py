@@ -34,7 +34,7 @@ def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple
     all_rules = tuple(rule for group in rules for rule in group)
     layers = (PolicyLayer(ADMINISTRATOR, all_rules, PolicyMode(mode)),) if all_rules else ()
     if problem := too_much(layers):
-        raise SettingError("--policy", f"{problem}; join some by globs")
+        raise SettingError("--policy", f"{problem}. Join rules by globs")
     return layers
 
 

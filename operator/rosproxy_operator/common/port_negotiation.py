@@ -30,12 +30,15 @@ def after_move(ros1: bool, ros2: bool) -> str:
     """
     effects = []
     if ros1:
-        text = "nodes that had registered under the old ones can't be reached: restart them"
+        text = "Restart the nodes that registered on the old ports: outside can't reach them"
         effects.append(text)
     if ros2:
-        text = "participants of ROS 2 meet outside anew; restart those that do not in a minute"
+        text = (
+            "Outside discovers the ROS 2 participants again. Restart the participants that outside "
+            "has not discovered after a minute"
+        )
         effects.append(text)
-    return "; ".join(effects)
+    return ". ".join(effects)
 
 
 class PortsExhausted(Exception):

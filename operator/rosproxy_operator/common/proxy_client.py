@@ -103,7 +103,7 @@ class ProxyClient:
             )
         except ProxyError as error:
             if error.status == 404:
-                text = "it has no live page: its image is that of a former release"
+                text = "the proxy has no live page: its image is of a former release"
                 raise ProxyError(text, status=404) from None
             raise
         try:
@@ -148,12 +148,15 @@ class ProxyClient:
         except ProxyError as error:
             if error.status == 404 and layers:
                 text = (
-                    "does not support policies, so nobody new may use it: its image is that of a "
-                    "former release; let it have the operator's"
+                    "does not support policies, since its image is of a former release. So no new "
+                    "container or pod may use the proxy. Give the proxy the image of this release"
                 )
                 raise PolicyRefused(text, status=404) from None
             if error.status == 400:
-                text = f"refuses its policy, so nobody new may use it until it takes one: {error}"
+                text = (
+                    f"refuses its policy: {error}. Until the proxy accepts a policy, no new "
+                    "container or pod may use the proxy"
+                )
                 raise PolicyRefused(text, status=400) from None
             if error.status not in (404, 503):
                 raise
@@ -215,13 +218,15 @@ class ProxyClient:
                 text = (await read_bounded(reply.content, longest)).decode(errors="replace")
                 if reply.status == 200:
                     return text
-                message = f"{method} {url} answers HTTP {reply.status}: {text.strip()[:200]}"
+                request = f"{method} {path.partition('?')[0]}"
+                message = f"{admin} answers HTTP {reply.status} to {request}: {text.strip()[:200]}"
                 raise ProxyError(message, status=reply.status)
         except TimeoutError:
             raise ProxyError(f"{admin} does not answer", away=True) from None
         except TooLong:
-            what = f"{method} {path.partition('?')[0]} with more than {longest} bytes"
-            text = f"{admin} answers {what}: the proxy is of another version, or taken over"
+            request = f"{method} {path.partition('?')[0]}"
+            text = f"{admin} answers more than {longest} bytes to {request}"
+            text = f"{text}: the proxy is of another release, or compromised"
             raise ProxyError(text, unreadable=True) from None
         except (OSError, aiohttp.ClientError) as error:
             raise _no_answer(admin, error) from None

@@ -87,7 +87,7 @@ async def test_a_proxy_of_a_former_release_says_so(client: ProxyClient) -> None:
     await web.TCPSite(former, address.host, address.port).start()
     try:
         documents = await client.documents({"old": (address, TOKEN)})
-        assert documents == {"old": "it has no live page: its image is that of a former release"}
+        assert documents == {"old": "the proxy has no live page: its image is of a former release"}
     finally:
         await former.cleanup()
 

@@ -119,5 +119,5 @@ def test_the_range_of_a_usual_host() -> None:
 @pytest.mark.parametrize(("ros1", "ros2"), [(True, False), (False, True), (True, True)])
 def test_what_to_do_after_a_move_is_told(ros1: bool, ros2: bool) -> None:
     told = after_move(ros1, ros2)
-    assert ("nodes that had registered" in told, "ROS 2" in told) == (ros1, ros2)
-    assert "restart" in told
+    assert ("nodes that registered" in told, "ROS 2" in told) == (ros1, ros2)
+    assert "Restart" in told

@@ -159,7 +159,7 @@ def test_a_proxy_that_cannot_be_asked_says_why() -> None:
     node = document["nodes"]["one"]
     assert (node["state"], node["text"], node["fix"]) == (
         BROKEN,
-        "it can't be asked: 10.0.0.1:11312 refuses connections",
+        "no data from this proxy: 10.0.0.1:11312 refuses connections",
         "docker logs one",
     )
 
@@ -239,7 +239,7 @@ def test_no_proxy_has_a_key_of_another_one() -> None:
         nodes = merged(documents, "1.0", LOGS)["nodes"]
         assert nodes["good /talker"] == {"lane": "container", "label": "/talker", "proxy": "good"}
         assert nodes["good rosproxy"]["label"] == "good"
-        assert nodes["silent"]["text"] == "it can't be asked: no answer"
+        assert nodes["silent"]["text"] == "no data from this proxy: no answer"
 
 
 def test_no_proxy_tells_of_links_between_nodes_of_others() -> None:

@@ -96,7 +96,7 @@ async def test_a_proxy_is_told_all_layers() -> None:
 async def test_one_of_a_former_release_has_no_policy_at_all() -> None:
     async with proxy() as (client, admin):
         await client.policy(admin, "token", [])
-        with pytest.raises(PolicyRefused, match="its image is that of a former release"):
+        with pytest.raises(PolicyRefused, match="its image is of a former release"):
             await client.policy(admin, "token", [OWN])
 
 

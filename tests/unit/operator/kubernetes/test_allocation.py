@@ -169,7 +169,7 @@ def test_who_has_left_his_ports_is_told() -> None:
     _, plan = changed(window=PortRange(11410, 11420))
     (text,) = told(plan, "PortConflict")
     assert "has left ports 11400-11403 for 11410-11413" in text
-    assert "restart them" in text
+    assert "Restart the nodes" in text
 
 
 # conflicts
@@ -211,7 +211,7 @@ def test_ports_that_have_served_are_tried_for_a_while() -> None:
     third = look(STUCK, second.state, 121.0)
     assert kinds(third) == [DeleteProxy]
     assert third.state.given[ROBOT_ON_ONE] == NEXT
-    assert any("restart them" in text for text in told(third, "PortConflict"))
+    assert any("Restart the nodes" in text for text in told(third, "PortConflict"))
 
 
 def test_a_rejected_pod_is_made_anew_on_the_same_ports_for_a_while() -> None:
