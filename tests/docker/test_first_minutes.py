@@ -12,7 +12,7 @@ from tests.docker.inside import ENABLE, Inside
 from tests.docker.nodes import node_command
 from tests.docker.robot import Robot
 
-ADVICE = re.compile(r"set ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?$")
+ADVICE = re.compile(r"[Ss]et ROS_MASTER_URI=(\S+)(?: and the label (\S+=\S+))?$")
 
 
 def told(controller: Controller, name: str) -> str:
@@ -180,10 +180,10 @@ def test_the_hosts_address_as_the_containers_own(
     text = told(controller, first.name)
 
     wait_until(lambda: first.state == "exited", 60, first.log.read)
-    quoted = re.search(r"ends with '(.+)':", text)
+    quoted = re.search(r"ends with '(.+)'\.", text)
     assert quoted
     assert quoted[1] in first.log.read()
-    advice = re.search(r"leave (\w+) out", text)
+    advice = re.search(r"Unset (\w+):", text)
     assert advice
     assert advice[1] == "ROS_IP"
     first.remove()

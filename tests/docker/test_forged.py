@@ -52,7 +52,7 @@ def test_image_with_the_labels_of_a_proxy_is_told_and_left_alone(
     forged = net.run(alone, image=forged_image, labels=(), uri="")
     wait_until(lambda: forged.name in controller.problems(), 60, controller.logs)
     text = next(line for line in controller.problems().splitlines() if forged.name in line)
-    assert "its name is not rosproxy-robot-" in text
+    assert "the name is not rosproxy-robot-" in text
     assert f"docker rm -f {forged.name}" in text
 
     net.idle(joined)

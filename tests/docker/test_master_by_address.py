@@ -65,8 +65,8 @@ def test_it_is_told_and_leaves_no_more_than_a_record(
 
     (row,) = (row for row in controller.status()["containers"] if row["name"] == node.name)
     assert row["redirect"] == {"master": f"{robot.address}:11311", "in_place": True}
-    assert f"{robot.address}:11311 leads to its proxy there" in controller.command("status")
-    assert "goes around" not in controller.problems()
+    assert f"{robot.address}:11311 is redirected to the proxy" in controller.command("status")
+    assert "bypass the proxy" not in controller.problems()
     (record,) = managed("redirect")
     made = inspect(record)
     assert (made["State"]["Status"], made["State"]["ExitCode"]) == ("exited", 0)
@@ -162,5 +162,5 @@ def test_what_can_not_be_redirected_is_told(
 
     wait_until(lambda: f"container {node.name}" in controller.problems(), 30, controller.problems)
 
-    assert "its networks have no way outwards" in controller.problems()
+    assert "all networks of the container are internal" in controller.problems()
     assert not managed("redirect")

@@ -126,9 +126,9 @@ def test_range_taken_by_another_while_the_proxy_was_down(
         controller.logs,
     )
     the_proxy(40)
-    wait_until(lambda: "HAS LEFT ITS PORTS" in controller.problems(), 40, controller.problems)
-    assert "HAS LEFT ITS PORTS" in controller.logs()
-    assert "restart them" in controller.problems()
+    wait_until(lambda: "has left ports" in controller.problems(), 40, controller.problems)
+    assert "has left ports" in controller.logs()
+    assert "Restart the nodes" in controller.problems()
     left = named.uri(node.node)
     docker("restart", "--time", "0", node.name)
     # roscpp takes what the reply to its subscription says, also if it is older than an update.

@@ -127,7 +127,7 @@ def test_it_can_be_switched_off(
     node = addressed_talker(near, network, robot)
     other = near.idle(network, labels=(ENABLE, "rosproxy.redirect=false"))
     redirected(node, network)
-    assert "without label rosproxy.redirect='false' it is led" in told(running, tmp_path)
+    assert "Or remove label rosproxy.redirect='false'" in told(running, tmp_path)
     assert not rules(other)
     running.kill()
 
@@ -135,7 +135,7 @@ def test_it_can_be_switched_off(
 
     wait_until(lambda: not managed("redirect"), 30, "the record is removed")
     assert not rules(node)
-    assert "the operator's --no-redirect keeps it" in told(off, tmp_path)
+    assert "start the operator without --no-redirect" in told(off, tmp_path)
     late = near.node(network, "rospy", "pub", "--topic", "/late")
     wait_until(lambda: bool(robot.uri(late.node)), 60, late.log.read)
     assert the_proxy().running

@@ -97,7 +97,7 @@ def test_range_taken_by_another_while_neither_proxy_nor_operator_was_there(
         wait_until(lambda: all_run(proxy), 60, lambda: docker("ps", "--all"))
         lan.end()
         Flow(lan, inside2)
-        assert "HAS LEFT ITS PORTS" in controller.logs()
+        assert "has left ports" in controller.logs()
     finally:
         lan.end()
 

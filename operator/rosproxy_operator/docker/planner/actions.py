@@ -70,7 +70,7 @@ class CreateSandbox(_CreateContainer, frozen=True):
     udp: bool = False
 
     def _details(self) -> str:
-        return f": it holds ports {self.range} for the proxy of the {self.key.graph}"
+        return f": sandbox with ports {self.range} for the proxy of the {self.key.graph}"
 
 
 class Create(_CreateContainer, frozen=True):
@@ -115,8 +115,8 @@ class CreateLanRelay(_CreateContainer, frozen=True):
 
     def _details(self) -> str:
         return (
-            f": it carries announcements of the {self.key.graph} between the LAN at {self.lan} and "
-            f"the proxy at {self.proxy}"
+            f": LAN relay of the {self.key.graph} between the LAN at {self.lan} and the proxy at "
+            f"{self.proxy}"
         )
 
 
@@ -136,8 +136,8 @@ class CreateRedirect(_CreateContainer, frozen=True):
     def _details(self) -> str:
         location = f"in the network of container {self.target[:12]}"
         if self.master is None:
-            return f": it takes the redirect of the {self.key.graph} away {location}"
-        return f": {location} it leads {self.master} to the proxy at {self.proxy}"
+            return f": removes the redirect of the {self.key.graph} {location}"
+        return f": redirects {self.master} to the proxy at {self.proxy} {location}"
 
 
 class CreateFlush(_CreateContainer, frozen=True):
@@ -147,7 +147,7 @@ class CreateFlush(_CreateContainer, frozen=True):
 
     def _details(self) -> str:
         return (
-            f": it deletes the host's conntrack entries for UDP ports {self.range} of the "
+            f": deletes the host's conntrack entries for UDP ports {self.range} of the "
             f"{self.key.graph}"
         )
 
@@ -223,5 +223,5 @@ class Remove(Action, frozen=True):
     stop: bool = False
 
     def _details(self) -> str:
-        after = ", after it has told outside that its nodes have ended" if self.retire else ""
-        return f" ({self.why}){after}"
+        text = "after the proxy has told outside that its nodes have ended"
+        return f" ({self.why})" + (f", {text}" if self.retire else "")

@@ -167,8 +167,8 @@ class _Allocation:
                 )
             except PortsExhausted as error:
                 text = (
-                    f"{error}: lower --ports or the label rosproxy.ports ({count}), widen "
-                    f"--port-window ({window}), or stop what holds ports there"
+                    f"{error}. Lower --ports or the label rosproxy.ports ({count}), widen "
+                    f"--port-window ({window}), or stop programs that hold ports there"
                 )
                 self.problems.append(_problem(key, text, fatal=True))
         elif not frozen:
@@ -177,8 +177,8 @@ class _Allocation:
             if len(self.allocated[key]) < count:
                 missing = PortRange(kept.last + 1, kept.first + count - 1)
                 text = (
-                    f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps "
-                    f"its {len(kept)} at {kept}: {self._why_not_longer(key, missing)}"
+                    f"has only the {len(kept)} ports {kept}, although --ports or the label "
+                    f"rosproxy.ports asks for {count}: {self._why_not_longer(key, missing)}"
                 )
                 self.problems.append(_problem(key, text))
 
@@ -186,14 +186,14 @@ class _Allocation:
         """What keeps a key's range from getting these ports, and what to do."""
         window = self.settings.port_window
         if missing.last > window.last:
-            return f"{missing} is beyond --port-window ({window}): widen that"
+            return f"ports {missing} are beyond --port-window ({window}). Widen --port-window"
         for neighbour, ports in sorted(self.allocated.items()):
             if neighbour != key and overlap(ports, missing):
                 return (
-                    f"proxy {proxy_name(neighbour)} has {ports}. To have it move, stop its "
-                    "containers until the operator has removed it (--grace), then start them"
+                    f"proxy {proxy_name(neighbour)} has {ports}. Stop the containers of that proxy "
+                    "until the operator has removed that proxy (--grace), then start them again"
                 )
-        return f"{missing} are not all free: stop what holds them (ss -ltnup)"
+        return f"ports {missing} are not all free. Stop the programs that hold them (see ss -ltnup)"
 
 
 def allocate(
@@ -224,8 +224,8 @@ def allocate(
     for key, ports in sorted(ranges.items(), key=lambda item: item[0]):
         if key in moved and not within(moved[key].ports, ports):
             text = (
-                f"HAS LEFT ITS PORTS {moved[key].ports} for {ports}, since something else has "
-                f"taken them: {after_move(not key.is_ros2, key.is_ros2)}"
+                f"has left ports {moved[key].ports} for {ports}, since another program or "
+                f"container has taken old ports. {after_move(not key.is_ros2, key.is_ros2)}"
             )
             allocation.problems.append(_problem(key, text))
     memory = replace(memory, served=served, planned=ranges, moved=moved)

@@ -54,6 +54,8 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.settings import PlanSettings
 
+REPLACED = "replaced by another container"
+"""Why a container is removed whose successor has been created."""
 _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 
 
@@ -278,7 +280,7 @@ def _start_steps(context: PlanContext, selection: Selection, kept: Container) ->
         yield Connect(kept.name, context.settings.uplink, ())
     if selection.predecessor:
         yield from _emptying_steps(context, selection.predecessor)
-        yield Remove(selection.predecessor.name, "another one takes over")
+        yield Remove(selection.predecessor.name, REPLACED)
     yield Start(kept.name)
     yield from _connect(context, kept.name)
 
@@ -292,7 +294,7 @@ def _emptying_steps(context: PlanContext, old: Container) -> Iterator[Action]:
     """End the proxies properly that are in a sandbox, before it goes."""
     for proxy in context.observed.proxies_of(context.desired.key):
         if proxy.container.network_container == old.id and proxy.container.state != "removing":
-            yield Remove(proxy.container.name, "its sandbox is made anew", stop=True)
+            yield Remove(proxy.container.name, "the sandbox is replaced", stop=True)
 
 
 def _process_steps(
@@ -350,7 +352,7 @@ def keep_running_steps(
 ) -> Iterator[Action]:
     """Have a container run that stays; one that is ``lost`` is to be started anew."""
     if selection.predecessor:
-        yield Remove(selection.predecessor.name, "another one takes over")
+        yield Remove(selection.predecessor.name, REPLACED)
     if kept.state == "paused":
         yield Unpause(kept.name)
     if selection.waiting:
@@ -393,5 +395,5 @@ def creation_steps(
     yield action
     if selection.predecessor:
         yield from ended
-        yield Remove(former, "made anew")
+        yield Remove(former, REPLACED)
     yield Start(action.name)

@@ -76,7 +76,7 @@ def flush_steps(
             continue
         is_published = bool(observed.sandboxes_of(key)) or key in live
         if observed.deletes_udp_entries or not is_published:
-            gone = (Remove(r.container.name, "it is needed no more") for r in existing)
+            gone = (Remove(r.container.name, "no longer needed") for r in existing)
             yield FlushSteps(key, tuple(gone))
         elif key in live and (sandbox := _published(key, observed)):
             steps = _steps(sandbox, existing, outdated, observed, settings)
@@ -129,7 +129,7 @@ def _fix(sandbox: Sandbox) -> str:
     """How users delete the entries themselves."""
     ports = own_range(sandbox.key, sandbox.range)
     return (
-        "datagrams of nodes that went on sending while the ports were not published may bypass the "
+        "Datagrams of nodes that went on sending while the ports were not published may bypass the "
         f"ports. Run as root: for port in $(seq {ports.first} {ports.last}); do conntrack -D -p "
         "udp --orig-port-dst $port; done"
     )

@@ -43,7 +43,7 @@ def with_lan_relay(context: PlanContext, steps: list[Action]) -> list[Action]:
         return steps
     sandboxes = {s.container.name for s in context.observed.sandboxes_of(key)}
     if any(_starts(step, sandboxes) for step in steps):
-        return [*_without(context, "its proxy gets another address"), *steps]
+        return [*_without(context, "the proxy gets another address"), *steps]
     return [*steps, *_lan_relay_steps(context)]
 
 
@@ -52,8 +52,8 @@ def missing_lan_relay(key: Key, observed: HostState, settings: PlanSettings) -> 
     if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.lan_relays_of(key):
         return None
     text = (
-        "does not hear the LAN, since this host's address there is not known: start the operator "
-        f"with --ros2-lan ADDRESS, or with --ros2-lan {NOWHERE} if peers are enough"
+        "has no LAN relay, since the operator does not know this host's address on the LAN. Start "
+        f"the operator with --ros2-lan ADDRESS, or with --ros2-lan {NOWHERE} if peers are enough"
     )
     return Problem(f"proxy {proxy_name(key)}", text, fatal=False)
 
@@ -96,7 +96,7 @@ def _wanted(context: PlanContext) -> CreateLanRelay | None:
 def _lan_relay_steps(context: PlanContext) -> Iterator[Action]:
     lan_relay = _wanted(context)
     if context.settings.ros2_lan == NOWHERE:
-        yield from _without(context, "the LAN is not to be heard")
+        yield from _without(context, f"--ros2-lan is {NOWHERE}")
     # Where an address is not known now, the LAN relay that is there stays as it is.
     elif lan_relay is not None:
         yield from _ensure_lan_relay(context, lan_relay)

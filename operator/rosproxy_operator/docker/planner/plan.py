@@ -31,7 +31,7 @@ from rosproxy_operator.docker.planner.specs import master, proxy_name, unresolve
 from rosproxy_operator.docker.planner.state import DockerMemory, after_look, with_exited
 from rosproxy_operator.docker.settings import PlanSettings
 
-UNWANTED = "no running container wants it any more"
+UNWANTED = "no running container needs the proxy"
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""
 
@@ -144,15 +144,16 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     if not observed.image_id:
         return Problem(
             f"proxy image {settings.proxy_image}",
-            f"not on this host: docker pull {settings.proxy_image}, or in rosproxy's sources: "
+            f"not on this host. Run docker pull {settings.proxy_image}, or in rosproxy's sources "
             f"docker build --target proxy -t {settings.proxy_image} .",
         )
     for network in observed.networks:
         if network.name == settings.uplink and (network.internal or network.driver != "bridge"):
             return Problem(
                 f"network {network.name}",
-                "can't be the proxies' uplink: it must be an ordinary bridge, not internal: remove "
-                "it (the operator creates it anew) or name another one with --uplink",
+                "can't be the uplink of the proxies: the uplink must be a bridge, and not "
+                "internal. Remove the network (the operator creates a new one), or name another "
+                "network with --uplink",
             )
     return None
 
@@ -234,7 +235,9 @@ def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
     for own in observed.own:
         name = own.container.name
         if own.key in live and own.container.state == "restarting":
-            yield Problem(f"proxy {name}", f"ends and is restarted: see docker logs {name}")
+            yield Problem(
+                f"proxy {name}", f"the container has ended and restarts. Read docker logs {name}"
+            )
     for host in sorted(host for host, address in observed.masters.items() if not address):
         yield Problem(f"master {host}", unresolved_master(host))
 

@@ -130,8 +130,8 @@ def redirect_steps(
 def _by_name(key: Key) -> str:
     """How nodes use their proxy where no redirect can be set."""
     return (
-        "so its nodes go around the proxy, and it is tried again; or set "
-        f"ROS_MASTER_URI=http://{proxy_name(key)}:{master(key).port} and the label "
+        "Until the redirect is in place, the nodes bypass the proxy. The operator tries again; or "
+        f"set ROS_MASTER_URI=http://{proxy_name(key)}:{master(key).port} and the label "
         f"{MASTER_URI}={key.master_uri}"
     )
 
@@ -246,7 +246,7 @@ def _removal_steps(
     """
     owner = next((c for c in observed.containers if c.id == target), None)
     if owner is None or owner.state not in STARTED:
-        return [Remove(r.container.name, "its network is gone") for r in records]
+        return [Remove(r.container.name, "the network namespace is gone") for r in records]
     # Also those of a former start: whoever has started the record since has set its rules anew.
     record = next(iter(records))
     action = CreateRedirect("", record.key, record.range, target, owner.started_at)

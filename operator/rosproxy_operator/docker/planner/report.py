@@ -32,7 +32,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
         "",
     )
     if status["operator"] is None:
-        text = "No operator was asked: this is as one with these options would see it."
+        text = "No operator was asked: this is the view of an operator with these options."
         head += wrap(text, columns, "")
     else:
         head += wrap(f"Live page of all proxies: {clean(status['operator'])}/", columns, "")
@@ -44,7 +44,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     ]
     steps = [clean(action) for action in status["actions"]]
     ending = _listing("problems:", problems, columns)
-    ending += _listing(f"yet to be done: {plural(len(steps), 'step')}", steps, columns)
+    ending += _listing(f"{plural(len(steps), 'step')} left:", steps, columns)
     full = [*head, "", *_proxies(status, columns), "", *_containers(status, columns, True), *ending]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
@@ -100,9 +100,9 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         yield row
         if details and (redirect := container["redirect"]):
             effect = (
-                "leads to its proxy there"
+                "is redirected to the proxy"
                 if redirect["in_place"]
-                else "does not lead to its proxy yet"
+                else "is not redirected to the proxy yet"
             )
             yield from wrap(f"{redirect['master']} {effect}", columns, INDENT)
         if details:

@@ -50,14 +50,15 @@ class Uninstall:
 
 
 def _other_operator(observed: HostState, first: frozenset[str]) -> Problem | None:
-    """Who makes anew what is removed, as a problem; None if nobody does."""
+    """The problem that another operator creates containers again; None without such containers."""
     anew = [own.container.name for own in observed.own if own.container.id not in first]
     if not anew:
         return None
     return Problem(
         "operator",
-        f"an operator is running on this host: {listed(anew)} was made meanwhile; end it first "
-        "(docker rm -f rosproxy-operator, or docker compose stop operator), then uninstall again",
+        f"another operator is running on this host: it has created {listed(anew)} meanwhile. Stop "
+        "that operator (docker rm -f rosproxy-operator, or docker compose stop operator), then run "
+        "uninstall again",
     )
 
 
@@ -83,17 +84,17 @@ def _remaining(observed: HostState, settings: PlanSettings) -> Iterator[Problem]
         if guests := _guests(observed, network.name) if network.made_by_operator else []:
             yield Problem(
                 f"network {network.name}",
-                f"stays, as {listed(guests)} is on it: docker network disconnect {network.name} "
-                f"{guests[0]}, then uninstall again",
+                f"not removed, since containers are on this network: {listed(guests)}. Run docker "
+                f"network disconnect {network.name} {guests[0]}, then run uninstall again",
             )
     if observed.redirects and not observed.image_id:
         names = {container.id: container.name for container in observed.containers}
         owners = (record.container.network_container or "" for record in observed.redirects)
         yield Problem(
             f"proxy image {settings.proxy_image}",
-            "not on this host, and it is what takes the redirects out of the networks of "
-            f"{listed(sorted({names.get(owner, owner[:12]) for owner in owners}))}: docker pull "
-            f"{settings.proxy_image}, then uninstall again",
+            "not on this host. The operator needs the image to remove the redirects in the networks"
+            f" of {listed(sorted({names.get(owner, owner[:12]) for owner in owners}))}. Run docker "
+            f"pull {settings.proxy_image}, then run uninstall again",
         )
 
 

@@ -167,14 +167,14 @@ def test_an_engine_that_deletes_entries_by_itself_needs_none() -> None:
     newer = replace(published(), deletes_udp_entries=True)
     assert steps(newer) == []
     upgraded = replace(newer, flushes=(record(MADE),))
-    assert steps(upgraded) == [Remove(NAME, "it is needed no more")]
+    assert steps(upgraded) == [Remove(NAME, "no longer needed")]
 
 
 def test_the_record_goes_after_the_sandbox() -> None:
     state = replace(published(), containers=(), flushes=(record(MADE),))
     assert steps(state) == []
     gone = replace(state, sandboxes=(), proxies=(), lan_relays=())
-    assert steps(gone) == [Remove(NAME, "it is needed no more")]
+    assert steps(gone) == [Remove(NAME, "no longer needed")]
 
 
 def test_uninstalling_removes_the_record() -> None:
@@ -201,7 +201,7 @@ def test_where_it_fails_users_are_told_the_command_and_nothing_else_waits() -> N
 
 def test_the_doctor_prints_the_command_as_a_warning() -> None:
     (group,) = groups(published())
-    text = f"{group.actions[-1]}: ended with 1; {group.fix}"
+    text = f"{group.actions[-1]}: ended with 1. {group.fix}"
     problem = {"subject": group.subject, "text": text, "fatal": group.fatal}
     status: dict[str, Any] = {"problems": [problem], "proxies": [], "actions": []}
     status |= {"containers": [], "operator": None}
@@ -251,7 +251,7 @@ def forgery(making: dict[str, Any], name: str = NAME) -> str:
 def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
     making = inspection(flush_config(MADE, SETTINGS))
     making["HostConfig"][field] = value
-    assert forgery(making) == f"its HostConfig.{field} is not the operator's"
+    assert forgery(making) == f"HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(
@@ -264,13 +264,13 @@ def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
 )
 def test_it_runs_the_operators_command_for_its_own_ports_alone(change: dict[str, Any]) -> None:
     body = {**flush_config(MADE, SETTINGS), **change}
-    assert forgery(inspection(body)) == "its command is not the operator's"
-    assert forgery(inspection({**body, "User": "10001:10001"})) == "its user is not 0:0"
-    assert forgery(inspection(body), "talker") == f"its name is not {NAME}"
+    assert forgery(inspection(body)) == "the command is not the operator's"
+    assert forgery(inspection({**body, "User": "10001:10001"})) == "the user is not 0:0"
+    assert forgery(inspection(body), "talker") == f"the name is not {NAME}"
 
 
 def test_another_key_has_one_of_its_own() -> None:
     assert flush_name(Key("", HERE, 1)) != NAME
     other = structs.replace(MADE, key=Key("", HERE, 1), name=flush_name(Key("", HERE, 1)))
     state = replace(published(), flushes=(record(MADE), record(other)))
-    assert steps(state) == [Remove(other.name, "it is needed no more")]
+    assert steps(state) == [Remove(other.name, "no longer needed")]

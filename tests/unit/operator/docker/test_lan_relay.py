@@ -154,7 +154,7 @@ def test_the_lan_relay_is_made_anew_when_its_proxy_has_another_address() -> None
     old = f"{MADE.name}-old"
     rename, create, remove, start = actions(observed(TALKER, **running_proxy("172.30.0.7")))
     assert (rename.name, remove, start) == (
-        MADE.name, Remove(old, "made anew"), Start(MADE.name),
+        MADE.name, Remove(old, "replaced by another container"), Start(MADE.name),
     )  # fmt: skip
     assert isinstance(create, CreateLanRelay)
     assert create.proxy == HostPort("172.30.0.7", RANGE.first)
@@ -163,7 +163,7 @@ def test_the_lan_relay_is_made_anew_when_its_proxy_has_another_address() -> None
 def test_the_lan_relay_goes_before_its_sandbox_is_made_anew() -> None:
     more = container(labels={**TWO, "rosproxy.ports": "40"})
     steps = actions(observed(more, **running_proxy()))
-    assert steps[0] == Remove(MADE.name, "its proxy gets another address")
+    assert steps[0] == Remove(MADE.name, "the proxy gets another address")
     assert any(isinstance(action, CreateSandbox) and len(action.range) == 40 for action in steps)
     assert not any(isinstance(action, CreateLanRelay) for action in steps)
 
@@ -176,7 +176,7 @@ def test_all_three_go_when_nobody_wants_them() -> None:
 def test_no_lan_no_lan_relay() -> None:
     deaf = replace(SETTINGS, ros2_lan="none")
     plan = look(observed(TALKER, **running_proxy()), deaf)
-    assert Remove(MADE.name, "the LAN is not to be heard") in plan.actions
+    assert Remove(MADE.name, "--ros2-lan is none") in plan.actions
     assert not plan.problems
     (create,) = (action for action in actions(observed(TALKER), deaf) if isinstance(action, Create))
     assert create.lan_relay is None
@@ -194,7 +194,7 @@ def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_ar
             sandboxes=[Sandbox(key, own(box, place, "app"), RANGE, box.fingerprint)],
         )  # fmt: skip
         plan = look(state, settings)
-        told = [p.text for p in plan.problems if "does not hear the LAN" in p.text]
+        told = [p.text for p in plan.problems if "has no LAN relay" in p.text]
         return [action.lan for action in plan.actions if isinstance(action, CreateLanRelay)] or told
 
     assert lan(HERE, "192.0.2.77") == ["192.0.2.77"]
@@ -345,7 +345,7 @@ def test_what_gives_a_forged_lan_relay_away(field: str, value: object) -> None:
     making["HostConfig"][field] = value
     own = OwnLabels("lan-relay", KEY, RANGE, "")
     reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)
-    assert reason == f"its HostConfig.{field} is not the operator's"
+    assert reason == f"HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(

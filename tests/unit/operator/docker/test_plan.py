@@ -97,8 +97,8 @@ FIRST = [
     new_sandbox(), Start(PORTS), Connect(PORTS, "app", ALIASES), new_proxy(), Start(NAME),
 ]  # fmt: skip
 ANEW = [
-    Remove(NAME, "its sandbox is made anew", stop=True),
-    Remove(f"{PORTS}-old", "made anew"),
+    Remove(NAME, "the sandbox is replaced", stop=True),
+    Remove(f"{PORTS}-old", "replaced by another container"),
     Start(PORTS),
     Connect(PORTS, "app", ALIASES),
     new_proxy(LONGER, replaces=NAME),
@@ -210,7 +210,7 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
     anew = [
         Rename(PORTS, f"{PORTS}-old"),
         new_sandbox(),
-        Remove(f"{PORTS}-old", "made anew"),
+        Remove(f"{PORTS}-old", "replaced by another container"),
         *FIRST[1:],
     ]
     usual = [Disconnect(PORTS, "app"), *FIRST[1:]]
@@ -225,7 +225,7 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
             [sandbox(state="restarting", networks=())],
             [],
             None,
-            [f"ends and is restarted: see docker logs {PORTS}"],
+            [f"the container has ended and restarts. Read docker logs {PORTS}"],
         ),
         ([sandbox(state="removing"), proxy()], [], 1.0, []),
         ([sandbox(state="dead")], [Remove(PORTS, "left over"), *FIRST], None, []),
@@ -289,7 +289,7 @@ def replacement(image: str = IMAGE) -> list[Action]:
     return [
         Rename(NAME, old),
         new_proxy(replaces=old, image=image),
-        Remove(old, "made anew"),
+        Remove(old, "replaced by another container"),
         Start(NAME),
     ]
 
@@ -306,7 +306,7 @@ def test_a_controller_killed_while_replacing_goes_on() -> None:
     new = proxy(image="new", state="created", started_at="")
     for proxies, left in (
         ([old], [new_proxy(replaces=f"{NAME}-old", image="new"), *replacement()[2:]]),
-        ([old, new], [Remove(f"{NAME}-old", "another one takes over"), Start(NAME)]),
+        ([old, new], [Remove(f"{NAME}-old", "replaced by another container"), Start(NAME)]),
         ([new], [Start(NAME)]),
     ):
         seen = observed(container(), image="new", sandboxes=[sandbox()], proxies=proxies)
@@ -336,7 +336,7 @@ def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
     new = sandbox(ports=LONGER, state="created", networks=())
     lives = proxy(sandbox_id=old.container.id)
     seen = observed(container(labels=ASKS_FOR_40), sandboxes=[old, new], proxies=[lives])
-    gone = Remove(f"{PORTS}-old", "another one takes over")
+    gone = Remove(f"{PORTS}-old", "replaced by another container")
     assert actions(seen) == [ANEW[0], gone, *ANEW[2:]]
 
 
@@ -344,7 +344,7 @@ def test_another_publish_address_replaces_both() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10",))
     steps = actions(observed(container(), **both()), settings=settings)
     assert steps[0] == Rename(PORTS, f"{PORTS}-old")
-    assert steps[2] == Remove(NAME, "its sandbox is made anew", stop=True)
+    assert steps[2] == Remove(NAME, "the sandbox is replaced", stop=True)
 
 
 def test_names_of_strangers_are_left_to_them() -> None:
@@ -364,7 +364,7 @@ def test_without_an_image_nothing_is_created() -> None:
     assert [(problem.subject, problem.fatal) for problem in plan.problems] == [
         ("proxy image rosproxy:latest", True)
     ]
-    assert "not on this host: docker pull rosproxy:latest" in texts(plan)[0]
+    assert "not on this host. Run docker pull rosproxy:latest" in texts(plan)[0]
     assert "docker build --target proxy" in texts(plan)[0]
 
 
@@ -388,13 +388,13 @@ def test_without_an_image_everything_is_kept() -> None:
 def test_an_uplink_that_is_none(uplink: Network) -> None:
     plan = look(observed(container(), networks=[uplink, APP]))
     assert plan.actions == ()
-    assert "can't be the proxies' uplink" in texts(plan)[0]
+    assert "can't be the uplink of the proxies" in texts(plan)[0]
 
 
 # the end
 
 
-UNWANTED = "no running container wants it any more"
+UNWANTED = "no running container needs the proxy"
 ALONE: Any = {"sandboxes": [sandbox(networks=())], "proxies": [proxy()]}
 
 
@@ -520,8 +520,10 @@ def test_never_fewer_ports() -> None:
 def test_more_ports_that_can_not_be_had() -> None:
     plan = look(observed(container(labels=ASKS_FOR_40), listening=[11435], **both()))
     assert plan.actions == ()
-    assert "40 ports are wanted" in port_problem(plan)
-    text = "it keeps its 32 at 11400-11431: 11432-11439 are not all free: stop what holds them"
+    assert "asks for 40: " in port_problem(plan)
+    text = "has only the 32 ports 11400-11431, although --ports or the label rosproxy.ports asks"
+    assert text in port_problem(plan)
+    text = "11432-11439 are not all free. Stop the programs that hold them"
     assert text in port_problem(plan)
 
 
@@ -535,14 +537,14 @@ def test_more_ports_where_the_next_proxy_begins() -> None:
         proxies=[*own["proxies"], *neighbour["proxies"]],
     )
     plan = look(seen)
-    text = f"at 11400-11431: proxy {proxy_name(ARM)} has 11432-11463. To have it move, stop its"
+    text = f"proxy {proxy_name(ARM)} has 11432-11463. Stop the containers of that proxy"
     assert text in port_problem(plan)
 
 
 def test_more_ports_beyond_the_window() -> None:
     settings = replace(SETTINGS, port_window=PortRange(11400, 11435))
     plan = look(observed(container(labels=ASKS_FOR_40), **both()), settings=settings)
-    text = "11432-11439 is beyond --port-window (11400-11435): widen that"
+    text = "ports 11432-11439 are beyond --port-window (11400-11435). Widen --port-window"
     assert text in port_problem(plan)
 
 
@@ -560,8 +562,8 @@ def test_exhausted() -> None:
     assert plan.actions == ()
     assert port_problem(plan) == (
         "no 32 free ports in a row between 11400 and 11430: 31 of 31 are free, 31 at most in a "
-        "row: lower --ports or the label rosproxy.ports (32), widen --port-window (11400-11430), "
-        "or stop what holds ports there"
+        "row. Lower --ports or the label rosproxy.ports (32), widen --port-window (11400-11430), "
+        "or stop programs that hold ports there"
     )
 
 
@@ -580,7 +582,7 @@ def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
     assert plan.actions[:4] == (
         Rename(PORTS, f"{PORTS}-old"),
         new_sandbox(then),
-        Remove(f"{PORTS}-old", "made anew"),
+        Remove(f"{PORTS}-old", "replaced by another container"),
         Start(PORTS),
     )
     forgets = replace(plan.memory, planned={})
@@ -600,7 +602,7 @@ def test_ports_that_have_served_are_tried_for_a_while(port: int | None) -> None:
     assert then.actions[0] == Start(PORTS)
     last = refused(seen, port, then.memory, 120.0)
     assert created(last) == (PortRange(11411, 11442) if port else NEXT)
-    assert f"HAS LEFT ITS PORTS 11400-11431 for {created(last)}" in port_problem(last)
+    assert f"has left ports 11400-11431 for {created(last)}" in port_problem(last)
     assert last.memory.moved == {KEY: Move(RANGE, 120.0)}
     assert last.memory.served == {}
 
@@ -612,14 +614,14 @@ def test_added_ports_that_are_refused_are_given_up() -> None:
     for port in (11435, None):
         plan = refused(seen, port, memory, 1.0)
         assert created(plan) == RANGE
-        assert "it keeps its 32" in port_problem(plan)
+        assert "has only the 32 ports" in port_problem(plan)
 
 
 def test_ports_that_a_stranger_publishes_now_are_left() -> None:
     web = container("web", {}, ports=[11400])
     plan = look(observed(container(), web, sandboxes=[sandbox(state="exited")]))
     assert created(plan) == PortRange(11401, 11432)
-    assert "HAS LEFT ITS PORTS" in port_problem(plan)
+    assert "has left ports" in port_problem(plan)
 
 
 def test_a_start_that_went_well_is_the_end_of_it() -> None:

@@ -162,7 +162,7 @@ def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:
 
 def test_what_is_left_of_a_network_that_is_gone_is_removed() -> None:
     made = wanted(observed(node(), **nodes_proxy()))
-    gone = [Remove(made.name, "its network is gone")]
+    gone = [Remove(made.name, "the network namespace is gone")]
     assert steps(observed(**nodes_proxy(), redirects=(record(made),))) == gone
     ended = replace(node(), state="exited")
     assert steps(observed(ended, **nodes_proxy(), redirects=(record(made),))) == gone
@@ -210,9 +210,9 @@ def test_a_masters_name_may_be_known_by_an_address(address: str) -> None:
         (node(env="http://192.0.2.7:11399", master_uri=MASTER), SETTINGS, "name of the master"),
         (node(env="http://[2001:db8::7]:11311"), SETTINGS, "name of the master's host"),
         (node(env="http://127.0.0.1:11311", master_uri="http://robot:11311"), SETTINGS, "itself"),
-        (node(redirect="false"), SETTINGS, "without label rosproxy.redirect='false' it is led"),
-        (node(redirect="true"), OFF, "the operator's --no-redirect keeps it"),
-        (node(redirect="perhaps"), SETTINGS, "neither true nor false: write rosproxy.redirect="),
+        (node(redirect="false"), SETTINGS, "Or remove label rosproxy.redirect='false'"),
+        (node(redirect="true"), OFF, "start the operator without --no-redirect"),
+        (node(redirect="perhaps"), SETTINGS, "neither true nor false. Write rosproxy.redirect="),
     ],
 )
 def test_who_is_not_redirected_is_told(
@@ -232,7 +232,7 @@ def test_without_a_way_outwards_nothing_is_redirected() -> None:
     cell = replace(APP, internal=True)
     (member,), (problem,) = read_members(observed(node(), networks=[UPLINK, cell]))
     assert member.redirected_master is None
-    assert "its networks have no way outwards" in problem.text
+    assert "all networks of the container are internal" in problem.text
 
 
 def test_a_master_that_is_not_allowed_is_not_redirected() -> None:
@@ -295,14 +295,14 @@ def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
     own = read_own(own_labels(MADE))
     assert own is not None
     reason = forgery_reason(own, MADE.name, read_making(making), IMAGE)
-    assert reason == f"its HostConfig.{field} is not the operator's"
+    assert reason == f"HostConfig.{field} is not the operator's"
 
 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"Entrypoint": ["/bin/sh"]}, "its command is not /usr/sbin/nft"),
-        ({"User": "10001:10001"}, "its user is not 0:0"),
+        ({"Entrypoint": ["/bin/sh"]}, "the command is not /usr/sbin/nft"),
+        ({"User": "10001:10001"}, "the user is not 0:0"),
     ],
 )
 def test_what_an_image_says_gives_it_away_as_well(change: dict[str, Any], text: str) -> None:
@@ -310,7 +310,7 @@ def test_what_an_image_says_gives_it_away_as_well(change: dict[str, Any], text: 
     own = read_own(own_labels(MADE))
     assert own is not None
     assert forgery_reason(own, MADE.name, read_making(making), IMAGE) == text
-    assert forgery_reason(own, "talker", read_making(making), IMAGE).startswith("its name is not")
+    assert forgery_reason(own, "talker", read_making(making), IMAGE).startswith("the name is not")
 
 
 def test_the_end_of_a_container_without_a_network_shows_in_the_list() -> None:

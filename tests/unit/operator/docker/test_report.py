@@ -81,7 +81,7 @@ ACTIONS: list[tuple[Action, str]] = [
     (CreateNetwork("0-rosproxy"), "create network 0-rosproxy, a bridge: the uplink of all proxies"),
     (
         CreateSandbox("p-ports", KEY, RANGE),
-        "create container p-ports: it holds ports 11400-11431 for the proxy of the master "
+        "create container p-ports: sandbox with ports 11400-11431 for the proxy of the master "
         "http://robot:11311",
     ),
     (
@@ -99,7 +99,7 @@ ACTIONS: list[tuple[Action, str]] = [
     (Remove("p", "made anew"), "remove container p (made anew)"),
     (
         Remove("p", "done", retire=True),
-        "remove container p (done), after it has told outside that its nodes have ended",
+        "remove container p (done), after the proxy has told outside that its nodes have ended",
     ),
 ]  # fmt: skip
 
@@ -235,7 +235,7 @@ def test_what_is_wrong_stands_where_it_belongs() -> None:
     assert text.endswith(
         "\n    ! no master is known\n"
         "\nproblems:\n  network 0-a: can't be joined\n"
-        "\nyet to be done: 1 step\n  start container x"
+        "\n1 step left:\n  start container x"
     )
 
 
@@ -294,8 +294,8 @@ def test_what_leads_to_the_proxy_is_told() -> None:
         redirect = {"master": "192.0.2.7:11311", "in_place": in_place}
         return render({**STATUS, "containers": [{**TALKER, "redirect": redirect}]}, 120)
 
-    assert "    192.0.2.7:11311 leads to its proxy there" in told(True)
-    assert "    192.0.2.7:11311 does not lead to its proxy yet" in told(False)
+    assert "    192.0.2.7:11311 is redirected to the proxy" in told(True)
+    assert "    192.0.2.7:11311 is not redirected to the proxy yet" in told(False)
 
 
 def test_both_versions_side_by_side() -> None:

@@ -108,7 +108,7 @@ def test_where_another_operator_makes_all_anew_it_stops() -> None:
     assert planned.actions == ()
     (problem,) = planned.problems
     assert problem.fatal
-    assert "an operator is running" in problem.text
+    assert "another operator is running" in problem.text
     assert sandbox_name(KEY) in problem.text
 
 
