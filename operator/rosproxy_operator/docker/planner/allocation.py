@@ -225,7 +225,7 @@ def allocate(
         if key in moved and not within(moved[key].ports, ports):
             text = (
                 f"has left ports {moved[key].ports} for {ports}, since another program or "
-                f"container has taken old ports. {after_move(not key.is_ros2, key.is_ros2)}"
+                f"container has taken the old ports. {after_move(not key.is_ros2, key.is_ros2)}"
             )
             allocation.problems.append(_problem(key, text))
     memory = replace(memory, served=served, planned=ranges, moved=moved)
