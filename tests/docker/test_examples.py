@@ -116,7 +116,7 @@ def test_example_with_a_master_by_address(
         works_both_ways(project, robot)
 
         status = project.compose("exec", "-T", "operator", "rosproxy-operator", "docker", "status")
-        assert status.count(f"{robot.address}:11311 leads to its proxy there") == 2
+        assert status.count(f"{robot.address}:11311 is redirected to the proxy") == 2
 
 
 @pytest.mark.usefixtures("_no_other_controller")

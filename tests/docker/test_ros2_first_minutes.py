@@ -42,7 +42,7 @@ def names(controller: Controller, variable: str, fix: str) -> bool:
         ("jazzy", *DISCOVERY_SERVER, "Unset the variable"),
         ("jazzy", "ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF", "or set SUBNET"),
         ("jazzy", "FASTDDS_BUILTIN_TRANSPORTS", "SHM", "or set UDPv4"),
-        ("cyclone", *EXTERNAL_ADDRESS, "let it use the network that it shares with the proxy"),
+        ("cyclone", *EXTERNAL_ADDRESS, "use a network that the proxy shares"),
     ],
 )
 def test_a_setting_that_leads_past_the_proxy(
