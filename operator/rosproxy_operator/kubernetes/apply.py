@@ -26,11 +26,11 @@ from rosproxy_operator.kubernetes.api.api_client import (
 from rosproxy_operator.kubernetes.confirm_deletion import Deletion, StateChanged, confirm
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
-    CreateLanRelay,
+    CreateHelper,
     CreatePolicy,
     CreateProxy,
     CreateService,
-    DeleteLanRelay,
+    DeleteHelper,
     DeletePolicy,
     DeleteProxy,
     DeleteService,
@@ -69,8 +69,8 @@ _KINDS: Mapping[type, tuple[str, str]] = {
     DeletePolicy: ("NetworkPolicy", POLICIES),
     CreateProxy: ("Pod", "pods"),
     DeleteProxy: ("Pod", "pods"),
-    CreateLanRelay: ("Pod", "pods"),
-    DeleteLanRelay: ("Pod", "pods"),
+    CreateHelper: ("Pod", "pods"),
+    DeleteHelper: ("Pod", "pods"),
 }
 """By action: the kind that it creates or deletes, and that kind's name in the API's paths."""
 Count = Callable[[Action, str], None]
@@ -216,9 +216,9 @@ class ClusterApplier:
     def _call_api(self, action: Action, observed: ClusterSnapshot) -> None:
         api = self._api
         match action:
-            case CreateService() | CreatePolicy() | CreateProxy() | CreateLanRelay():
+            case CreateService() | CreatePolicy() | CreateProxy() | CreateHelper():
                 _create(api, _KINDS[type(action)][1], action.body)
-            case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteLanRelay():
+            case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteHelper():
                 self._delete(action, observed)
             case EvictPod():
                 confirm(api, action, observed)
@@ -271,9 +271,9 @@ def _uid_test(uid: str) -> Json:
 def describe(action: Action) -> str:
     """An action in one line."""
     match action:
-        case CreateService() | CreatePolicy() | CreateProxy() | CreateLanRelay():
+        case CreateService() | CreatePolicy() | CreateProxy() | CreateHelper():
             return f"create {_KINDS[type(action)][0]} {_subject(action)}"
-        case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteLanRelay():
+        case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteHelper():
             return f"delete {_KINDS[type(action)][0]} {action.id}: {action.why}"
         case SetImage() | SetPolicy() | EvictPod():
             return _change_line(action)
@@ -294,7 +294,7 @@ def _change_line(action: SetImage | SetPolicy | EvictPod) -> str:
 def _subject(action: Action) -> Name:
     """The object that an action is about."""
     match action:
-        case CreateService() | CreatePolicy() | CreateProxy() | CreateLanRelay():
+        case CreateService() | CreatePolicy() | CreateProxy() | CreateHelper():
             return name_of(action.body["metadata"])
         case ObjectAction():
             return action.id

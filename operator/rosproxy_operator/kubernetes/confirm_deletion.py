@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.planner.actions import (
-    DeleteLanRelay,
+    DeleteHelper,
     DeletePolicy,
     DeleteProxy,
     DeleteService,
@@ -24,7 +24,7 @@ from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Json, 
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.records import pod_record, rosproxy_record
 
-Deletion = DeleteService | DeletePolicy | DeleteProxy | DeleteLanRelay | EvictPod
+Deletion = DeleteService | DeletePolicy | DeleteProxy | DeleteHelper | EvictPod
 
 
 class StateChanged(Exception):
@@ -39,9 +39,9 @@ def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
     is_gone = _check_rosproxy(api, action.of, observed)
     if isinstance(action, EvictPod):
         _check_pod(api, action, observed)
-    if is_gone or not isinstance(action, DeleteProxy | DeleteLanRelay):
+    if is_gone or not isinstance(action, DeleteProxy | DeleteHelper):
         return ""
-    own = own_pods(observed.proxies, observed.lan_relays)
+    own = own_pods(observed.proxies, observed.lan_relays, observed.image_checks)
     target = next((p for p in own if p.pod.uid == action.uid), None)
     if target is None:
         raise StateChanged(f"pod {action.id}")

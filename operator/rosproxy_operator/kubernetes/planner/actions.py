@@ -64,15 +64,20 @@ class DeleteProxy(ObjectAction, frozen=True):
     retire: bool = False
 
 
-class CreateLanRelay(ClusterAction, frozen=True):
-    """Create the pod of a proxy's LAN relay. ``body`` is the whole object."""
+class CreateHelper(ClusterAction, frozen=True):
+    """Create a pod beside a proxy: its LAN relay, or an image check.
 
+    ``component`` says which (`names`), ``body`` is the whole object.
+    """
+
+    component: str
     body: Json
 
 
-class DeleteLanRelay(ObjectAction, frozen=True):
-    """Delete the pod of a LAN relay."""
+class DeleteHelper(ObjectAction, frozen=True):
+    """Delete a pod beside a proxy."""
 
+    component: str
     why: str
 
 
@@ -115,8 +120,8 @@ Action = (
     | DeletePolicy
     | CreateProxy
     | DeleteProxy
-    | CreateLanRelay
-    | DeleteLanRelay
+    | CreateHelper
+    | DeleteHelper
     | EvictPod
     | SetImage
     | PatchStatus

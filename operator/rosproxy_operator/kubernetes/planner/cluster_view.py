@@ -11,7 +11,12 @@ import msgspec
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, PodFailure, ProxyPod
+from rosproxy_operator.kubernetes.resources.cluster import (
+    ClusterSnapshot,
+    PodFailure,
+    ProxyPod,
+    own_pods,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Name,
@@ -77,9 +82,8 @@ def view(observed: ClusterSnapshot) -> View:
     proxies = group_by_key((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
     unusable = {r.uid for r in observed.unusable.values()}
     orphans = (p for p in observed.proxies if not _owned(p, rosproxies))
-    own_uids = {p.pod.uid for p in observed.proxies} | {
-        lan_relay.pod.uid for lan_relay in observed.lan_relays
-    }
+    own = own_pods(observed.proxies, observed.lan_relays, observed.image_checks)
+    own_uids = {own_pod.pod.uid for own_pod in own}
     other_pods = {pod.uid: pod for pod in observed.pods if pod.uid not in own_uids}.values()
     taken, findings = _taken(observed, rosproxies)
     wanted, left_out = _wanted(observed, rosproxies, taken)

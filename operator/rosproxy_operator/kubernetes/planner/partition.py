@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, own_pods
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, HelperPod, own_pods
 
 
 class Partition(msgspec.Struct, frozen=True):
@@ -67,7 +67,7 @@ def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
     for pod in observed.pods:
         if pod.uid in observed.selected:
             yield pod.id.namespace, pod.node
-    for own_pod in own_pods(observed.proxies, observed.lan_relays):
+    for own_pod in own_pods(observed.proxies, observed.lan_relays, observed.image_checks):
         yield own_pod.of.namespace, own_pod.node
         yield own_pod.of.namespace, own_pod.pod.node
     for rosproxy in observed.rosproxies:
@@ -87,12 +87,15 @@ def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> Clust
         ),
         misspelt_pods=tuple(p for p in observed.misspelt_pods if p.id.namespace in namespaces),
         proxies=tuple(p for p in observed.proxies if p.of.namespace in namespaces),
-        lan_relays=tuple(
-            lan_relay for lan_relay in observed.lan_relays if lan_relay.of.namespace in namespaces
-        ),
+        lan_relays=_within(observed.lan_relays, namespaces),
+        image_checks=_within(observed.image_checks, namespaces),
         services={id: s for id, s in observed.services.items() if id.namespace in namespaces},
         policies={id: p for id, p in observed.policies.items() if id.namespace in namespaces},
     )
+
+
+def _within(helpers: tuple[HelperPod, ...], namespaces: frozenset[str]) -> tuple[HelperPod, ...]:
+    return tuple(helper for helper in helpers if helper.of.namespace in namespaces)
 
 
 def partition_state(state: ClusterState, partition: Partition) -> ClusterState:

@@ -28,6 +28,14 @@ from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
+from rosproxy_operator.kubernetes.planner.steps.context import (
+    ClusterContext,
+    advertise_host,
+    master_of,
+    peers,
+    site_of,
+)
+from rosproxy_operator.kubernetes.planner.steps.image_check import remove_image_checks
 from rosproxy_operator.kubernetes.planner.steps.lan_relay import (
     lan_relay_findings,
     reconcile_lan_relays,
@@ -37,15 +45,10 @@ from rosproxy_operator.kubernetes.planner.steps.network_policy import (
     reconcile_policies,
 )
 from rosproxy_operator.kubernetes.planner.steps.reconcile import (
-    ClusterContext,
-    advertise_host,
     ends,
-    master_of,
-    peers,
     reconcile_orphans,
     reconcile_proxies,
     reconcile_service,
-    site_of,
 )
 from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Obstacle, RosProxyOnNode
@@ -66,6 +69,7 @@ _STEPS = (
     reconcile_policies,
     reconcile_proxies,
     reconcile_lan_relays,
+    remove_image_checks,
     remake_unwired,
 )
 """What is done for each RosProxy, in this order."""
@@ -171,9 +175,8 @@ def stand_by(
 
 def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnNode]:
     """What a RosProxy has on each node that its status names: also where it had a proxy."""
-    lan_relays = [
-        lan_relay for lan_relay in context.observed.lan_relays if lan_relay.owner == rosproxy.uid
-    ]
+    lan_relays = {h.node: h for h in context.observed.lan_relays if h.owner == rosproxy.uid}
+    image_checks = {h.node: h for h in context.observed.image_checks if h.owner == rosproxy.uid}
     node_names = {
         *rosproxy.former_ranges,
         *(p.node for p in context.view.places.get(rosproxy.id, ())),
@@ -193,7 +196,8 @@ def _states(context: ClusterContext, rosproxy: RosProxy) -> Iterator[RosProxyOnN
             pods=context.view.wanted.get(place, ()),
             answer=context.observed.reports.get(current.pod.uid) if current else None,
             obstacle=site if isinstance(site, Obstacle) else None,
-            lan_relay=next((lan_relay for lan_relay in lan_relays if lan_relay.node == node), None),
+            lan_relay=lan_relays.get(node),
+            image_check=image_checks.get(node),
         )
 
 

@@ -84,6 +84,16 @@ class Retries:
         self.noted[task] = RetryRecord(count + 1, self._now, error=error)
         return True
 
+    def is_recent(self, task: Task, seconds: float) -> bool:
+        """Whether a task was carried out less than so many seconds ago; its record is kept then."""
+        record = self._attempts.get(task)
+        left = record.at + seconds - self._now if record is not None else 0.0
+        if record is None or record.error or left <= 0:
+            return False
+        self.noted[task] = record
+        self._later.append(left)
+        return True
+
     def look_again_in(self, seconds: float) -> None:
         """Note that something else has to come first: look again in that many seconds."""
         self._later.append(seconds)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from enum import Enum
+from itertools import chain
 
 import msgspec
 
@@ -51,9 +52,13 @@ class ProxyPod(msgspec.Struct, frozen=True):
     restarts: int = 0
 
 
-class LanRelayPod(msgspec.Struct, frozen=True):
-    """A pod of the operator that hears the LAN for a proxy. Its fields are those of `ProxyPod`."""
+class HelperPod(msgspec.Struct, frozen=True):
+    """A pod of the operator beside a proxy: its LAN relay, or the check of its next image.
 
+    ``component`` is LAN_RELAY or IMAGE_CHECK (`names`). All other fields are those of `ProxyPod`.
+    """
+
+    component: str
     pod: Pod
     of: Name
     owner: str
@@ -66,10 +71,10 @@ class LanRelayPod(msgspec.Struct, frozen=True):
 
 
 def own_pods(
-    proxies: Iterable[ProxyPod], lan_relays: Iterable[LanRelayPod]
-) -> tuple[ProxyPod | LanRelayPod, ...]:
-    """The operator's pods of both kinds."""
-    return (*proxies, *lan_relays)
+    proxies: Iterable[ProxyPod], *helpers: Iterable[HelperPod]
+) -> tuple[ProxyPod | HelperPod, ...]:
+    """The operator's pods of all kinds."""
+    return (*proxies, *chain.from_iterable(helpers))
 
 
 class ProxyService(msgspec.Struct, frozen=True):
@@ -154,7 +159,7 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
     told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
     had. ``proxy`` is the pod that serves the node, None where there is none yet or any more;
-    ``lan_relay`` its LAN relay.
+    ``lan_relay`` its LAN relay, ``image_check`` the check of its next image.
     """
 
     name: str
@@ -164,7 +169,8 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     pods: tuple[Pod, ...] = ()
     answer: ProxyReport | None = None
     obstacle: Obstacle | None = None
-    lan_relay: LanRelayPod | None = None
+    lan_relay: HelperPod | None = None
+    image_check: HelperPod | None = None
 
 
 class ClusterSnapshot(msgspec.Struct, frozen=True):
@@ -189,7 +195,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     nodes: Mapping[str, ClusterNode] = {}
     pods: tuple[Pod, ...] = ()
     proxies: tuple[ProxyPod, ...] = ()
-    lan_relays: tuple[LanRelayPod, ...] = ()
+    lan_relays: tuple[HelperPod, ...] = ()
+    image_checks: tuple[HelperPod, ...] = ()
     services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
     consents: Mapping[Name, frozenset[str]] = {}

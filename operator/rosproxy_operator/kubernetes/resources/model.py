@@ -86,6 +86,17 @@ class Advertise(Enum):
     HOSTNAME = "Hostname"
 
 
+class MaxUnavailable(msgspec.Struct, frozen=True):
+    """How many proxies of a RosProxy a rollout may have away: a count, or a percentage."""
+
+    number: int = 1
+    is_percent: bool = False
+
+    def of(self, count: int) -> int:
+        """How many of ``count`` proxies these are: at least one; a percentage is rounded up."""
+        return max(1, -(-count * self.number // 100) if self.is_percent else self.number)
+
+
 class RosProxySpec(msgspec.Struct, frozen=True):
     """What a RosProxy asks for; the fields are those of the CRD.
 
@@ -105,6 +116,7 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     advertise: Advertise = Advertise.INTERNAL_IP
     cleanup_after: float = 30.0
     grace: float = 60.0
+    max_unavailable: MaxUnavailable = MaxUnavailable()
     slave_control: str = "any"
     policy: tuple[PolicyLayer, ...] = ()
     data_plane: DataPlane = "auto"

@@ -42,11 +42,12 @@ COMPONENT_LABEL = "app.kubernetes.io/component"
 MANAGED_BY_LABEL = "app.kubernetes.io/managed-by"
 PROXY = "proxy"
 LAN_RELAY = "lan-relay"
+IMAGE_CHECK = "image-check"
 """What is made for a RosProxy, by the component label."""
 _FORMER_LAN_RELAY = "ear"
 """The component of LAN relays that operators before 0.1.0 made; they are made anew."""
 _OWN = {NAME_LABEL: "rosproxy", MANAGED_BY_LABEL: "rosproxy-operator"}
-_COMPONENTS = (_FORMER_LAN_RELAY, LAN_RELAY, PROXY)
+_COMPONENTS = (_FORMER_LAN_RELAY, IMAGE_CHECK, LAN_RELAY, PROXY)
 _EITHER = f"{COMPONENT_LABEL} in ({','.join(_COMPONENTS)})"
 OWN_SELECTOR = ",".join([*(f"{label}={value}" for label, value in _OWN.items()), _EITHER])
 """Label selector, in the API's words, of everything that the operator makes."""
@@ -77,9 +78,12 @@ def is_own(labels: Mapping[str, str]) -> bool:
     return same and labels.get(COMPONENT_LABEL) in _COMPONENTS and PROXY_OF in labels
 
 
-def is_lan_relay(labels: Mapping[str, str]) -> bool:
-    """Whether they are those of a LAN relay."""
-    return is_own(labels) and labels[COMPONENT_LABEL] != PROXY
+def component(labels: Mapping[str, str]) -> str:
+    """What an object is: PROXY, LAN_RELAY or IMAGE_CHECK; empty if it is not the operator's."""
+    if not is_own(labels):
+        return ""
+    component = labels[COMPONENT_LABEL]
+    return LAN_RELAY if component == _FORMER_LAN_RELAY else component
 
 
 def service_id(rosproxy: Name) -> Name:
@@ -101,6 +105,12 @@ def lan_relay_id(rosproxy: Name, node: str) -> Name:
     """The name of the pod in which the LAN relay of a RosProxy's proxy on a node runs."""
     proxy = proxy_id(rosproxy, node)
     return Name(proxy.namespace, f"{proxy.name}-lan-relay")
+
+
+def image_check_id(rosproxy: Name, node: str) -> Name:
+    """The name of the pod that tries the image of a RosProxy's proxy on a node."""
+    proxy = proxy_id(rosproxy, node)
+    return Name(proxy.namespace, f"{proxy.name}-{IMAGE_CHECK}")
 
 
 def policy_id(rosproxy: Name) -> Name:

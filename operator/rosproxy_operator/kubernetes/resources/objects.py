@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.resources.checks import (
     texts_at,
 )
 from rosproxy_operator.kubernetes.resources.cluster import (
-    LanRelayPod,
+    HelperPod,
     MasterService,
     ProxyPod,
     ProxyPolicy,
@@ -118,7 +118,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     ports = port_range(notes, names.PORT_RANGE)
     on = notes.get(names.NODE, "")
     owner = _owner(meta)
-    if not names.is_own(labels) or names.is_lan_relay(labels):
+    if names.component(labels) != names.PROXY:
         return None
     if ports is None or not (on and owner and container):
         return None
@@ -140,8 +140,8 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     )
 
 
-def lan_relay_pod(obj: Json) -> LanRelayPod | None:
-    """A LAN relay's pod; None if the object is not one that this operator made, or not whole."""
+def helper_pod(obj: Json) -> HelperPod | None:
+    """A pod beside a proxy; None if the object is not one that this operator made, or not whole."""
     meta = submap(obj, "metadata")
     status = submap(obj, "status")
     labels = texts_at(meta, "labels")
@@ -149,10 +149,12 @@ def lan_relay_pod(obj: Json) -> LanRelayPod | None:
     container = next(iter(submaps(submap(obj, "spec"), "containers")), {})
     on = notes.get(names.NODE, "")
     owner = _owner(meta)
-    if not names.is_lan_relay(labels) or not (on and owner):
+    component = names.component(labels)
+    if component in ("", names.PROXY) or not (on and owner):
         return None
     reason, message = pod_failure(status)
-    return LanRelayPod(
+    return HelperPod(
+        component=component,
         pod=pod(obj),
         of=Name(text_at(meta, "namespace"), labels[names.PROXY_OF]),
         owner=owner,

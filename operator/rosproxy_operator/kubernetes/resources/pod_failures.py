@@ -10,7 +10,7 @@ from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import Json
-from rosproxy_operator.kubernetes.resources.names import CONTAINER, LAN_RELAY
+from rosproxy_operator.kubernetes.resources.names import CONTAINER, IMAGE_CHECK, LAN_RELAY
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 """``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the
@@ -67,7 +67,7 @@ def pod_failure(status: Json) -> tuple[PodFailure | None, str]:
         if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
             return _unscheduled(text_at(condition, "reason"), text_at(condition, "message"))
     for container in submaps(status, "containerStatuses"):
-        if container.get("name") in (CONTAINER, LAN_RELAY):
+        if container.get("name") in (CONTAINER, LAN_RELAY, IMAGE_CHECK):
             return _waiting(container)
     return None, ""
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.cluster import (
-    LanRelayPod,
+    HelperPod,
     MasterService,
     ProxyPod,
     ProxyPolicy,
@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
 
-PodRecord = Pod | ProxyPod | LanRelayPod
+PodRecord = Pod | ProxyPod | HelperPod
 Record = (
     RosProxy
     | InvalidRosProxy
@@ -51,7 +51,7 @@ def key_of(obj: Json) -> str:
 def pod_record(obj: Json) -> PodRecord:
     """A pod, as one of the operator's if it is one."""
     if names.is_own(texts_at(submap(obj, "metadata"), "labels")):
-        own_pod = objects.proxy_pod(obj) or objects.lan_relay_pod(obj)
+        own_pod = objects.proxy_pod(obj) or objects.helper_pod(obj)
         if own_pod is not None:
             return own_pod
     return _shared(objects.pod(obj))

@@ -35,6 +35,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     Json,
     MasterSpec,
+    MaxUnavailable,
     Name,
     PodEgress,
     RosProxy,
@@ -151,6 +152,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         advertise=field["advertise"].one_of(_ADVERTISE, Advertise.INTERNAL_IP.value),
         cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY),
         grace=field["graceSeconds"].number(60.0, 0, _DAY),
+        max_unavailable=_max_unavailable(field["maxUnavailable"]),
         slave_control=field["policy"]["slaveControl"].one_of(_SLAVE_CONTROL, "Any"),
         policy=_policy(field["policy"], of),
         data_plane=field["dataPlane"].one_of(_DATA_PLANE, "Auto"),
@@ -163,6 +165,16 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         resources=field["resources"].map(RESOURCES),
         host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].items()),
     )
+
+
+def _max_unavailable(field: Field) -> MaxUnavailable:
+    """A count, or a percentage from 1% to 100% as text."""
+    if isinstance(field.value, str):
+        percent = field.value.removesuffix("%")
+        if field.value == percent or not percent.isdecimal() or not 1 <= int(percent) <= 100:
+            raise field.error("is no percentage", "write a number from 1, or 1% to 100%")
+        return MaxUnavailable(int(percent), is_percent=True)
+    return MaxUnavailable(int(field.number(1, 1, 10_000)))
 
 
 def _pod_egress(field: Field) -> PodEgress:

@@ -9,9 +9,9 @@ import msgspec
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
-    CreateLanRelay,
+    CreateHelper,
     CreateProxy,
-    DeleteLanRelay,
+    DeleteHelper,
     DeleteProxy,
     Emit,
     EvictPod,
@@ -19,7 +19,14 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.resources.checks import int_at, text_at
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
-from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, NODE, PORT_RANGE
+from rosproxy_operator.kubernetes.resources.names import (
+    API_VERSION,
+    IMAGE_CHECK,
+    KIND,
+    LAN_RELAY,
+    NODE,
+    PORT_RANGE,
+)
 
 QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""
@@ -41,10 +48,11 @@ COMPONENT = "rosproxy-operator"
 _LONGEST_NAME = 200
 _ENDED: Mapping[type, tuple[str, str]] = {
     DeleteProxy: ("ProxyDeleted", "deleted"),
-    DeleteLanRelay: ("LanRelayDeleted", "deleted"),
     EvictPod: ("PodEvicted", "evicted"),
 }
 """Reason and verb of the Events about what goes."""
+_HELPERS = {LAN_RELAY: "LanRelay", IMAGE_CHECK: "ImageCheck"}
+"""What the reasons of Events about pods beside a proxy begin with."""
 
 
 class NewEvents(msgspec.Struct, frozen=True):
@@ -105,13 +113,15 @@ def _result(action: Action) -> tuple[str, str]:
             return "ProxyCreated", f"created pod {name} {place}"
         case SetImage(id=id, image=image):
             return "ImageSet", f"gave pod {id.name} the image {image}"
-        case (
-            DeleteProxy(id=id, why=why) | DeleteLanRelay(id=id, why=why) | EvictPod(id=id, why=why)
-        ):
+        case DeleteProxy(id=id, why=why) | EvictPod(id=id, why=why):
             reason, verb = _ENDED[type(action)]
             return reason, f"{verb} pod {id.name}: {why}"
-        case CreateLanRelay(body={"metadata": {"name": name, "annotations": notes}}):
-            return "LanRelayCreated", f"created pod {name} on node {notes[NODE]}"
+        case CreateHelper(component=component, body=body):
+            meta = body["metadata"]
+            text = f"created pod {meta['name']} on node {meta['annotations'][NODE]}"
+            return f"{_HELPERS[component]}Created", text
+        case DeleteHelper(component=component, id=id, why=why):
+            return f"{_HELPERS[component]}Deleted", f"deleted pod {id.name}: {why}"
         case _:
             return "", ""
 

@@ -9,7 +9,7 @@ from rosproxy.admin.setup_rules import RANGE
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.cluster import (
-    LanRelayPod,
+    HelperPod,
     PodFailure,
     ProxyPod,
     ProxyReport,
@@ -66,6 +66,10 @@ def node_findings(rosproxy: RosProxy, state: RosProxyOnNode) -> Iterator[Cluster
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting:
         return
+    check = state.image_check
+    has_failed = check is not None and (check.stuck is not None or check.pod.phase == "Failed")
+    if check is not None and has_failed and not check.pod.deleting:
+        yield _unusable(rosproxy, check, proxy)
     if proxy.stuck is not None:
         yield _stuck(rosproxy, proxy, proxy.stuck)
     else:
@@ -118,7 +122,30 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
     return _finding(rosproxy, proxy_subject(proxy), texts[cause], reason)
 
 
-def _deaf(rosproxy: RosProxy, lan_relay: LanRelayPod) -> ClusterFinding:
+def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterFinding:
+    """What keeps a proxy from its next image. The proxy runs on with the image that it has."""
+    id = check.pod.id
+    if check.stuck is PodFailure.IMAGE:
+        text = f"the node can't get the image {check.image} ({check.message})"
+        fix = (
+            "correct spec.image or the chart's proxy.image, or set spec.imagePullPolicy or "
+            "spec.imagePullSecrets"
+        )
+    elif check.pod.phase == "Failed":
+        text = f"the image {check.image} does not run rosproxy ({check.message})"
+        fix = (
+            f"correct spec.image or the chart's proxy.image; kubectl -n {id.namespace} delete pod "
+            f"{id.name} has the same image tried again"
+        )
+    else:
+        text = f"the image {check.image} can't be tried ({check.message})"
+        fix = f"kubectl -n {id.namespace} describe pod {id.name}"
+    kept = f"{text}, so that proxy {proxy.pod.id.name} keeps {proxy.image}: {fix}"
+    subject = f"node {check.node}"
+    return finding(rosproxy, "ImageUnusable", bounded(kept, _LONGEST), subject=subject)
+
+
+def _deaf(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding:
     id = lan_relay.pod.id
     text = (
         f"it does not run ({lan_relay.message}), so that the LAN is not heard: "

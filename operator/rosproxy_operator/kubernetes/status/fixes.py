@@ -15,6 +15,7 @@ _TEMPLATE = f"correct the pod's template as the message says, then {_RESTART}"
 _BY_REASON = {
     "Ambiguous": f"label the pod's template with the name of one: {INJECT}={{of.name}}",
     "LanRelayStuck": _PODS,
+    "ImageUnusable": f"{_EDIT}: spec.image; or the chart's proxy.image",
     "HostNetwork": f"take hostNetwork, or the label {INJECT}, out of the pod's template",
     "Invalid": f"{_EDIT}: the field that the message names",
     "MasterUnknown": f"{_EDIT}: spec.master",

@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.api.api_client import ApiError, ApiNotFound, A
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
-    LanRelayPod,
+    HelperPod,
     MasterService,
     ProxyPod,
     ProxyPolicy,
@@ -33,7 +33,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Pod,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import PLURAL
+from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, LAN_RELAY, PLURAL
 from rosproxy_operator.kubernetes.resources.records import POLICIES, Record
 from rosproxy_operator.kubernetes.watch.reflector import crd_missing
 
@@ -77,7 +77,7 @@ class ClusterStore:
         self._all_heard = asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
-        self._lan_relays: dict[str, dict[str, LanRelayPod]] = defaultdict(dict)
+        self._helpers: dict[str, dict[str, HelperPod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
         self._touched = StoreChanges()
@@ -165,14 +165,12 @@ class ClusterStore:
 
     def _with_pods(self, snapshot: ClusterSnapshot) -> ClusterSnapshot:
         proxies = [proxy for group in self._proxies.values() for proxy in group.values()]
-        lan_relays = [
-            lan_relay for group in self._lan_relays.values() for lan_relay in group.values()
-        ]
-        namespaces = {*self._rosproxies, *self._proxies, *self._lan_relays}
+        helpers = [helper for group in self._helpers.values() for helper in group.values()]
+        namespaces = {*self._rosproxies, *self._proxies, *self._helpers}
         namespaces |= {id.namespace for id in snapshot.unusable}
         candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
         selected = [p for p in candidates if self._is_selected(p)]
-        own = own_pods(proxies, lan_relays)
+        own = own_pods(proxies, helpers)
         nodes = {p.node for p in selected} | {node for p in own for node in (p.node, p.pod.node)}
         pods = {p.uid: p for p in candidates if p.node in nodes}
         pods |= {pod.uid: pod for pod in selected}
@@ -183,7 +181,8 @@ class ClusterStore:
             snapshot,
             pods=tuple(pods.values()),
             proxies=tuple(proxies),
-            lan_relays=tuple(lan_relays),
+            lan_relays=tuple(h for h in helpers if h.component == LAN_RELAY),
+            image_checks=tuple(h for h in helpers if h.component == IMAGE_CHECK),
             selected=frozenset(pod.uid for pod in selected if not pod.ended),
             misspelt_pods=tuple(pod for pod in candidates if pod.misspelt),
         )
@@ -237,7 +236,7 @@ class ClusterStore:
 
     def _as_foreign(self, record: Record | None) -> Record | None:
         """Turn pods of an operator that looks after other namespaces into ordinary pods."""
-        if isinstance(record, ProxyPod | LanRelayPod) and not self._is_looked_after(
+        if isinstance(record, ProxyPod | HelperPod) and not self._is_looked_after(
             record.of.namespace
         ):
             return record.pod
@@ -248,8 +247,8 @@ class ClusterStore:
             _set(self._rosproxies, record.id.namespace, key, record if add else None)
         elif isinstance(record, ProxyPod):
             _set(self._proxies, record.of.namespace, key, record if add else None)
-        elif isinstance(record, LanRelayPod):
-            _set(self._lan_relays, record.of.namespace, key, record if add else None)
+        elif isinstance(record, HelperPod):
+            _set(self._helpers, record.of.namespace, key, record if add else None)
         elif isinstance(record, Pod):
             _set(self._pods, record.id.namespace, key, record if add else None)
             if record.every_port and record.node:
@@ -274,7 +273,7 @@ class ClusterStore:
                 return
             case _:
                 self._touched.namespaces.add(record.of.namespace)
-                if counterpart is None and isinstance(record, ProxyPod | LanRelayPod):
+                if counterpart is None and isinstance(record, ProxyPod | HelperPod):
                     self._touched.nodes.add(record.node)  # others may wait for its ports
         self._wake()
 

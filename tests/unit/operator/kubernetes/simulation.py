@@ -13,11 +13,11 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
-    CreateLanRelay,
+    CreateHelper,
     CreatePolicy,
     CreateProxy,
     CreateService,
-    DeleteLanRelay,
+    DeleteHelper,
     DeletePolicy,
     DeleteProxy,
     DeleteService,
@@ -80,9 +80,9 @@ def is_own(obj: Object) -> bool:
     return names.is_own(meta(obj).get("labels", {})) and owned
 
 
-def is_lan_relay(obj: Object) -> bool:
-    """Whether it is a LAN relay."""
-    return names.is_lan_relay(meta(obj).get("labels", {}))
+def component_of(obj: Object) -> str:
+    """What an object of the operator's is; empty if another one has made it."""
+    return names.component(meta(obj).get("labels", {})) if is_own(obj) else ""
 
 
 def bound_to(pod: Object) -> str:
@@ -286,8 +286,10 @@ class Cluster:
             "conditions": [{"type": "Ready", "status": str(ready)}],
             "containerStatuses": [{"name": container["name"], "state": state, "restartCount": 0}],
         }
-        if is_own(pod) and ready and not is_lan_relay(pod):
+        if component_of(pod) == names.PROXY and ready:
             self.ros.setdefault(uid, set())
+        elif component_of(pod) == names.IMAGE_CHECK and ready:
+            pod["status"]["phase"] = "Succeeded"
 
     # what the operator sees
 
@@ -296,7 +298,7 @@ class Cluster:
         seen = old or self.state
         pods = [parse.pod(pod) for pod in seen.pods.values()]
         own = [proxy for pod in seen.pods.values() if (proxy := parse.proxy_pod(pod))]
-        lan_relays = filter(None, map(parse.lan_relay_pod, seen.pods.values()))
+        helpers = [*filter(None, map(parse.helper_pod, seen.pods.values()))]
         services = filter(None, map(parse.service, seen.services.values()))
         policies = seen.policies.values()
         of = tuple(parse_rosproxy.rosproxy(rosproxy) for rosproxy in self.state.rosproxies.values())
@@ -307,7 +309,8 @@ class Cluster:
             nodes={name: parse.node(node) for name, node in seen.nodes.items()},
             pods=tuple(pods),
             proxies=tuple(own),
-            lan_relays=tuple(lan_relays),
+            lan_relays=tuple(h for h in helpers if h.component == names.LAN_RELAY),
+            image_checks=tuple(h for h in helpers if h.component == names.IMAGE_CHECK),
             services={service.of: service for service in services},
             policies={policy.id: policy for policy in filter(None, map(parse.policy, policies))},
             key=self.key,
@@ -335,7 +338,7 @@ class Cluster:
                     if "allocated" not in str(error):
                         raise
                     self.create_service(dict(without_cluster_ip(body)))
-            case CreateProxy(body=body) | CreateLanRelay(body=body):
+            case CreateProxy(body=body) | CreateHelper(body=body):
                 self.made += 1
                 self.create_pod(dict(body))
             case CreatePolicy(body=body):
@@ -347,7 +350,7 @@ class Cluster:
             case SetPolicy(id=id, uid=uid, spec=spec):
                 if policy := self._own(self.state.policies, id, uid):
                     policy["spec"] = copy.deepcopy(dict(spec))
-            case DeleteProxy(id=id, uid=uid) | DeleteLanRelay(id=id, uid=uid):
+            case DeleteProxy(id=id, uid=uid) | DeleteHelper(id=id, uid=uid):
                 if pod := self._own(self.state.pods, id, uid):
                     self.delete_pod(pod)
             case DeleteService(id=id, uid=uid):
@@ -355,6 +358,8 @@ class Cluster:
                     del self.state.services[id]
             case SetImage(id=id, uid=uid, image=image):
                 if pod := self._own(self.state.pods, id, uid):
+                    works = pod["status"]["phase"] == "Running"
+                    assert image != BAD_IMAGE or not works, f"{id} loses an image that it can run"
                     pod["spec"]["containers"][0]["image"] = image
             case PatchStatus(of=of, status=status):
                 if of in self.state.rosproxies:
@@ -408,11 +413,11 @@ class Controller:
         try:
             self.cluster.apply(action)
         except Refused as error:
-            assert isinstance(action, CreateProxy | CreateLanRelay | CreateService | CreatePolicy)
+            assert isinstance(action, CreateProxy | CreateHelper | CreateService | CreatePolicy)
             name = name_of(dict(action.body))
             state = self.cluster.state
             kinds = {
-                CreateProxy: state.pods, CreateLanRelay: state.pods, CreateService: state.services,
+                CreateProxy: state.pods, CreateHelper: state.pods, CreateService: state.services,
             }  # fmt: skip
             existing = kinds.get(type(action), state.policies).get(name)
             if str(error) == "AlreadyExists" and existing is not None:

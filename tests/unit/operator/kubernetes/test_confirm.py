@@ -9,8 +9,9 @@ import pytest
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api, ApiConflict, ApiUnavailable
 from rosproxy_operator.kubernetes.confirm_deletion import StateChanged, confirm
-from rosproxy_operator.kubernetes.planner.actions import DeleteLanRelay, DeleteProxy, DeleteService
+from rosproxy_operator.kubernetes.planner.actions import DeleteHelper, DeleteProxy, DeleteService
 from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.names import LAN_RELAY
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (
     INJECT,
@@ -111,7 +112,7 @@ async def test_what_is_not_so_any_more(
     happen(server)
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, DELETE, seen)
-    lan_relay = DeleteLanRelay(OF, DELETE.id, DELETE.uid, "nobody wants it")
+    lan_relay = DeleteHelper(OF, DELETE.id, DELETE.uid, LAN_RELAY, "no proxy needs it")
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, lan_relay, seen)
 

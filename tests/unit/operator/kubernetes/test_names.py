@@ -51,7 +51,9 @@ def test_names_are_in_the_rosproxys_namespace() -> None:
 def test_own_labels_are_recognized_and_selected() -> None:
     labels = names.own_labels("robot")
     assert names.is_own(labels)
-    assert names.OWN_SELECTOR.endswith("app.kubernetes.io/component in (ear,lan-relay,proxy)")
+    assert names.OWN_SELECTOR.endswith(
+        "app.kubernetes.io/component in (ear,image-check,lan-relay,proxy)"
+    )
     rest = labels.items() - {(names.PROXY_OF, "robot"), (names.COMPONENT_LABEL, "proxy")}
     assert all(f"{key}={value}" in names.OWN_SELECTOR for key, value in rest)
 
@@ -74,5 +76,5 @@ def test_what_pods_use_as_their_master(address: str, uri: str) -> None:
 def test_the_lan_relay_of_an_operator_before_0_1_0_is_its_own() -> None:
     labels = {**names.own_labels("robot"), names.COMPONENT_LABEL: "ear"}
     assert names.is_own(labels)
-    assert names.is_lan_relay(labels)
-    assert not names.is_lan_relay(names.own_labels("robot"))
+    assert names.component(labels) == names.LAN_RELAY
+    assert names.component(names.own_labels("robot")) == names.PROXY

@@ -12,11 +12,10 @@ from rosproxy_operator.kubernetes.planner.actions import (
     DeleteProxy,
     DeleteService,
     Emit,
-    SetImage,
 )
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, PodFailure, ProxyPod
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
@@ -26,7 +25,6 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
-    SETTINGS,
     complete,
     creation,
     done,
@@ -145,12 +143,6 @@ def test_a_proxy_on_a_node_that_is_gone_is_deleted_after_a_while() -> None:
     (deleted,) = done(look(gone, first.state, 110.0))
     assert isinstance(deleted, DeleteProxy)
     assert (deleted.why, deleted.retire) == ("its node is gone", False)
-
-
-def test_another_image_is_given_to_the_pod_that_is_there() -> None:
-    plan = look(complete(rosproxies=(rosproxy(image="rosproxy:2"),)))
-    assert done(plan) == [SetImage(ROBOT, PROXY, "uid-proxy-robot-one", "rosproxy:2")]
-    assert reasons(plan) == ["ImageSet"]
 
 
 @pytest.mark.parametrize(
@@ -387,13 +379,6 @@ def test_one_bad_rosproxy_does_not_stop_another() -> None:
     assert [(type(action), action.of.name) for action in done(plan)] == [(CreateProxy, "robot")]
 
 
-def test_the_default_image_is_that_of_the_settings() -> None:
-    plan = look(complete(), settings=replace(SETTINGS, image="rosproxy:9"))
-    (changed,) = done(plan)
-    assert isinstance(changed, SetImage)
-    assert changed.image == "rosproxy:9"
-
-
 # proxies that are made anew one after the other
 
 
@@ -422,23 +407,6 @@ def test_the_next_waits_until_the_one_before_runs(first: tuple[ProxyPod, ...]) -
     assert DeleteProxy not in kinds(plan) or first
     assert not [action for action in done(plan) if getattr(action, "id", PROXY) != PROXY]
     assert plan.next_look_in == 1.0
-
-
-def test_one_that_can_never_come_holds_up_nobody() -> None:
-    bad = proxy(stuck=PodFailure.IMAGE)
-    plan = look(two(replace(bad, fingerprint="x"), proxy(on=node("two"))))
-    assert {action.id for action in done(plan) if isinstance(action, DeleteProxy)} == {PROXY}
-    settled = replace(bad, fingerprint=fingerprint(two()))
-    (action,) = done(look(two(settled, proxy(on=node("two")))))
-    assert isinstance(action, DeleteProxy)
-    assert action.id == names.proxy_id(ROBOT, "two")
-
-
-def fingerprint(seen: ClusterSnapshot) -> str:
-    """That of the proxy of node one, as it is made now."""
-    (body,) = [action.body for action in done(look(seen)) if isinstance(action, CreateProxy)
-               and action.body["metadata"]["name"] == PROXY.name]  # fmt: skip
-    return str(body["metadata"]["annotations"][names.FINGERPRINT])
 
 
 def test_what_has_to_move_waits_for_nobody() -> None:

@@ -10,9 +10,9 @@ from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.access.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.actions import (
-    CreateLanRelay,
+    CreateHelper,
     CreateProxy,
-    DeleteLanRelay,
+    DeleteHelper,
     DeleteProxy,
 )
 from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
@@ -20,7 +20,7 @@ from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.steps.lan_relay import lan_relay_pod
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
-from rosproxy_operator.kubernetes.resources.cluster import LanRelayPod, ProxyReport
+from rosproxy_operator.kubernetes.resources.cluster import HelperPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import (
     Json,
@@ -196,11 +196,13 @@ def hearing(**changes: Any) -> tuple[RosProxy, Any]:
     return of, proxy(of, ports=PortRange(11400, 11404), **changes)
 
 
-def lan_relay(of: RosProxy, address: str = "10.244.1.200", **changes: Any) -> LanRelayPod:
+def lan_relay(of: RosProxy, address: str = "10.244.1.200", **changes: Any) -> HelperPod:
     place = site(of, node(), PortRange(11400, 11404))
     assert place.lan_relay is not None
-    body = lan_relay_pod(place, place.lan_relay, address, SETTINGS)
-    parsed = objects.lan_relay_pod({**body, "status": {"phase": "Running"}})
+    heard = proxy(of, ports=PortRange(11400, 11404))
+    heard = replace(heard, pod=replace(heard.pod, ip=address))
+    body = lan_relay_pod(place, place.lan_relay, heard, SETTINGS)
+    parsed = objects.helper_pod({**body, "status": {"phase": "Running"}})
     assert parsed is not None
     own = replace(parsed.pod, uid="uid-lan-relay", node="one")
     return replace(parsed, **{"pod": own, "ready": True, **changes})
@@ -212,7 +214,7 @@ def test_an_lan_relay_is_made_once_its_proxy_has_an_address():
 
     (action,) = done(look(seen))
 
-    assert isinstance(action, CreateLanRelay)
+    assert isinstance(action, CreateHelper)
     body = action.body
     assert env_of(body)["ROSPROXY_LAN_RELAY_PROXY"] == "10.244.1.200:11400"
     assert env_of(body)["ROSPROXY_LAN_RELAY_BIND"] == "192.0.2.1:11404"
@@ -243,7 +245,7 @@ def test_a_proxy_and_its_lan_relay_share_a_secret():
     assert names.token_of(KEY, proxy_id, "one") not in of_proxies
     place = replace(site(of, node(), PortRange(11400, 11404)), relay_secret=SECRET)
     assert place.lan_relay is not None
-    relay = lan_relay_pod(place, place.lan_relay, "10.244.1.200", SETTINGS)
+    relay = lan_relay_pod(place, place.lan_relay, proxy(of), SETTINGS)
     assert env_of(relay)["ROSPROXY_LAN_RELAY_SECRET"] == SECRET
 
 
@@ -270,7 +272,7 @@ def test_an_lan_relay_that_is_not_right_goes(why: str):
     (action,) = done(
         look(observed(of, service(of), pod(), proxy_pod, lan_relays=(wrong_lan_relay,)))
     )
-    assert isinstance(action, DeleteLanRelay)
+    assert isinstance(action, DeleteHelper)
 
 
 def test_an_lan_relay_stays_while_its_proxy_is_made_anew():

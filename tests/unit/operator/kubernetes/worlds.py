@@ -22,10 +22,10 @@ from tests.unit.operator.kubernetes.simulation import (
     Cluster,
     Controller,
     Object,
+    component_of,
     deleting,
     ended,
     host_ports,
-    is_lan_relay,
     is_own,
     meta,
     name_of,
@@ -77,7 +77,7 @@ class World:
 
     def proxies(self) -> Iterator[tuple[Object, ProxyPod]]:
         for pod in self.own():
-            if is_lan_relay(pod):
+            if component_of(pod) != names.PROXY:
                 continue
             proxy = objects.proxy_pod(pod)
             assert proxy is not None
@@ -257,7 +257,8 @@ class World:
         """
         lan_relays = {}
         for pod in self.own():
-            if lan_relay := objects.lan_relay_pod(pod):
+            lan_relay = objects.helper_pod(pod)
+            if lan_relay and lan_relay.component == names.LAN_RELAY:
                 lan_relays[ProxyPlace(lan_relay.of, lan_relay.node)] = pod, lan_relay
         wanted = {}
         for _, proxy in self.proxies():
@@ -288,7 +289,8 @@ class World:
             pod, proxy = proxies[place]
             assert not deleting(pod)
             container = pod["spec"]["containers"][0]
-            assert container["image"] == rosproxy.get("image", "rosproxy:1")
+            image = rosproxy.get("image", "rosproxy:1")
+            assert container["image"] == image or self.told(plan, place, "ImageUnusable")
             assert pod["status"]["phase"] == "Running" or container["image"] == BAD_IMAGE
             assert len(proxy.range) == rosproxy["ports"] or self.told(plan, place, "PortsExhausted")
             env = {variable["name"]: variable["value"] for variable in container["env"]}

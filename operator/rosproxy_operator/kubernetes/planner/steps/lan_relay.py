@@ -11,7 +11,7 @@ from typing import Any
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND, lan_relay_variables
-from rosproxy_operator.kubernetes.planner.actions import Action, CreateLanRelay, DeleteLanRelay
+from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.manifests import (
     POD_SECURITY_CONTEXT,
@@ -19,13 +19,12 @@ from rosproxy_operator.kubernetes.planner.manifests import (
     bound_to,
     fingerprint_of,
     fingerprinted,
-    image_of,
     metadata,
     proxy_fingerprint,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
-from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext, site_of
-from rosproxy_operator.kubernetes.resources.cluster import LanRelayPod
+from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
+from rosproxy_operator.kubernetes.resources.cluster import HelperPod, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, ProxyPlace, RosProxy
 from rosproxy_operator.kubernetes.resources.names import LAN_RELAY, NODE, lan_relay_id
 from rosproxy_operator.kubernetes.settings import ClusterSettings
@@ -36,20 +35,23 @@ _RESOURCES: Json = {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"me
 
 
 def lan_relay_pod(
-    site: ProxySite, lan_relay: HostPort, proxy_address: str, settings: ClusterSettings
+    site: ProxySite, lan_relay: HostPort, proxy: ProxyPod, settings: ClusterSettings
 ) -> Json:
-    """The pod of a LAN relay that listens at ``lan_relay``, for the proxy at ``proxy_address``."""
+    """The pod of the LAN relay of a proxy that listens at ``lan_relay``.
+
+    The relay has the image that the proxy has, which may not be the next one yet.
+    """
     rosproxy = site.rosproxy
     ros2 = site.rosproxy.spec.ros2
     annotations = {NODE: site.node.name}
     meta = metadata(rosproxy, lan_relay_id(rosproxy.id, site.node.name), annotations, LAN_RELAY)
-    target = HostPort(proxy_address, site.ports.first)
+    target = HostPort(proxy.pod.ip, site.ports.first)
     number = ros2.number if ros2 else 0
     variables = lan_relay_variables(number, lan_relay.host, lan_relay, target, site.relay_secret)
     policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
     container: dict[str, Any] = {
         "name": LAN_RELAY,
-        "image": image_of(rosproxy, settings),
+        "image": proxy.image,
         **({"imagePullPolicy": policy} if policy else {}),
         "command": [*LAN_RELAY_COMMAND],
         "env": [{"name": name, "value": value} for name, value in variables.items()],
@@ -108,7 +110,7 @@ def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
 
 
 def _ensure_lan_relay(
-    context: ClusterContext, place: ProxyPlace, lan_relays: tuple[LanRelayPod, ...]
+    context: ClusterContext, place: ProxyPlace, lan_relays: tuple[HelperPod, ...]
 ) -> Iterator[Action]:
     current = context.view.current.get(place)
     wanted = place in context.view.wanted
@@ -118,7 +120,7 @@ def _ensure_lan_relay(
         return
     if current.fingerprint != proxy_fingerprint(site, context.settings):
         return
-    body = lan_relay_pod(site, site.lan_relay, address, context.settings)
+    body = lan_relay_pod(site, site.lan_relay, current, context.settings)
     expected = fingerprint_of(body)
     id = lan_relay_id(place.of, place.node)
     outdated = [
@@ -130,13 +132,13 @@ def _ensure_lan_relay(
         context, outdated, "made anew: its proxy or its settings have changed"
     )
     if not lan_relays and context.retries.is_due(Task(place.of, "create", id)):
-        yield CreateLanRelay(place.of, body)
+        yield CreateHelper(place.of, LAN_RELAY, body)
 
 
 def _delete_lan_relays(
-    context: ClusterContext, lan_relays: Iterable[LanRelayPod], why: str
+    context: ClusterContext, lan_relays: Iterable[HelperPod], why: str
 ) -> Iterator[Action]:
     for lan_relay in lan_relays:
         task = Task(lan_relay.of, "delete", lan_relay.pod.id, lan_relay.pod.uid)
         if not lan_relay.pod.deleting and context.retries.is_due(task):
-            yield DeleteLanRelay(lan_relay.of, lan_relay.pod.id, lan_relay.pod.uid, why)
+            yield DeleteHelper(lan_relay.of, lan_relay.pod.id, lan_relay.pod.uid, LAN_RELAY, why)

@@ -32,7 +32,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.manifests import metadata
 from rosproxy_operator.kubernetes.planner.pods.selection import LABEL_OFF_VALUES, own_values
 from rosproxy_operator.kubernetes.planner.retries import Task
-from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext
+from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPolicy
 from rosproxy_operator.kubernetes.resources.model import Json, Name, RosProxy
 from rosproxy_operator.kubernetes.resources.names import (

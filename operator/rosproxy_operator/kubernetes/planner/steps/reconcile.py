@@ -7,189 +7,49 @@ which can be exchanged. `retries` keeps actions without effect from being repeat
 """
 
 from collections import Counter
-from collections.abc import Iterator
-
-import msgspec
-from msgspec.structs import replace
+from collections.abc import Iterable, Iterator
 
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.common.port_negotiation import RETRY_FOR
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreateHelper,
     CreateProxy,
     CreateService,
     DeleteProxy,
     DeleteService,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
-from rosproxy_operator.kubernetes.planner.cluster_view import View, serves
+from rosproxy_operator.kubernetes.planner.cluster_view import serves
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
-from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.resources.checks import host_problem
+from rosproxy_operator.kubernetes.planner.retries import Task
+from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
+from rosproxy_operator.kubernetes.planner.steps.image_check import (
+    ImageState,
+    check_image,
+    image_state,
+)
 from rosproxy_operator.kubernetes.resources.cluster import (
-    ClusterSnapshot,
     Obstacle,
+    PodFailure,
     ProxyPod,
     ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.model import (
-    ClusterNode,
-    MasterSpec,
     ProxyPlace,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
     proxy_id,
-    relay_secret_of,
     service_id,
-    token_of,
 )
-from rosproxy_operator.kubernetes.settings import ClusterSettings
 
-LOST_FOR = 10.0
-"""Seconds for which a node must be missing before its proxies are deleted."""
+RESTARTS_WITHIN_S = 60.0
+"""Seconds in which a kubelet starts a container again that has got another image."""
 IN_TURN = 1.0
 """Seconds after which it is looked again whether the next proxy can be made anew."""
-
-
-class ClusterContext(msgspec.Struct, frozen=True):
-    """Everything that the steps of all RosProxies are made from.
-
-    ``sites`` are those that have been worked out already: each is asked for several times.
-    """
-
-    view: View
-    settings: ClusterSettings
-    state: ClusterState
-    ranges: ClusterRanges
-    retries: Retries
-    now: float
-    sites: dict[ProxyPlace, ProxySite | Obstacle] = {}
-
-    @property
-    def observed(self) -> ClusterSnapshot:
-        """What is seen."""
-        return self.view.observed
-
-    def cluster_ip(self, rosproxy: RosProxy) -> str:
-        """The address of a RosProxy's Service; empty if it has none, or is another RosProxy's."""
-        service = self.observed.services.get(rosproxy.id)
-        return service.cluster_ip if service and service.owner == rosproxy.uid else ""
-
-    def grace_left(self, place: ProxyPlace) -> float:
-        """The seconds until the grace of a proxy ends that no pod wants any more."""
-        grace = self.view.rosproxies[place.of].spec.grace
-        return grace - (self.now - self.state.absent.get(place, self.now))
-
-    def seconds_until_lost(self, node: str) -> float:
-        """The seconds until a node that is missing counts as gone."""
-        return LOST_FOR - (self.now - self.state.lost.get(node, self.now))
-
-
-def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:
-    """A RosProxy's master as its proxies are told it, else what is wrong; for ROS 2 it is empty."""
-    master = rosproxy.spec.master
-    if master.service is None:
-        return master, ""
-    address, problem = observed.masters.get(master.service, ("", "is not known yet"))
-    if problem:
-        return None, f"spec.master.service: Service {master.service} {problem}"
-    host = f"{master.service.name}.{master.service.namespace}.svc"
-    return replace(master, uri=f"http://{host}:{master.service_port}", address=address), ""
-
-
-def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
-    """Under which name or address outside reaches a node, else what is wrong."""
-    if node.advertise_host:
-        problem = host_problem(node.advertise_host)
-        subject = "its annotation rosproxy.io/advertise-host"
-        return ("", f"{subject}: {problem}") if problem else (node.advertise_host, "")
-    wanted_type = rosproxy.spec.advertise.value
-    if address := node.addresses.get(wanted_type):
-        return address, ""
-    types = ", ".join(sorted(node.addresses)) or "none at all"
-    return "", (
-        f"it has no address of type {wanted_type} (it has: {types}): set another "
-        f"spec.advertise, or kubectl annotate node {node.name} rosproxy.io/advertise-host=HOST"
-    )
-
-
-def site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
-    """The proxy that a place is to have where pods want one, or why it can't."""
-    if place not in context.sites:
-        context.sites[place] = _site_of(context, place)
-    return context.sites[place]
-
-
-def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle:
-    rosproxy = context.view.rosproxies[place.of]
-    node = context.observed.nodes[place.node]
-    if not node.ready:
-        text = "is not ready: nothing is changed there until it is: kubectl describe node"
-        return Obstacle("NodeNotReady", f"{text} {node.name}")
-    master, problem = master_of(rosproxy, context.observed)
-    if master is None:
-        return Obstacle("MasterUnknown", problem)
-    host, problem = advertise_host(rosproxy, node)
-    if rosproxy.spec.ros2 and ":" in host:
-        problem = f"its address {host} can't be advertised for ROS 2, which has IPv4 alone"
-        problem += f": kubectl annotate node {node.name} rosproxy.io/advertise-host=ADDRESS"
-    if problem:
-        return Obstacle("NoAdvertiseHost", problem)
-    if place in context.ranges.exhausted:
-        return Obstacle("PortsExhausted", context.ranges.exhausted[place])
-    name = proxy_id(place.of, place.node)
-    if name in context.view.other_pod_names:
-        text = "is there already, and is not the operator's: delete or rename it"
-        return Obstacle("NameTaken", f"a pod called {name} {text}")
-    publish = master.publish if place in context.ranges.published else 0
-    token = token_of(context.observed.key, name, node.name)
-    ports = context.ranges.given[place]
-    published = replace(master, publish=publish)
-    token_hash = hash_token(token) if token else ""
-    return ProxySite(
-        rosproxy,
-        node,
-        host,
-        ports,
-        published,
-        token_hash,
-        peers_of(context, place),
-        relay_secret_of(context.observed.key, name, node.name),
-    )
-
-
-def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
-    """Whom a proxy tells of its participants: peers that its RosProxy names, and its other proxies.
-
-    The other proxies are found at the first port of their range.
-    """
-    rosproxy = context.view.rosproxies[place.of]
-    nodes = context.observed.nodes
-    if rosproxy.spec.ros2 is None:
-        return ()
-    peers = set(rosproxy.spec.ros2.peers)
-    for other_place in context.view.places.get(place.of, ()):
-        ports = context.ranges.given.get(other_place)
-        if other_place != place and ports is not None and other_place.node in nodes:
-            host, problem = advertise_host(rosproxy, nodes[other_place.node])
-            if not problem and ":" not in host:
-                peers.add(f"{host}:{ports.first}")
-    return tuple(sorted(peers))
-
-
-def peers(context: ClusterContext) -> dict[str, tuple[str, ...]]:
-    """What the proxies for ROS 2 are told of their peers, by the uid of their pod."""
-    return {
-        proxy.pod.uid: peers_of(context, place)
-        for place, proxy in context.view.current.items()
-        if context.view.rosproxies[place.of].spec.ros2
-    }
 
 
 def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
@@ -225,29 +85,62 @@ def _delete_service(context: ClusterContext, service: ProxyService, why: str) ->
 def reconcile_proxies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
     """The next actions for a RosProxy's proxies.
 
-    Proxies that are made anew for another setting alone, on the same ports and with the same
-    master, are so one after the other: a proxy waits until the others run again. If they can't be
-    made any more, for example by a new rule of the cluster, the remaining ones go on.
+    A change of the image or of the settings rolls out: no more than ``spec.maxUnavailable``
+    proxies are away, or have their next image tried, at a time. The next one waits until those
+    before work again. A proxy that moves to other ports or to another master does not wait.
     """
     places = context.view.places.get(rosproxy.id, ())
-    busy = any(_is_starting(context, place) for place in places)
+    wanted = [place for place in places if _can_be_had(context, place)]
+    working = {place for place in wanted if _works(context, place, wanted)}
+    away = [p for p in wanted if p not in working and not _lacks_ports(context, p)]
+    tried = [place for place in working if _is_tried(context, place)]
+    room = rosproxy.spec.max_unavailable.of(len(wanted)) - len(away) - len(tried)
     for place in places:
-        actions = [*_reconcile_proxy(context, place, busy)]
-        wanted = place in context.view.wanted
-        busy = busy or (wanted and any(isinstance(action, DeleteProxy) for action in actions))
+        may_stop = room > 0 or place not in working
+        actions = [*_reconcile_proxy(context, place, may_stop)]
+        begins = any(isinstance(a, DeleteProxy | SetImage | CreateHelper) for a in actions)
+        room -= begins and place in working
         yield from actions
 
 
-def _is_starting(context: ClusterContext, place: ProxyPlace) -> bool:
-    """Whether a proxy is wanted that can be had, and does not run yet."""
+def _is_tried(context: ClusterContext, place: ProxyPlace) -> bool:
+    """Whether the next image of a proxy is being tried, or was in vain."""
     current = context.view.current.get(place)
-    if place not in context.view.wanted or isinstance(site_of(context, place), Obstacle):
+    site = site_of(context, place)
+    if current is None or not isinstance(site, ProxySite):
         return False
-    return current is None or not (serves(current) or current.stuck)
+    if current.image == manifests.image_of(site.rosproxy, context.settings):
+        return False
+    return image_state(context, current, site) in (ImageState.CHECKING, ImageState.UNUSABLE)
 
 
-def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> Iterator[Action]:
-    """The next actions for a proxy on a node; ``busy`` if another proxy is to come first."""
+def _lacks_ports(context: ClusterContext, place: ProxyPlace) -> bool:
+    """Whether a proxy waits for ports: no change of it has caused that, and others are tried."""
+    current = context.view.current.get(place)
+    return current is not None and current.stuck is PodFailure.PORTS
+
+
+def _can_be_had(context: ClusterContext, place: ProxyPlace) -> bool:
+    """Whether a proxy is wanted, and nothing keeps it from being made."""
+    return place in context.view.wanted and not isinstance(site_of(context, place), Obstacle)
+
+
+def _works(context: ClusterContext, place: ProxyPlace, places: Iterable[ProxyPlace]) -> bool:
+    """Whether a proxy runs what its pod says, and reaches its master if any of ``places`` does."""
+    current = context.view.current.get(place)
+    if current is None or not serves(current) or current.stuck is not None:
+        return False
+    # A pod says that it is ready until its kubelet has ended the former container.
+    if context.retries.is_recent(_setting_image(current, current.image), RESTARTS_WITHIN_S):
+        return False
+    every = filter(None, map(context.view.current.get, places))
+    return current.ready or not any(proxy.ready for proxy in every)
+
+
+def _reconcile_proxy(
+    context: ClusterContext, place: ProxyPlace, may_stop: bool
+) -> Iterator[Action]:
+    """The next actions for a proxy on a node; ``may_stop``: no other proxy is to come first."""
     node = context.observed.nodes.get(place.node)
     proxies = context.view.proxies.get(place, ())
     if place in context.view.wanted:
@@ -255,7 +148,7 @@ def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> 
         if isinstance(site, Obstacle):
             _note_creation(context, place)
         else:
-            yield from _ensure(context, place, site, busy)
+            yield from _ensure(context, place, site, may_stop)
     elif node is None:
         for proxy in proxies if context.seconds_until_lost(place.node) <= 0 else ():
             yield from _delete_pod(context, proxy, "its node is gone")
@@ -267,7 +160,7 @@ def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> 
 
 
 def _ensure(
-    context: ClusterContext, place: ProxyPlace, site: ProxySite, busy: bool
+    context: ClusterContext, place: ProxyPlace, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
     """The next action for a proxy that is wanted, and can be had as the site says."""
     name = proxy_id(place.of, place.node)
@@ -279,33 +172,54 @@ def _ensure(
     elif name in context.view.names:
         _note_creation(context, place)
         if current is not None:  # else its pod is about to go
-            yield from _update(context, current, site, busy)
+            yield from _update(context, current, site, may_stop)
     elif context.retries.is_due(_creation(place)):
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
 def _update(
-    context: ClusterContext, proxy: ProxyPod, site: ProxySite, busy: bool
+    context: ClusterContext, proxy: ProxyPod, site: ProxySite, may_stop: bool
 ) -> Iterator[Action]:
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
-    task = Task(proxy.of, "image", proxy.pod.id, f"{proxy.pod.uid} {image}")
     if proxy.pod.ended:
         yield from _delete_pod(context, proxy, f"it has ended: {proxy.message or proxy.pod.phase}")
+    elif proxy.fingerprint == fingerprint and proxy.image == image:
+        return
+    elif serves(proxy) and proxy.stuck is None and proxy.image != image:
+        state = image_state(context, proxy, site)
+        if state is ImageState.USABLE:
+            yield from _change(context, proxy, site, may_stop)
+        elif state is ImageState.MISSING and may_stop:
+            yield from check_image(context, site)
+    else:
+        yield from _change(context, proxy, site, may_stop)
+
+
+def _change(
+    context: ClusterContext, proxy: ProxyPod, site: ProxySite, may_stop: bool
+) -> Iterator[Action]:
+    """Make a proxy anew, or exchange its image, if it is its turn."""
+    image = manifests.image_of(site.rosproxy, context.settings)
+    fingerprint = manifests.proxy_fingerprint(site, context.settings)
+    # If the next proxy can't find these nodes at the master, this one unregisters them. A range
+    # with the same first port has grown or shrunk at its end: what is left of it is the same.
+    moved = proxy.range.first != site.ports.first
+    lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
+    if not may_stop and not lost:
+        context.retries.look_again_in(IN_TURN)
     elif proxy.fingerprint != fingerprint:
-        # If the next proxy can't find these nodes at the master, this one unregisters them. A range
-        # with the same first port has grown or shrunk at its end: what is left of it is the same.
-        moved = proxy.range.first != site.ports.first
-        lost = moved or not manifests.keeps_registrations(proxy.fingerprint, fingerprint)
         diff = "its RosProxy, its node or the operator's options have changed"
         if proxy.range != site.ports:
             diff = f"its ports are to be {site.ports} instead of {proxy.range}"
-        elif busy and serves(proxy) and not lost:
-            context.retries.look_again_in(IN_TURN)
-            return
         yield from _delete_pod(context, proxy, f"made anew: {diff}", retire=serves(proxy) and lost)
-    elif proxy.image != image and context.retries.is_due(task):
+    elif context.retries.is_due(_setting_image(proxy, image)):
         yield SetImage(proxy.of, proxy.pod.id, proxy.pod.uid, image)
+
+
+def _setting_image(proxy: ProxyPod, image: str) -> Task:
+    """The task of exchanging an image; another one once the container was started again."""
+    return Task(proxy.of, "image", proxy.pod.id, f"{proxy.pod.uid} {proxy.restarts} {image}")
 
 
 def _delete_pod(

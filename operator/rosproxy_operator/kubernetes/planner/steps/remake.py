@@ -13,7 +13,7 @@ from rosproxy_operator.kubernetes.planner.actions import Action, EvictPod
 from rosproxy_operator.kubernetes.planner.pods.injection import has_come_unwired
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
 from rosproxy_operator.kubernetes.planner.retries import Task
-from rosproxy_operator.kubernetes.planner.steps.reconcile import ClusterContext
+from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext
 from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
 
 RECREATING_CONTROLLERS = ("ReplicaSet", "ReplicationController", "StatefulSet", "DaemonSet")

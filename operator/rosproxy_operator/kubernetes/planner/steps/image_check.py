@@ -1,0 +1,116 @@
+"""Whether a node can get the next image of its proxy, and run it, before the proxy takes it.
+
+A kubelet ends a container before it gets another image (kuberuntime_manager.go, SyncPod). With an
+image that the node can't get, the proxy would be away until somebody sets the image right. So a pod
+with the next image is made on the node first. It prints the version and ends. The proxy takes the
+image only after that pod has succeeded.
+"""
+
+from collections.abc import Iterator
+from enum import Enum
+from typing import Any
+
+from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper
+from rosproxy_operator.kubernetes.planner.manifests import (
+    POD_SECURITY_CONTEXT,
+    ProxySite,
+    bound_to,
+    fingerprint_of,
+    fingerprinted,
+    image_of,
+    metadata,
+)
+from rosproxy_operator.kubernetes.planner.retries import Task
+from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
+from rosproxy_operator.kubernetes.resources.cluster import HelperPod, ProxyPod
+from rosproxy_operator.kubernetes.resources.model import Json, ProxyPlace, RosProxy
+from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, NODE, image_check_id
+from rosproxy_operator.kubernetes.settings import ClusterSettings
+
+_COMMAND = ("rosproxy", "--version")
+_RESOURCES: Json = {"requests": {"cpu": "1m", "memory": "32Mi"}, "limits": {"memory": "128Mi"}}
+
+
+class ImageState(Enum):
+    """What is known of an image on a node."""
+
+    MISSING = "missing"  # nothing: the check is still to be made
+    CHECKING = "checking"
+    USABLE = "usable"
+    UNUSABLE = "unusable"
+
+
+def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
+    """The pod that tries the image of a proxy."""
+    rosproxy = site.rosproxy
+    annotations = {NODE: site.node.name}
+    meta = metadata(rosproxy, image_check_id(rosproxy.id, site.node.name), annotations, IMAGE_CHECK)
+    policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
+    container: dict[str, Any] = {
+        "name": IMAGE_CHECK,
+        "image": image_of(rosproxy, settings),
+        **({"imagePullPolicy": policy} if policy else {}),
+        "command": [*_COMMAND],
+        "resources": dict(_RESOURCES),
+        "terminationMessagePolicy": "FallbackToLogsOnError",
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+    }
+    spec = {
+        **bound_to(site.node.name, rosproxy.spec),
+        "restartPolicy": "Never",
+        "terminationGracePeriodSeconds": 1,
+        "securityContext": dict(POD_SECURITY_CONTEXT),
+        "containers": [container],
+    }
+    return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
+
+
+def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> ImageState:
+    """What is known of the next image of a proxy that runs, on the proxy's node."""
+    expected = fingerprint_of(image_check_pod(site, context.settings))
+    check = next((c for c in _checks(context, site.rosproxy) if c.node == proxy.node), None)
+    if check is None or check.fingerprint != expected or check.pod.deleting:
+        return ImageState.MISSING
+    if check.pod.phase == "Succeeded":
+        return ImageState.USABLE
+    is_bad = check.stuck is not None or check.pod.ended
+    return ImageState.UNUSABLE if is_bad else ImageState.CHECKING
+
+
+def check_image(context: ClusterContext, site: ProxySite) -> Iterator[Action]:
+    """Have the next image tried on a node where the check is missing."""
+    of = site.rosproxy.id
+    id = image_check_id(of, site.node.name)
+    # One with another image has to go first: `remove_image_checks`.
+    is_there = any(c.node == site.node.name for c in _checks(context, site.rosproxy))
+    if not is_there and context.retries.is_due(Task(of, "create", id)):
+        yield CreateHelper(of, IMAGE_CHECK, image_check_pod(site, context.settings))
+
+
+def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
+    """Delete the image checks of a RosProxy whose proxies have the image, or want another one."""
+    for check in _checks(context, rosproxy):
+        task = Task(check.of, "delete", check.pod.id, check.pod.uid)
+        if check.pod.deleting or _is_needed(context, rosproxy, check):
+            continue
+        if context.retries.is_due(task):
+            why = "its proxy has the image, or is to have another one"
+            yield DeleteHelper(check.of, check.pod.id, check.pod.uid, IMAGE_CHECK, why)
+
+
+def _is_needed(context: ClusterContext, rosproxy: RosProxy, check: HelperPod) -> bool:
+    place = ProxyPlace(rosproxy.id, check.node)
+    current = context.view.current.get(place)
+    site = site_of(context, place) if place in context.view.wanted else None
+    if current is None or not isinstance(site, ProxySite):
+        return False
+    is_next = current.image != image_of(rosproxy, context.settings)
+    return is_next and check.fingerprint == fingerprint_of(image_check_pod(site, context.settings))
+
+
+def _checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[HelperPod]:
+    return (c for c in context.observed.image_checks if c.owner == rosproxy.uid)
