@@ -310,7 +310,7 @@ def _reached(
     states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
 ) -> Condition:
     """Proxies that are not asked yet say nothing: for them the former condition stays."""
-    proxies = [state for state in states if state.proxy is not None]
+    proxies = [state for state in states if _may_answer(state)]
     answers = [s.answer for s in proxies if s.answer is not None and s.answer.answered]
     if not all(answer.master_up for answer in answers):
         lines = [_one_line(p) for p in problems if p.reason == NO_MASTER]
@@ -328,7 +328,7 @@ def _way_in(
     states: Sequence[RosProxyOnNode], problems: Sequence[ClusterFinding], former: Json
 ) -> Condition:
     """Whether outside reaches the ports. Proxies that are not asked yet say nothing, as above."""
-    proxies = [(s, s.proxy, s.answer) for s in states if s.proxy is not None]
+    proxies = [(s, s.proxy, s.answer) for s in states if s.proxy is not None and _may_answer(s)]
     probes = [(s, p, a.range_probe) for s, p, a in proxies if a is not None and a.answered]
     if any(probe is not None and probe.reached is False for _, _, probe in probes):
         lines = [_one_line(p) for p in problems if p.reason == NO_WAY_IN]
@@ -343,6 +343,11 @@ def _way_in(
     lines = [f"{proxy_subject(p)}: {not_proven(s, probe)}" for s, p, probe in open_questions]
     reason = "NotTried" if any(probe is None for _, _, probe in open_questions) else "NotProven"
     return Condition(WAY_IN, "Unknown", reason, "; ".join(lines))
+
+
+def _may_answer(state: RosProxyOnNode) -> bool:
+    """Whether a node has a proxy that runs, or is about to."""
+    return state.proxy is not None and state.proxy.stuck is None
 
 
 def _previous(condition: str, former: Json) -> Condition:

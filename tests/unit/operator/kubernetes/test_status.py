@@ -35,6 +35,7 @@ from tests.unit.operator.kubernetes.builders_api import (
     rosproxy,
     state,
     status,
+    stuck_proxy,
 )
 
 
@@ -314,3 +315,13 @@ def test_ready_means_that_every_node_with_pods_is_served(states):
     ]
     assert condition(rosproxy_status, "Ready")["status"] == str(all(served))
     assert rosproxy_status["proxies"] == f"{sum(served)}/{len(served)}"
+
+
+def test_where_no_proxy_runs_nothing_is_said_of_the_master():
+    """It said for minutes that the master is reached, with 0 of 2 proxies."""
+    first = status(state())
+    assert judged(first, "MasterReachable") == ("True", "Reached")
+    stuck = state(proxy=stuck_proxy(PodFailure.IMAGE), answer=None)
+    later = status(stuck, of=rosproxy(status=first))
+    assert judged(later, "MasterReachable") == ("Unknown", "NoProxies")
+    assert judged(later, "PortsReachable") == ("Unknown", "NoProxies")
