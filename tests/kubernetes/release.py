@@ -19,6 +19,7 @@ FULL_NAME = "rosproxy-operator"
 """What the chart calls the objects of the release."""
 OPERATORS = "app.kubernetes.io/component=operator"
 PROXIES = "app.kubernetes.io/component=proxy"
+IMAGE_CHECKS = "app.kubernetes.io/component=image-check"
 _OTHER = "rosproxy:other"
 _IMAGES: Json = {
     "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},

@@ -47,6 +47,26 @@ def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
     release.upgrade()
 
 
+def test_a_wrong_image_of_the_proxies(net: Namespace, robot: Robot) -> None:
+    """Proxies go on with the image that they have, and the RosProxy tells what is wrong."""
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    with flow(net, robot, "roscpp") as traffic:
+        before = made.the_proxy()
+        started = time.time()
+        release.upgrade(proxy={"image": {"tag": "missing"}})
+        made.wait_event("ImageUnusable", "rosproxy:missing")
+        assert "rosproxy:missing" in made.wait_for("Degraded", "True")["message"]
+        assert made.wait_for("Ready", "True")
+        release.upgrade()
+        made.wait_for("Degraded", "False")
+        traffic.wait(since=time.time())
+        gaps = traffic.gaps(started)
+        assert gaps.unnoticed, gaps
+        after = made.the_proxy()
+        assert (after.uid_then, after.restarts) == (before.uid_then, before.restarts)
+    wait_until(lambda: not api.objects("pods", net.name, release.IMAGE_CHECKS), 60, made.tell)
+
+
 def test_another_key_of_the_tokens(net: Namespace, robot: Robot) -> None:
     """Proxies are made anew on their ports, one after the other, and ROS nodes go on."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)

@@ -73,6 +73,7 @@ class Retries:
         self._now = now
         self.noted: dict[Task, RetryRecord] = {}
         self._later: list[float] = []
+        self._recent: set[Task] = set()
 
     def is_due(self, task: Task) -> bool:
         """Whether a task is to be done now; if so, that is noted."""
@@ -91,6 +92,7 @@ class Retries:
         if record is None or record.error or left <= 0:
             return False
         self.noted[task] = record
+        self._recent.add(task)
         self._later.append(left)
         return True
 
@@ -111,6 +113,6 @@ class Retries:
     def pauses(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""
         yield from self._later
-        for record in self.noted.values():
-            if not record.effect:
+        for task, record in self.noted.items():
+            if not record.effect and task not in self._recent:
                 yield max(record.at + record.pause - self._now, 0.0)

@@ -83,6 +83,12 @@ class World:
             assert proxy is not None
             yield pod, proxy
 
+    def phases(self) -> dict[str, str]:
+        """The phase of each pod, by its uid."""
+        return {
+            meta(pod)["uid"]: pod["status"]["phase"] for pod in self.cluster.state.pods.values()
+        }
+
     # what the operator does
 
     def observe(self) -> ClusterSnapshot:
@@ -210,9 +216,11 @@ class World:
         for _ in range(100):
             plan = self.seen()
             self.carry_out(plan)
+            phases = self.phases()
             self.cluster.step()
             self.check()
-            if not plan.actions and plan.next_look_in is None:
+            # A pod that has come into another phase makes the operator look again.
+            if not plan.actions and plan.next_look_in is None and phases == self.phases():
                 break
             self.controller.now += 1.0 if plan.next_look_in is None else plan.next_look_in
         else:

@@ -139,7 +139,7 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
 
 
 def peers_of(context: ClusterContext, place: ProxyPlace) -> tuple[str, ...]:
-    """Whom a proxy tells of its participants: peers that its RosProxy names, and its other proxies.
+    """The peers of a proxy: those that its RosProxy names, and the proxies on other nodes.
 
     The other proxies are found at the first port of their range.
     """

@@ -1,7 +1,7 @@
 """Whether a node can get the next image of its proxy, and run it, before the proxy takes it.
 
 A kubelet ends a container before it gets another image (kuberuntime_manager.go, SyncPod). With an
-image that the node can't get, the proxy would be away until somebody sets the image right. So a pod
+image that the node can't get, the proxy would be away until the image is set right. So a pod
 with the next image is made on the node first. It prints the version and ends. The proxy takes the
 image only after that pod has succeeded.
 """
