@@ -148,7 +148,8 @@ class RosProxy(msgspec.Struct, frozen=True):
     ``former_ranges`` are the ranges by node name that its status holds; ``cluster_ip`` is the
     address that its Service has, or had; ``status`` is its status as it is now. ``remakes``:
     whether pods that came by unwired are to be made anew. ``misspelt``: what is wrong with the
-    names of its annotations and labels, as for nodes and pods (`misspelt_names`).
+    names of its annotations and labels, as for nodes and pods (`misspelt_names`). ``created`` is
+    the time of the creation, as the API server writes it.
     """
 
     id: Name
@@ -160,6 +161,7 @@ class RosProxy(msgspec.Struct, frozen=True):
     status: Json = {}
     deleting: bool = False
     remakes: bool = False
+    created: str = ""
     misspelt: tuple[str, ...] = ()
 
 
@@ -199,7 +201,9 @@ class Pod(msgspec.Struct, frozen=True):
     not a plain text (from a ConfigMap, for one) is `VALUE_AT_RUNTIME`. ``wired_master_uri`` is the
     one that the webhook has set, empty if it has not; ``static_peers`` the same of
     ROS_STATIC_PEERS. ``udp_ports`` are the UDP ports that it takes, ``controller`` is the kind of
-    what made it.
+    the object that creates the pod again, ``workload`` names the object whose pods `kubectl rollout
+    restart` creates anew, as "deployment/talker". ``created`` is the time of the creation, as the
+    API server writes it.
     """
 
     id: Name
@@ -218,6 +222,8 @@ class Pod(msgspec.Struct, frozen=True):
     static_peers: str = ""
     containers: tuple[PodContainer, ...] = ()
     controller: str = ""
+    workload: str = ""
+    created: str = ""
     misspelt: tuple[str, ...] = ()
 
     @property

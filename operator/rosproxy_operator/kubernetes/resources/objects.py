@@ -51,6 +51,9 @@ ROS2_VARIABLES = frozenset(
 MOST_LABELS = 128
 """Labels that are kept of a pod, those of rosproxy.io first. All pods of the cluster are kept in
 memory, and the API server takes pods with a megabyte of labels."""
+_TEMPLATE_HASH = "pod-template-hash"
+_RESTARTED = ("StatefulSet", "DaemonSet")
+"""Controllers of pods that `kubectl rollout restart` takes themselves."""
 MOST_CONTAINERS = 64
 """Containers that are kept of a pod, and values of ROS_MASTER_URI, for the same reason."""
 LONGEST_TEXT = 2048
@@ -102,7 +105,9 @@ def pod(obj: Json) -> Pod:
         static_peers=_short(text_at(submap(meta, "annotations"), names.STATIC_PEERS)),
         containers=tuple(map(_container, submaps(spec, "containers")[:MOST_CONTAINERS])),
         ips=tuple(filter(None, (text_at(pod_ip, "ip") for pod_ip in submaps(status, "podIPs")))),
-        controller=_controller(meta),
+        controller=text_at(_controller(meta), "kind"),
+        workload=_workload(meta),
+        created=text_at(meta, "creationTimestamp"),
         misspelt=misspelt_names(meta, "pods"),
     )
 
@@ -284,10 +289,26 @@ def _masters(spec: Json) -> Iterator[str]:
                 yield VALUE_AT_RUNTIME if is_indirect else value
 
 
-def _controller(meta: Json) -> str:
-    """The kind of the controller that made an object; empty if none did."""
+def _controller(meta: Json) -> Json:
+    """The reference to the controller of an object; empty if there is none."""
     owners = submaps(meta, "ownerReferences")
-    return next((text_at(owner, "kind") for owner in owners if owner.get("controller") is True), "")
+    return next((owner for owner in owners if owner.get("controller") is True), {})
+
+
+def _workload(meta: Json) -> str:
+    """What `kubectl rollout restart` takes to create a pod anew; empty if there is no such object.
+
+    A Deployment names its ReplicaSets after itself and the hash of the template, which all their
+    pods have as a label.
+    """
+    controller = _controller(meta)
+    kind = text_at(controller, "kind")
+    name = _short(text_at(controller, "name"))
+    if kind in _RESTARTED:
+        return f"{kind.lower()}/{name}"
+    suffix = f"-{texts_at(meta, 'labels').get(_TEMPLATE_HASH, '')}"
+    is_of_deployment = kind == "ReplicaSet" and len(suffix) > 1 and name.endswith(suffix)
+    return f"deployment/{name.removesuffix(suffix)}" if is_of_deployment else ""
 
 
 def _owner(meta: Json) -> str:

@@ -119,6 +119,7 @@ def rosproxy(obj: Json) -> RosProxy:
         status=status,
         deleting=is_deleted(meta),
         remakes=texts_at(meta, "annotations").get(REMAKE) == "true",
+        created=text_at(meta, "creationTimestamp"),
         misspelt=misspelt_names(meta, "RosProxies"),
     )
 

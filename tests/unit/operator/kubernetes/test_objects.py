@@ -228,6 +228,27 @@ def test_a_pod_that_lacks_something_is_no_proxy(path):
 
 
 @pytest.mark.parametrize(
+    ("kind", "name", "labels", "workload"),
+    [
+        ("ReplicaSet", "talker-5d4c9", {"pod-template-hash": "5d4c9"}, "deployment/talker"),
+        ("ReplicaSet", "talker-5d4c9", {}, ""),  # no Deployment has made it
+        ("ReplicaSet", "talker", {"pod-template-hash": "5d4c9"}, ""),
+        ("StatefulSet", "arm", {}, "statefulset/arm"),
+        ("DaemonSet", "arm", {}, "daemonset/arm"),
+        ("Job", "arm", {}, ""),
+    ],
+)
+def test_what_restarts_a_pod(kind, name, labels, workload):
+    obj = pod_obj()
+    owner = {"kind": kind, "name": name, "controller": True}
+    obj["metadata"] |= {"labels": labels, "ownerReferences": [owner]}
+
+    parsed = pod(obj)
+
+    assert (parsed.controller, parsed.workload) == (kind, workload)
+
+
+@pytest.mark.parametrize(
     "owner", [{"apiVersion": "apps/v1"}, {"kind": "ReplicaSet"}, {"controller": False}]
 )
 def test_somebody_elses_pod_with_the_same_labels_is_no_proxy(owner):

@@ -325,7 +325,19 @@ def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
 
 def test_a_pod_that_is_not_wired_is_told() -> None:
     plan = look(complete(pods=(pod(wired_master_uri=""),)))
-    assert "create the pod anew" in told(plan, "NotWired")[0]
+    assert "kubectl -n ros delete pod talker" in told(plan, "NotWired")[0]
+
+
+def test_a_pod_of_a_former_rosproxy_is_told() -> None:
+    """Its nodes are registered no more; the new Service had got the same address."""
+    of = replace(rosproxy(), created="2026-01-01T00:00:10Z")
+    former = pod(created="2026-01-01T00:00:09Z", workload="deployment/talker")
+    plan = look(complete(pods=(former,), rosproxies=(of,)))
+    (text,) = told(plan, "NotWired")
+    assert "is older than RosProxy robot" in text
+    assert text.endswith(": kubectl -n ros rollout restart deployment/talker")
+    of_now = pod(created="2026-01-01T00:00:10Z", workload="deployment/talker")
+    assert not told(look(complete(pods=(of_now,), rosproxies=(of,))), "NotWired")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
-from rosproxy_operator.kubernetes.resources.model import Pod
+from rosproxy_operator.kubernetes.resources.model import MasterSpec, Pod, PodContainer, Ros2Spec
 from rosproxy_operator.kubernetes.resources.names import master_uri
 from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
 from tests.unit.operator.kubernetes.builders_api import pod_obj, rosproxy_obj
@@ -26,7 +26,8 @@ from tests.unit.operator.kubernetes.objects import (
     service,
 )
 
-WIRED = master_uri(service().cluster_ip)
+IP = service().cluster_ip
+WIRED = master_uri(IP)
 
 
 def of_set(name: str = "a", **more: Any) -> Pod:
@@ -54,6 +55,25 @@ def test_one_that_was_not_wired_is_evicted() -> None:
 
 def test_one_that_was_wired_to_a_former_address_is_evicted() -> None:
     assert evicted(look(cluster(of_set(wired_master_uri="http://10.96.0.200:11311")))) == ["a"]
+
+
+def test_a_pod_of_a_former_rosproxy_is_evicted() -> None:
+    seen = cluster(of_set(wired_master_uri=WIRED, created="2026-01-01T00:00:00Z"))
+    (of,) = seen.rosproxies
+    assert evicted(look(seen)) == []
+    of = replace(of, created="2026-01-01T00:00:01Z")
+    assert evicted(look(replace(seen, rosproxies=(of,)))) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("peers", "own", "goes"),
+    [("", "", True), ("10.96.0.200", "10.96.0.200", True), ("", "robot", False), (IP, IP, False)],
+)
+def test_a_pod_without_static_peers_is_evicted(peers: str, own: str, goes: bool) -> None:
+    container = PodContainer(variables={"ROS_STATIC_PEERS": own} if own else {})
+    left = of_set(static_peers=peers, containers=(container,))
+    of = replace(rosproxy(ros1=False, ros2=Ros2Spec(), master=MasterSpec()), remakes=True)
+    assert bool(evicted(look(observed(of, service(), node(), left)))) == goes
 
 
 @pytest.mark.parametrize("kind", ["ReplicationController", "StatefulSet", "DaemonSet"])

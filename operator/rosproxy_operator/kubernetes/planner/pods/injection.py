@@ -21,6 +21,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     Name,
     Pod,
+    PodContainer,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
@@ -122,17 +123,58 @@ def wiring_finding(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFind
 
 
 def has_come_unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
-    """Whether a pod is not wired, or to another address, and would be wired if it were made anew.
+    """Whether a pod has to be created anew to use its proxy, and would be wired then.
 
     A pod whose template sets another ROS_MASTER_URI than that of its RosProxy's master would not,
-    nor would a pod without the label.
+    nor would a pod whose template sets ROS_STATIC_PEERS, nor a pod without the label.
     """
     masters = _masters_of(rosproxy)
-    return (
-        INJECT in pod.labels
+    lacks_master = (
+        rosproxy.spec.ros1
         and all(_names_one(uri, masters) for uri in pod.own_masters)
-        and pod.wired_master_uri != master_uri(cluster_ip)
+        and (pod.wired_master_uri != master_uri(cluster_ip) or _is_of_former(pod, rosproxy))
     )
+    peers = {c.variables["ROS_STATIC_PEERS"] for c in pod.containers if has_peers(c)}
+    lacks_peers = (
+        rosproxy.spec.ros2 is not None
+        and peers <= {pod.static_peers}
+        and pod.static_peers != cluster_ip
+    )
+    return INJECT in pod.labels and (lacks_master or lacks_peers)
+
+
+def has_peers(container: PodContainer) -> bool:
+    """Whether ROS_STATIC_PEERS is set in a container."""
+    return "ROS_STATIC_PEERS" in container.variables
+
+
+def restart_of(pod: Pod) -> str:
+    """The command that creates a pod anew."""
+    if pod.workload:
+        return f"kubectl -n {pod.id.namespace} rollout restart {pod.workload}"
+    command = f"kubectl -n {pod.id.namespace} delete pod {pod.id.name}"
+    return command if pod.controller else f"{command}, and create the pod again"
+
+
+def _edit_of(pod: Pod) -> str:
+    """Where the template of a pod is changed."""
+    if pod.workload:
+        return f"kubectl -n {pod.id.namespace} edit {pod.workload}"
+    return f"change the template of the pod, then {restart_of(pod)}"
+
+
+def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
+    """Whether a pod was wired to a proxy of a former RosProxy of the same name.
+
+    The ROS nodes of the pod were unregistered when that RosProxy was deleted, and don't register
+    again by themselves.
+    """
+    return bool(pod.wired_master_uri) and _is_older(pod, rosproxy)
+
+
+def _is_older(pod: Pod, rosproxy: RosProxy) -> bool:
+    # RFC 3339 in UTC and whole seconds: the order of the texts is that of the times.
+    return bool(pod.created) and pod.created < rosproxy.created
 
 
 def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
@@ -141,27 +183,35 @@ def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
     foreign = [uri for uri in around if not _names_one(uri, masters)]
     if foreign:
         return (
-            f"sets ROS_MASTER_URI={clean(foreign[0])[:200]} itself, which is not its proxy: take "
-            "the variable out of its template, then create the pod anew"
+            f"sets ROS_MASTER_URI={clean(foreign[0])[:200]} itself, which does not lead to its "
+            f"proxy: remove the variable: {_edit_of(pod)}"
         )
     if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
         return (
             f"was wired to {clean(pod.wired_master_uri)[:200]}, but its proxy is at "
-            f"{master_uri(cluster_ip)} now: create the pod anew"
+            f"{master_uri(cluster_ip)} now: {restart_of(pod)}"
+        )
+    if _is_of_former(pod, rosproxy):
+        return (
+            f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
+            "deleted, and the ROS nodes of the pod were unregistered at the master: "
+            f"{restart_of(pod)}"
         )
     if not around and (pod.wired_master_uri or pod.own_masters):
         return ""
-    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy.id)
+    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy)
 
 
-def missing_variable_text(variable: str, pod: Pod, rosproxy_id: Name) -> str:
+def missing_variable_text(variable: str, pod: Pod, rosproxy: RosProxy) -> str:
     """Why a pod has not got a variable of its proxy, and what to do about it."""
     text = f"has no {variable} of its proxy"
     if INJECT not in pod.labels:
-        label = f"{INJECT}={rosproxy_id.name}"
-        return f"{text}: add the label {label} to its template, then create the pod anew"
-    reason = "since it was created while the webhook was not there or there was no RosProxy"
-    return f"{text}, {reason}: create the pod anew"
+        label = f"{INJECT}={rosproxy.id.name}"
+        return f"{text}: add the label {label} to the pod's template: {_edit_of(pod)}"
+    if _is_older(pod, rosproxy):
+        return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}: {restart_of(pod)}"
+    reason = "since the API server reached no operator (port 9443) when the pod was created"
+    return f"{text}, {reason}: {restart_of(pod)}"
 
 
 def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:

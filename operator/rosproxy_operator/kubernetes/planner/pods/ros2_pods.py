@@ -10,7 +10,11 @@ from collections.abc import Iterator
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.ros2 import is_dds
-from rosproxy_operator.kubernetes.planner.pods.injection import missing_variable_text
+from rosproxy_operator.kubernetes.planner.pods.injection import (
+    has_peers,
+    missing_variable_text,
+    restart_of,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,
     ClusterFinding,
@@ -32,7 +36,9 @@ def ros2_findings(pod: Pod, rosproxy: RosProxy, address: str) -> Iterator[Cluste
     """What is wrong with a pod's variables; ``address`` is that of the RosProxy's Service."""
     if rosproxy.spec.ros2 is None:
         return
-    problems = dict.fromkeys(p for c in pod.containers for p in _problems(c, rosproxy, address))
+    problems = dict.fromkeys(
+        p for c in pod.containers for p in _problems(c, pod, rosproxy, address)
+    )
     if (text := _peers_problem(pod, rosproxy, address)) and not any(
         r == "NotWired" for r, _ in problems
     ):
@@ -46,15 +52,15 @@ def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str) -> str:
     if pod.static_peers and pod.static_peers != address:
         return (
             f"was told ROS_STATIC_PEERS={clean(pod.static_peers)[:200]}, but its proxy is at "
-            f"{address} now: create the pod anew"
+            f"{address} now: {restart_of(pod)}"
         )
-    if pod.static_peers or any("ROS_STATIC_PEERS" in c.variables for c in pod.containers):
+    if pod.static_peers or any(map(has_peers, pod.containers)):
         return ""
-    return missing_variable_text("ROS_STATIC_PEERS", pod, rosproxy.id)
+    return missing_variable_text("ROS_STATIC_PEERS", pod, rosproxy)
 
 
 def _problems(
-    container: PodContainer, rosproxy: RosProxy, address: str
+    container: PodContainer, pod: Pod, rosproxy: RosProxy, address: str
 ) -> Iterator[tuple[str, str]]:
     """Reason and text of what is wrong with a container."""
     get = container.variables.get
@@ -69,7 +75,7 @@ def _problems(
         and not _names_service(peers, rosproxy, address)
     ):
         text = f"sets ROS_STATIC_PEERS={_shown(peers)} itself, without its proxy"
-        yield "NotWired", f"{text}: take the variable out of its template, or add {address} to it"
+        yield "NotWired", f"{text}: remove the variable from the template, or add {address} to it"
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     if domain not in (None, VALUE_AT_RUNTIME) and str(domain).strip() not in (str(number), ""):
@@ -77,7 +83,7 @@ def _problems(
             f"sets ROS_DOMAIN_ID={_shown(str(domain))}, "
             f"but RosProxy {rosproxy.id.name} is for domain"
         )
-        yield "OtherDomain", f"{text} {number}: change either, then create the pod anew"
+        yield "OtherDomain", f"{text} {number}: change either, then {restart_of(pod)}"
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
     if distro:
         text = f"is of ROS 2 {distro[1].capitalize()}, which knows no ROS_STATIC_PEERS"

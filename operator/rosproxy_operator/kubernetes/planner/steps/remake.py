@@ -43,4 +43,4 @@ def is_to_be_remade(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> bool:
     ``cluster_ip`` is the address of the RosProxy's Service.
     """
     makes_anew = pod.controller in RECREATING_CONTROLLERS and not pod.deleting and not pod.ended
-    return makes_anew and rosproxy.spec.ros1 and has_come_unwired(pod, rosproxy, cluster_ip)
+    return makes_anew and has_come_unwired(pod, rosproxy, cluster_ip)
