@@ -114,10 +114,10 @@ def moves(
         for place, move in sorted(moved.items()):
             if place in ranges and not _is_kept(move.ports, ranges[place]):
                 rosproxy = view.rosproxies[place.of]
-                why = "they could not be had: nothing needs to be done"
+                why = "the old ports are not free. Nothing needs to be done"
                 if has_served:
                     lost = after_move(rosproxy.spec.ros1, rosproxy.spec.ros2 is not None)
-                    why = f"something else has taken them or the RosProxy forbids them now: {lost}"
+                    why = f"the old ports are taken, or the RosProxy no longer allows them. {lost}"
                 change = f"has left ports {move.ports} for {ranges[place]}"
                 text = f"the proxy on node {place.node} {change}, since {why}"
                 yield finding(rosproxy, "PortConflict", text)
