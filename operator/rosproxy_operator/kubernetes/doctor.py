@@ -6,7 +6,7 @@ own pod (``kubectl exec``), which looks from where the proxy is. All of that tak
 whoever looks needs: what is missing is told, and the rest looked at.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from kubernetes.client import ApiClient, CoreV1Api
@@ -23,7 +23,9 @@ from rosproxy_operator.common.proxy_doctor import (
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
+from rosproxy_operator.kubernetes.resources.checks import submap, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.names import PROXY, component
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import event_findings
 from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_FIX
@@ -56,10 +58,20 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         ]
     finally:
         api.close()
-    pods = [pod for pod in own_pods if pod["status"].get("phase") == "Running"]
+    proxies = running_proxies(own_pods)
     with ThreadPoolExecutor(AT_ONCE) as threads:
-        answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], pods)
+        answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], proxies)
         return [*findings, *without_names_of_others([*answers], names)]
+
+
+def running_proxies(own_pods: Iterable[Json]) -> list[Json]:
+    """The pods that have a doctor: running proxies, without LAN relays and image checks."""
+    return [
+        pod
+        for pod in own_pods
+        if component(texts_at(submap(pod, "metadata"), "labels")) == PROXY
+        and submap(pod, "status").get("phase") == "Running"
+    ]
 
 
 def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:

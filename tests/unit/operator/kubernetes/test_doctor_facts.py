@@ -1,5 +1,6 @@
 """What the doctor finds about the webhook and in Events, and what it is not allowed to look at."""
 
+import copy
 import time
 from datetime import UTC, datetime
 from typing import Any
@@ -10,8 +11,15 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.rbac import missing_right
+from rosproxy_operator.kubernetes.doctor import running_proxies
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
 from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.names import (
+    COMPONENT_LABEL,
+    IMAGE_CHECK,
+    LAN_RELAY,
+    PROXY,
+)
 from rosproxy_operator.kubernetes.status.event_findings import (
     MOST,
     RecentEvent,
@@ -250,3 +258,13 @@ def test_the_name_in_an_event_is_no_command() -> None:
     )
     (finding,) = event_findings([evil], ())
     assert finding.fix == "kubectl -n 'robots;reboot' describe pod 'talker;reboot'"
+
+
+def test_only_running_proxies_have_a_doctor() -> None:
+    """A LAN relay has none: its pod was reported as an ERROR, with a cure for Docker."""
+    proxy = proxy_obj("robot")
+    pods = [proxy, *(copy.deepcopy(proxy) for _ in range(3))]
+    for pod, component in zip(pods[1:], (LAN_RELAY, IMAGE_CHECK, PROXY), strict=True):
+        pod["metadata"]["labels"][COMPONENT_LABEL] = component
+    pods[3]["status"]["phase"] = "Pending"
+    assert running_proxies(pods) == [proxy]
