@@ -206,7 +206,10 @@ class Api:
     def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[JsonObject]:
         """All RosProxies, or those of a namespace, as they are at this moment."""
         places = (namespace,) if namespace else self._places
-        lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
+        try:
+            lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
+        except ApiNotFound:
+            raise ApiNotFound(crd_missing(PLURAL)) from None
         return [obj for listing in lists for obj in self._items(listing)]
 
     def own_pods(self) -> list[JsonObject]:
@@ -443,6 +446,16 @@ def _path(kind: str, namespace: str, name: str = "") -> str:
     kind, _, sub = kind.partition("/")
     segments = ["namespaces", namespace, kind, name, sub] if namespace else [kind, name, sub]
     return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(s, safe="") for s in segments if s)])
+
+
+def crd_missing(kind: str) -> str:
+    """What to do about a kind that does not exist at all; empty for those that always do."""
+    if kind != PLURAL:
+        return ""
+    return (
+        f"the CustomResourceDefinition {PLURAL}.{GROUP} is not installed. Install the chart "
+        "rosproxy, or apply manifests/; both contain the definition"
+    )
 
 
 def refusal(status: int, reason: str, body: bytes) -> ApiError:

@@ -29,7 +29,6 @@ from rosproxy_operator.kubernetes.api.api_client import (
 )
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json
-from rosproxy_operator.kubernetes.resources.names import GROUP, PLURAL
 from rosproxy_operator.kubernetes.resources.records import READERS, Record, key_of
 
 log = logging.getLogger(__name__)
@@ -212,13 +211,3 @@ def _error(status: Json) -> ApiError:
 def watched_collections(api: Api) -> list[tuple[str, str]]:
     """The kinds to be followed, each with a namespace (empty for all); RosProxies first."""
     return [(kind, place) for kind in READERS for place in api.namespaces_of(kind)]
-
-
-def crd_missing(kind: str) -> str:
-    """What to do about a kind that does not exist at all; empty for those that always do."""
-    if kind != PLURAL:
-        return ""
-    return (
-        "the cluster has no RosProxies: install the CustomResourceDefinition "
-        f"{PLURAL}.{GROUP} (it comes with the chart and with manifests/)"
-    )

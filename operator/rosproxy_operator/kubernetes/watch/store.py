@@ -15,7 +15,12 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
-from rosproxy_operator.kubernetes.api.api_client import ApiError, ApiNotFound, ApiUnavailable
+from rosproxy_operator.kubernetes.api.api_client import (
+    ApiError,
+    ApiNotFound,
+    ApiUnavailable,
+    crd_missing,
+)
 from rosproxy_operator.kubernetes.planner.pods.selection import selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
@@ -35,7 +40,6 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, LAN_RELAY, PLURAL
 from rosproxy_operator.kubernetes.resources.records import POLICIES, Record
-from rosproxy_operator.kubernetes.watch.reflector import crd_missing
 
 log = logging.getLogger(__name__)
 

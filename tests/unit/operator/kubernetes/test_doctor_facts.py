@@ -9,7 +9,7 @@ import pytest
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api.api_client import Api
+from rosproxy_operator.kubernetes.api.api_client import Api, ApiNotFound
 from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.doctor import running_proxies
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
@@ -268,3 +268,10 @@ def test_only_running_proxies_have_a_doctor() -> None:
         pod["metadata"]["labels"][COMPONENT_LABEL] = component
     pods[3]["status"]["phase"] = "Pending"
     assert running_proxies(pods) == [proxy]
+
+
+async def test_a_missing_crd_is_told(server: ApiServer, api: Api) -> None:
+    """The doctor printed the answer of the API server, "404 page not found", and nothing else."""
+    server.refuse("GET", "rosproxies", 404, "404 page not found")
+    with pytest.raises(ApiNotFound, match=r"rosproxies\.rosproxy\.io is not installed"):
+        await in_thread(api.rosproxies)

@@ -332,7 +332,7 @@ async def test_one_bad_rosproxy_does_not_stop_the_others(server: ApiServer, seen
 async def test_a_missing_crd_is_told(server: ApiServer, seen: Seen) -> None:
     server.refuse("GET", "rosproxies", 404, "the server could not find the requested resource")
     start(seen)
-    with pytest.raises(ApiError, match="install the CustomResourceDefinition") as caught:
+    with pytest.raises(ApiError, match=r"rosproxies\.rosproxy\.io is not installed") as caught:
         await seen.read()
     assert type(caught.value) is ApiNotFound
 
