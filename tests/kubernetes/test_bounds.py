@@ -20,7 +20,7 @@ def test_an_image_that_is_not_allowed(net: Namespace) -> None:
     net.idle(on="node1")
     for kind, status in (("Ready", "False"), ("Degraded", "True")):
         message = made.wait_for(kind, status, "NotAllowed")["message"]
-        assert message.startswith("spec.image: 'evil:1' is not what the operator allows")
+        assert message.startswith("spec.image: the operator does not allow 'evil:1'")
         assert "allow.images" in message
     made.wait_event("NotAllowed", "spec.image")
     assert made.proxies == []
@@ -41,7 +41,7 @@ def test_what_is_there_stays_when_too_much_is_asked_for(net: Namespace) -> None:
 
 
 def test_another_namespaces_master_needs_its_consent(net: Namespace) -> None:
-    """The condition says the command; whoever may change the Service runs it."""
+    """The condition has the command for a user that may change the Service."""
     with namespace() as other:
         api.create({
             "apiVersion": "v1", "kind": "Service",
@@ -53,7 +53,7 @@ def test_another_namespaces_master_needs_its_consent(net: Namespace) -> None:
         net.idle(on="node1")
         message = made.wait_for("Ready", "False", "NotAllowed")["message"]
         assert made.proxies == []
-        command = shlex.split(message.partition("with: ")[2])
+        command = shlex.split(message.partition("to run ")[2])
         assert command[0] == "kubectl"
         assert command[-1] == f"rosproxy.io/allow-from={net.name}"
         kubectl(*command[1:])

@@ -1,7 +1,7 @@
 """What a user writes, read strictly: the first field that does not fit is refused by its name.
 
 Not by msgspec, which reads the proxy's documents: its messages neither name a field as Kubernetes
-does nor tell what to do.
+does nor give a fix.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ class Field(msgspec.Struct, frozen=True):
 
     def error(self, problem: str, fix: str) -> InvalidField:
         """The error to raise for it: what is wrong, and what to do."""
-        return InvalidField(f"{self.path}: {quoted(self.value)} {problem}: {fix}")
+        return InvalidField(f"{self.path}: {quoted(self.value)} {problem}. {fix}")
 
     def __getitem__(self, key: str) -> "Field":
         return Field(f"{self.path}.{key}", self.map().get(key))
@@ -51,7 +51,7 @@ class Field(msgspec.Struct, frozen=True):
         ]
         for field in fields:
             if field.value is None:
-                raise field.error("is not valid", "leave it out")
+                raise field.error("is not valid", "Remove the entry")
         return fields
 
     def text(self, default: str = "") -> str:
@@ -70,14 +70,14 @@ class Field(msgspec.Struct, frozen=True):
         fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
         if not fits or not least <= self.value <= most:
             expected = {int: "an integer", float: "a number"}[kind]
-            raise self.error("is not valid", f"write {expected} from {least} to {most}")
+            raise self.error("is not valid", f"Write {expected} from {least} to {most}")
         return kind(self.value)
 
     def one_of(self, allowed: Mapping[str, V], default: str) -> V:
         """What the text stands for, which must be one of those that are allowed."""
         text = self.text(default)
         if text not in allowed:
-            fix = f"write one of {', '.join(sorted(filter(None, allowed)))}"
+            fix = f"Write one of {', '.join(sorted(filter(None, allowed)))}"
             raise self.error("is unknown", fix)
         return allowed[text]
 
@@ -85,7 +85,7 @@ class Field(msgspec.Struct, frozen=True):
         if self.value is None:
             return default
         if not isinstance(self.value, type):
-            raise self.error("is not valid", f"write {expected}")
+            raise self.error("is not valid", f"Write {expected}")
         return self.value
 
 

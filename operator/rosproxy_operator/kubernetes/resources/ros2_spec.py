@@ -13,7 +13,7 @@ def versions(field: Field) -> tuple[str, ...]:
     value = "1" if field.value is None else field.value
     text = str(value).replace(" ", "") if type(value) in (int, str) else ""
     if text not in _VERSIONS:
-        raise field.error("is unknown", "write 1, 2 or '1,2'")
+        raise field.error("is unknown", "Write 1, 2 or '1,2'")
     return _VERSIONS[text]
 
 
@@ -22,8 +22,8 @@ def ros2_spec(field: Field, wanted: bool) -> Ros2Spec | None:
     if not wanted:
         for name in ("domain", "peers", "multicast"):
             if field[name].value not in (None, [], False):
-                fix = "leave it out, or set spec.ros: 2"
-                raise field[name].error("is for ROS 2, which spec.ros leaves out", fix)
+                fix = "Remove the field, or set spec.ros: 2"
+                raise field[name].error("is for ROS 2, but spec.ros is 1", fix)
         return None
     domain = field["domain"]
     return Ros2Spec(
@@ -37,14 +37,14 @@ def check_ports(field: Field, ports: int, ros2: Ros2Spec | None) -> None:
     """Raise InvalidField if there are too few ports for ROS 2."""
     least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PER_DOMAIN
     if ros2 and ports < least:
-        fix = f"ask for {least} at least: each participant takes three"
-        raise field.error("are too few for ROS 2", fix)
+        fix = f"Write at least {least}: each participant takes three ports"
+        raise field.error("is too low for ROS 2", fix)
 
 
 def _peers(field: Field) -> tuple[str, ...]:
     listed = field.items()
     if len(listed) > MOST_PEERS:
-        raise field.error("are too many", f"name {MOST_PEERS} hosts at most")
+        raise field.error("has too many hosts", f"Name at most {MOST_PEERS} hosts")
     return tuple(sorted({_peer(peer) for peer in listed}))
 
 
@@ -52,5 +52,5 @@ def _peer(field: Field) -> str:
     try:
         return read_peer_name(field.text())
     except ValueError:
-        fix = "write the robot's name or address, or HOST:PORT of another proxy"
-        raise field.error("is no peer", fix) from None
+        fix = "Write the robot's name or address, or HOST:PORT of another proxy"
+        raise field.error("is not a peer", fix) from None

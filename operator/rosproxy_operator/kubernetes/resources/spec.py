@@ -107,8 +107,8 @@ def rosproxy(obj: Json) -> RosProxy:
     service = parse_slave_uri(text_at(status, "masterURI"))
     address = service.host if service else text_at(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME:
-        fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
-        raise Field("metadata.name", id.name).error("is not valid", fix)
+        fix = f"Use at most {MOST_NAME} characters a-z, 0-9 and -"
+        raise Field("metadata.name", id.name).error("can't be the name of a RosProxy", fix)
     return RosProxy(
         id=id,
         uid=text_at(meta, "uid"),
@@ -138,7 +138,7 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
     for_ros = versions(field["ros"])
     for name in ("master", "udp"):
         if "1" not in for_ros and field[name].value not in (None, False):
-            raise field[name].error("is for ROS 1, which spec.ros leaves out", "leave it out")
+            raise field[name].error("is for ROS 1, but spec.ros is 2", "Remove the field")
     ros2 = ros2_spec(field, "2" in for_ros)
     check_ports(field["ports"], ports, ros2)
     return RosProxySpec(
@@ -173,7 +173,7 @@ def _max_unavailable(field: Field) -> MaxUnavailable:
     if isinstance(field.value, str):
         percent = field.value.removesuffix("%")
         if field.value == percent or not percent.isdecimal() or not 1 <= int(percent) <= 100:
-            raise field.error("is no percentage", "write a number from 1, or 1% to 100%")
+            raise field.error("is not a percentage", "Write a number from 1 on, or 1% to 100%")
         return MaxUnavailable(int(percent), is_percent=True)
     return MaxUnavailable(int(field.number(1, 1, 10_000)))
 
@@ -182,16 +182,16 @@ def _pod_egress(field: Field) -> PodEgress:
     egress = field["podEgress"].one_of(_POD_EGRESS, "Any")
     direction = field["direction"]
     if egress == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
-        fix = "the pods would hear nobody outside: choose spec.direction: Both, too"
-        raise field["podEgress"].error("does not go with spec.direction: Out", fix)
+        problem = "needs spec.direction: Both; otherwise the pods receive nothing from outside"
+        raise field["podEgress"].error(problem, "Set spec.direction: Both")
     return egress
 
 
 def _udp(field: Field) -> bool:
     udp = field["udp"].boolean()
     if udp and field["direction"].one_of(_DIRECTION, "Out") == "out":
-        fix = "datagrams get in with both directions alone: choose spec.direction: Both, too"
-        raise field["udp"].error("does not go with spec.direction: Out", fix)
+        problem = "needs spec.direction: Both; otherwise no datagrams reach the pods"
+        raise field["udp"].error(problem, "Set spec.direction: Both")
     return udp
 
 
@@ -201,7 +201,7 @@ def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:
     rules = tuple(rule for r in field["rules"].items() for rule in _rules(r))
     layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
     if problem := too_much(layers):
-        raise InvalidField(f"{field['rules'].path}: {problem}: join names or nodes by globs")
+        raise InvalidField(f"{field['rules'].path}: {problem}. Join names or nodes by globs")
     return layers
 
 
@@ -212,7 +212,7 @@ def _rules(field: Field) -> Iterator[Rule]:
     names = [_glob(name, kind is not RuleKind.SLAVE) for name in field["names"].items()]
     nodes = [_glob(node, True) for node in field["nodes"].items()]
     if not names:
-        raise field["names"].error("is empty", "name what the rule is about, or write ['*']")
+        raise field["names"].error("is empty", "Write the names that the rule is about, or ['*']")
     for name in names:
         yield from (Rule(action, kind, name, node) for node in nodes or ["*"])
 
@@ -221,9 +221,9 @@ def _glob(field: Field, ros_name: bool) -> str:
     """A glob, for a ROS name or for a method of the slave API."""
     glob = field.text()
     if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
-        begins = ", and begins with / or *" if ros_name else ""
-        fix = f"it has 1 to 256 characters without blanks and ;{begins}"
-        raise field.error("is no glob of names", fix)
+        begins = ", with / or * at the beginning" if ros_name else ""
+        fix = f"Write 1 to 256 characters without blanks and ;{begins}"
+        raise field.error("is not a pattern of names", fix)
     return glob
 
 
@@ -232,8 +232,8 @@ def _window(field: Field, ports: int) -> PortRange:
     window = PortRange(field["first"].number(11412, *_HIGH), field["last"].number(29999, *_HIGH))
     if window.last - window.first + 1 < ports:
         raise InvalidField(
-            f"{field.path}: {window} has fewer than the {ports} ports that spec.ports asks for: "
-            "make the window larger, or spec.ports smaller"
+            f"{field.path}: {window} has fewer than the {ports} ports of spec.ports. Widen "
+            "spec.portWindow, or lower spec.ports"
         )
     return window
 
@@ -246,12 +246,12 @@ def _host_alias(field: Field) -> Json:
     ip = field["ip"].text()
     names = []
     if not is_address(ip) or "%" in ip:
-        fix = "write the host's address, e.g. 192.0.2.7"
+        fix = "Write the address of the host, such as 192.0.2.7"
         raise field["ip"].error("is not an IP address", fix)
     for hostname in field["hostnames"].items():
         names.append(hostname.text().lower())
         if not is_subdomain(names[-1]):
-            raise hostname.error("is not a host name", "it has letters, digits, - and dots only")
+            raise hostname.error("is not a host name", "Use letters, digits, - and dots only")
     return {"ip": ip, "hostnames": names}
 
 
@@ -277,23 +277,23 @@ def _expression(field: Field) -> tuple[str, str, frozenset[str]]:
     values = [_check_value(value) for value in field["values"].items()]
     if bool(values) != (operator in ("In", "NotIn")):
         problem = f"{'is not' if values else 'is'} empty, but the operator is {operator}"
-        fix = "leave the values out" if values else "name at least one value"
+        fix = "Remove the values" if values else "Write at least one value"
         raise field["values"].error(problem, fix)
     return key, operator, frozenset(values)
 
 
 def _check_key(field: Field, key: str) -> None:
     if not is_label_key(key):
-        raise Field(field.path, key).error("is no label's key", _AS_LABEL)
+        raise Field(field.path, key).error("can't be the key of a label", _AS_LABEL)
 
 
 def _check_value(field: Field) -> str:
     if not is_label_value(field.text()):
-        raise field.error("is no label's value", _AS_LABEL)
+        raise field.error("can't be the value of a label", _AS_LABEL)
     return field.text()
 
 
-_AS_LABEL = "write it as in the pod's labels"
+_AS_LABEL = "Copy the text from the labels of the pod"
 
 
 def _master(field: Field, of: Name) -> MasterSpec:
@@ -303,13 +303,13 @@ def _master(field: Field, of: Name) -> MasterSpec:
     publish = field["publish"].number(0, *_HIGH)
     if (uri.value is None) == (service.value is None):
         raise InvalidField(
-            f"{field.path}: give either uri, for a master outside of the cluster, or service, for "
-            "one in it, and not both"
+            f"{field.path}: give exactly one of uri (a master outside of the cluster) and service "
+            "(a master in the cluster)"
         )
     if service.value is None:
         return MasterSpec(uri=_uri(uri, of), address=_address(address), publish=publish)
     if address.value is not None:
-        raise InvalidField(f"{address.path}: goes with uri only: leave it out")
+        raise InvalidField(f"{address.path}: goes with uri only. Remove the field")
     port = service["port"].number(MASTER_PORT, 1, 65535)
     return MasterSpec(service=_service(service, of), service_port=port, publish=publish)
 
@@ -320,16 +320,16 @@ def _uri(field: Field, of: Name) -> str:
     master = parse_slave_uri(text) or parse_slave_uri(_with_port(text))
     path = urlsplit(text).path.rstrip("/") if master else ""
     if master is None or not master.host.isascii() or not _PATH.fullmatch(path):
-        raise field.error("is not a master's URI", f"write it like {_EXAMPLE}")
+        raise field.error("is not the URI of a master", f"Write a URI such as {_EXAMPLE}")
     host = master.host.lower()
     if is_loopback(host):
         raise field.error(
-            "would be the proxy's own pod, where no master runs",
-            "give the master's host as the nodes of the cluster reach it, or, for a master in the "
-            "cluster, service instead",
+            "means the proxy's own pod, where no master runs",
+            "Give the master's host as the nodes of the cluster reach it; for a master in the "
+            "cluster, give spec.master.service instead",
         )
     if _is_service(host, service_id(of)):
-        raise field.error(_OWN_SERVICE, f"give the real master, as {_EXAMPLE}")
+        raise field.error(_OWN_SERVICE, f"Give the real master, such as {_EXAMPLE}")
     return slave_uri(HostPort(host, master.port), path)
 
 
@@ -357,19 +357,19 @@ def _service(field: Field, of: Name) -> Name:
     namespace = field["namespace"]
     service = Name(namespace.text() or of.namespace, name.text())
     if not is_label(service.name):
-        raise name.error("is not a Service's name", "write it as kubectl get service shows it")
+        raise name.error("can't be the name of a Service", "Copy the name from kubectl get service")
     if not is_label(service.namespace):
-        raise namespace.error("is not a namespace's name", "leave it out or correct it")
+        raise namespace.error("can't be the name of a namespace", "Correct or remove the field")
     if service == service_id(of):
-        raise name.error(_OWN_SERVICE, "name that of the real master")
+        raise name.error(_OWN_SERVICE, "Give the Service of the real master")
     return service
 
 
 def _address(field: Field) -> str:
     address = parse_address(field.text())
     if field.value is not None and (address is None or is_loopback(address)):
-        fix = "give that of the master's host, e.g. 192.0.2.7"
-        raise field.error("is not an IP address", fix)
+        fix = "Give the IP address of the master's host, such as 192.0.2.7"
+        raise field.error("is not an IP address of another host", fix)
     return address or ""
 
 

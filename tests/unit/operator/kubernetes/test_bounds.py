@@ -58,29 +58,31 @@ def condition(rosproxy_status: Mapping[str, Any], kind: str = "Ready") -> tuple[
     [
         (OWN, {"ports": 500}, ""),
         (bounded(max_ports=8), {"ports": 8}, ""),
-        (bounded(max_ports=8), {"ports": 9}, "spec.ports: 9 is not what the operator allows: ask "
-         "for 8 at most, or have its administrator allow it (chart value allow.maxPorts)"),
+        (bounded(max_ports=8), {"ports": 9}, "spec.ports: the operator does not allow 9. Ask for "
+         "8 at most, or ask the operator's administrator to allow the value (chart value "
+         "allow.maxPorts)"),
         (OWN, {"window": PortRange(1024, 65535)}, ""),
         (NARROW, {"window": PortRange(12000, 12999)}, ""),
-        (NARROW, {"window": PortRange(11999, 12100)}, "spec.portWindow: '11999-12100' is not what "
-         "the operator allows: choose one within 12000-12999, or have its administrator allow it "
-         "(chart value allow.portWindow)"),
+        (NARROW, {"window": PortRange(11999, 12100)}, "spec.portWindow: the operator does not "
+         "allow '11999-12100'. Choose a window within 12000-12999, or ask the operator's "
+         "administrator to allow the value (chart value allow.portWindow)"),
         (NARROW, {"window": PortRange(12900, 13000)}, "allow.portWindow"),
         (NARROW, {"window": PortRange(12000, 12100), "master": MasterSpec("http://robot:11311",
-         publish=13000)}, "spec.master.publish: 13000 is not what the operator allows: choose one"),
+         publish=13000)}, "spec.master.publish: the operator does not allow 13000. Choose a"),
         (NARROW, {"window": PortRange(12000, 12100), "master": MasterSpec("http://robot:11311",
          publish=12500)}, ""),
         (OWN, {"data_plane": "splice"}, ""),
-        (OWN, {"data_plane": "kernel"}, "spec.dataPlane: 'Kernel' is not what the operator allows: "
-         "choose Auto or Splice or Copy, or have its administrator allow it (chart value "
-         "allow.dataPlanes)"),
+        (OWN, {"data_plane": "kernel"}, "spec.dataPlane: the operator does not allow 'Kernel'. "
+         "Choose Auto or Splice or Copy, or ask the operator's administrator to allow the value "
+         "(chart value allow.dataPlanes)"),
         (bounded(data_planes=("auto", "kernel")), {"data_plane": "kernel"}, ""),
-        (OWN, {"pod_egress": "proxy"}, "spec.podEgress: 'Proxy' is not what the operator allows: "
-         "choose Any, or have its administrator allow it (chart value "
+        (OWN, {"pod_egress": "proxy"}, "spec.podEgress: the operator does not allow 'Proxy'. "
+         "Choose Any, or ask the operator's administrator to allow the value (chart value "
          "proxy.networkPolicy.enabled)"),
         (OWN, {"image": "rosproxy:1"}, ""),
-        (OWN, {"image": "evil:1"}, "spec.image: 'evil:1' is not what the operator allows: leave it "
-         "out, or have its administrator allow it (chart value allow.images)"),
+        (OWN, {"image": "evil:1"}, "spec.image: the operator does not allow 'evil:1'. Remove the "
+         "field, or ask the operator's administrator to allow the value (chart value "
+         "allow.images)"),
         (bounded(images=("registry.example/ros/*",)), {"image": "registry.example/ros/a:1"}, ""),
         (bounded(images=("registry.example/ros/*",)), {"image": "registry.example/b:1"},
          "allow.images"),
@@ -162,7 +164,7 @@ def test_who_asks_for_too_much_gets_nothing_and_is_told() -> None:
     of = rosproxy(data_plane="kernel")
     plan = look(observed(of, pod(wired_master_uri="")), settings=OWN)
     assert done(plan) == []
-    text = "spec.dataPlane: 'Kernel' is not what the operator allows"
+    text = "spec.dataPlane: the operator does not allow 'Kernel'"
     for kind, holds in (("Ready", "False"), ("Degraded", "True")):
         status_, reason, message = condition(status(plan), kind)
         assert (status_, reason) == (holds, "NotAllowed")

@@ -106,7 +106,7 @@ def test_directions():
         read(podEgress="Proxy")
     with pytest.raises(InvalidField, match=r"spec\.udp.*direction: Both"):
         read(udp=True)
-    with pytest.raises(InvalidField, match=r"spec\.udp: 'yes' is not valid: write true or false"):
+    with pytest.raises(InvalidField, match=r"spec\.udp: 'yes' is not valid. Write true or false"):
         read(udp="yes")
 
 
@@ -218,18 +218,18 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
 @pytest.mark.parametrize(
     ("spec", "text"),
     [
-        ({"ports": 501}, "spec.ports: 501 is not valid: write an integer from 1 to 500"),
-        ({"ports": "32"}, "spec.ports: '32' is not valid: write an integer"),
-        ({"image": 7}, "spec.image: 7 is not valid: write a text, in quotes"),
+        ({"ports": 501}, "spec.ports: 501 is not valid. Write an integer from 1 to 500"),
+        ({"ports": "32"}, "spec.ports: '32' is not valid. Write an integer"),
+        ({"image": 7}, "spec.image: 7 is not valid. Write a text, in quotes"),
         (
             {"nodeSelector": {"a": 1}},
-            "spec.nodeSelector.a: 1 is not valid: write a text, in quotes",
+            "spec.nodeSelector.a: 1 is not valid. Write a text, in quotes",
         ),
-        ({"portWindow": [1]}, "spec.portWindow: [1] is not valid: write a map of fields"),
-        ({"dataPlane": "kernel"}, "spec.dataPlane: 'kernel' is unknown: write one of Auto, Copy, "),
+        ({"portWindow": [1]}, "spec.portWindow: [1] is not valid. Write a map of fields"),
+        ({"dataPlane": "kernel"}, "spec.dataPlane: 'kernel' is unknown. Write one of Auto, Copy, "),
         (
             {"graceSeconds": -1},
-            "spec.graceSeconds: -1 is not valid: write a number from 0 to 86400",
+            "spec.graceSeconds: -1 is not valid. Write a number from 0 to 86400",
         ),
     ],
 )
@@ -357,19 +357,22 @@ def test_every_kind_of_rule_has_a_word(kind):
 @pytest.mark.parametrize(
     ("bad", "said"),
     [
-        (rule(action="Hide"), "spec.policy.rules[0].action: 'Hide' is unknown: write one of Allow"),
-        (rule(kind="Topic"), "spec.policy.rules[0].kind: 'Topic' is unknown: write one of Call"),
+        (rule(action="Hide"), "spec.policy.rules[0].action: 'Hide' is unknown. Write one of Allow"),
+        (rule(kind="Topic"), "spec.policy.rules[0].kind: 'Topic' is unknown. Write one of Call"),
         (rule(kind=None), "spec.policy.rules[0].kind"),
-        (rule(names=[]), "spec.policy.rules[0].names: [] is empty: name what"),
-        (rule(names=["camera"]), "names[0]: 'camera' is no glob of names: it has 1 to 256 char"),
-        (rule(names=["/a; allow publish *"]), "is no glob of names"),
-        (rule(names=["/a by /b"]), "is no glob of names"),
-        (rule(names=["/" + "a" * 256]), "is no glob of names"),
-        (rule(names=[""]), "is no glob of names"),
-        (rule(nodes=["driver"]), "spec.policy.rules[0].nodes[0]: 'driver' is no glob of names"),
-        (rule(kind="Slave", names=["shutdown"], nodes=["x"]), "nodes[0]: 'x' is no glob"),
+        (rule(names=[]), "spec.policy.rules[0].names: [] is empty. Write the names"),
+        (rule(names=["camera"]), "names[0]: 'camera' is not a pattern of names. Write 1 to 256"),
+        (rule(names=["/a; allow publish *"]), "is not a pattern of names"),
+        (rule(names=["/a by /b"]), "is not a pattern of names"),
+        (rule(names=["/" + "a" * 256]), "is not a pattern of names"),
+        (rule(names=[""]), "is not a pattern of names"),
+        (
+            rule(nodes=["driver"]),
+            "spec.policy.rules[0].nodes[0]: 'driver' is not a pattern of names",
+        ),
+        (rule(kind="Slave", names=["shutdown"], nodes=["x"]), "nodes[0]: 'x' is not a pattern"),
         (rule(names=["/a"] * 501), "spec.policy.rules: 501 rules, at most 500 are accepted"),
-        (rule(names=["/" + "a" * 200] * 300), "bytes, at most 32768 are accepted: join names"),
+        (rule(names=["/" + "a" * 200] * 300), "bytes, at most 32768 are accepted. Join names"),
     ],
 )
 def test_a_bad_rule_is_told(bad, said):

@@ -87,19 +87,19 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
         for uri in _masters(spec):
             if not is_allowed_master(uri, bounds.masters):
                 field = "spec.master.uri" if spec.master.uri else "spec.master.service"
-                yield _refusal(field, uri, "choose an allowed master", "allow.masters")
+                yield _refusal(field, uri, "Choose an allowed master", "allow.masters")
     if spec.ros2:
         yield from _ros2_violations(spec.ros2, bounds)
     yield from _port_violations(spec, bounds)
     if spec.data_plane not in bounds.data_planes:
         choices = " or ".join(p.capitalize() for p in bounds.data_planes)
         value = spec.data_plane.capitalize()
-        yield _refusal("spec.dataPlane", value, f"choose {choices}", "allow.dataPlanes")
+        yield _refusal("spec.dataPlane", value, f"Choose {choices}", "allow.dataPlanes")
     if spec.pod_egress == "proxy" and not settings.network_policy:
-        yield _refusal("spec.podEgress", "Proxy", "choose Any", "proxy.networkPolicy.enabled")
+        yield _refusal("spec.podEgress", "Proxy", "Choose Any", "proxy.networkPolicy.enabled")
     patterns = (settings.image, *bounds.images)
     if spec.image and not any(_fits(spec.image, p) for p in patterns):
-        yield _refusal("spec.image", spec.image, "leave it out", "allow.images")
+        yield _refusal("spec.image", spec.image, "Remove the field", "allow.images")
 
 
 def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
@@ -107,29 +107,29 @@ def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
     for peer in spec.peers if bounds.peers else ():
         uri = slave_uri(HostPort(read_peer(peer).host, 1))
         if not is_allowed_master(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
-            yield _refusal("spec.peers", peer, "choose an allowed peer", "allow.peers")
+            yield _refusal("spec.peers", peer, "Choose an allowed peer", "allow.peers")
     if spec.multicast and not bounds.multicast:
-        fix = "leave it out, and name who is outside in spec.peers"
+        fix = "Remove the field, and name the hosts outside in spec.peers"
         yield _refusal("spec.multicast", True, fix, "allow.multicast")
 
 
 def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
     """What goes beyond them of the hostPorts that it asks for."""
     if spec.ports > bounds.max_ports:
-        fewer = f"ask for {bounds.max_ports} at most"
+        fewer = f"Ask for {bounds.max_ports} at most"
         yield _refusal("spec.ports", spec.ports, fewer, "allow.maxPorts")
     if not within(spec.window, bounds.window):
-        inside = f"choose one within {bounds.window}"
+        inside = f"Choose a window within {bounds.window}"
         yield _refusal("spec.portWindow", str(spec.window), inside, "allow.portWindow")
     if spec.master.publish and spec.master.publish not in bounds.window:
-        inside = f"choose one of {bounds.window}"
+        inside = f"Choose a port in {bounds.window}"
         yield _refusal("spec.master.publish", spec.master.publish, inside, "allow.portWindow")
 
 
 def _refusal(field: str, value: object, fix: str, allowing: str) -> str:
     return (
-        f"{field}: {quoted(value)} is not what the operator allows: {fix}, or have its "
-        f"administrator allow it (chart value {allowing})"
+        f"{field}: the operator does not allow {quoted(value)}. {fix}, or ask the operator's "
+        f"administrator to allow the value (chart value {allowing})"
     )
 
 
@@ -171,7 +171,8 @@ def _missing_consent(rosproxy: RosProxy, consents: Consents) -> str:
         return ""
     value = ",".join(sorted({*allowed, namespace}))
     return (
-        f"spec.master.service.namespace: {quoted(service.namespace)} is not this RosProxy's "
-        "namespace, and has not agreed: whoever may change the Service allows it with: kubectl "
+        f"spec.master.service.namespace: namespace {quoted(service.namespace)} does not allow "
+        f"RosProxies of namespace {quoted(namespace)} to use this master. Ask a user that may "
+        "change the Service to run kubectl "
         f"-n {service.namespace} annotate --overwrite service {service.name} {ALLOW_FROM}={value}"
     )
