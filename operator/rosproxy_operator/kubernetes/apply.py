@@ -49,6 +49,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.status.events import count_patch, event_body
+from rosproxy_operator.kubernetes.status.findings import OF_ANOTHER
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +141,7 @@ class ClusterApplier:
                 error = await self._perform(action, observed)
                 self.problems.pop(name, None)
                 if error is not None:
-                    text = f"its status can't be written: {error}"
+                    text = f"the operator can't write the status: {error}"
                     self.problems[name] = Problem(f"rosproxy {name}", text)
         # A Normal Event says that an action was done. It does not name its action: so after a
         # failure none of them is made.
@@ -159,7 +160,7 @@ class ClusterApplier:
             async with self._room:
                 await in_thread(self._call_api, action, observed)
         except StateChanged as error:
-            log.debug("%s: put off: %s has changed meanwhile", describe(action), error)
+            log.debug("%s: postponed: %s has changed meanwhile", describe(action), error)
             self._doubt(_subject(action))
             return None
         except NotLeading:
@@ -170,7 +171,7 @@ class ClusterApplier:
         except ApiError as error:
             text = str(error)
         except Exception as error:  # a mistake of ours must not stop the others
-            log.exception("%s failed", describe(action))
+            log.exception("action failed by an internal error: %s", describe(action))
             text = f"the operator failed: {error!r}"
         else:
             self._stale.discard(_subject(action))
@@ -252,10 +253,10 @@ class ClusterApplier:
                 async with asyncio.timeout(RETIRING):
                     token = token_for(proxy, observed.key)
                     answer = await self._proxies.retire(address_of(proxy), token)
-                log.info("%s has unregistered its nodes: %s", action.id, answer, extra=fields)
+                log.info("nodes unregistered: proxy %s, %s", action.id, answer, extra=fields)
         except (ProxyError, TimeoutError) as error:
             reason = str(error) or f"no answer in {RETIRING:g} s"
-            text = "%s could not unregister its nodes at the master: %s"
+            text = "nodes not unregistered at the master: proxy %s: %s"
             log.info(text, action.id, reason, extra=fields)
         finally:
             self._retired.add(action.uid)  # a proxy that could not unregister them goes as well
@@ -333,7 +334,8 @@ def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED)
         if pauses:
             time.sleep(pauses[0])
             return _create(api, kind, body, pauses[1:])
-        log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
+        text = "Service %s gets another address, since the API server refuses the former: %s"
+        log.info(text, name_of(body["metadata"]), error)
         _create(api, kind, without_cluster_ip(body))
 
 
@@ -349,10 +351,7 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
         return
     owners = {text_at(owner, "kind") for owner in submaps(metadata, "ownerReferences")}
     if not is_own(texts_at(metadata, "labels")) or KIND not in owners:
-        raise ApiConflict(
-            f"there is already a {body.get('kind')} of this name that is not the operator's: "
-            "rename it, or rename the RosProxy"
-        )
+        raise ApiConflict(f"a {body.get('kind')} of this name exists already that {OF_ANOTHER}")
 
 
 def _emit(api: Api, event: Emit) -> None:

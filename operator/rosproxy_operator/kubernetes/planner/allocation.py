@@ -88,8 +88,8 @@ class _Allocation:
         self.strangers = view.other_pods_by_node.get(node, ())
         self.refused = refused
         self.kernel = {
-            "NodePorts are": settings.node_ports,
-            "the nodes' ephemeral ports are": settings.ephemeral,
+            "NodePorts": settings.node_ports,
+            "the nodes' ephemeral ports": settings.ephemeral,
         }
 
     def run(self) -> None:
@@ -166,13 +166,12 @@ class _Allocation:
             holders = [str(p.id) for p in self._other_pods(place) if port in p.host_ports]
             promised = any(port in ports for ports in self._promised_to_others(place))
             if holders or promised or port in self.refused:
-                holder = (
-                    abbreviated(holders) or "another RosProxy, or something that is about to end"
-                )
+                holder = "another RosProxy, or a pod or program that ends soon, has"
+                if holders:
+                    holder = f"pod {abbreviated(holders)} has"
                 text = (
-                    f"the master in the cluster is not published on port {port} of node "
-                    f"{self.node}, which is held by {holder}: choose another spec.master.publish, "
-                    "or remove what holds it"
+                    f"the master is not published on port {port} of node {self.node}, since "
+                    f"{holder} this port. Choose another spec.master.publish, or free the port"
                 )
                 self.ranges.findings.append(finding(self.rosproxies[place], "PortConflict", text))
                 return
@@ -190,10 +189,10 @@ class _Allocation:
             if len(ranges[place]) < spec.ports:
                 missing = PortRange(kept.last + 1, kept.first + spec.ports - 1)
                 text = (
-                    f"spec.ports is {spec.ports}, but the proxy on node {self.node} keeps its "
-                    f"{len(kept)} at {kept}, since {missing} are not free or not in "
-                    "spec.portWindow: delete the pods that hold them, or move spec.portWindow away "
-                    "from there, so that the proxy gets another range"
+                    f"the proxy on node {self.node} has only the {len(kept)} ports {kept}, "
+                    f"although spec.ports is {spec.ports}: ports {missing} are not all free, or "
+                    "not in spec.portWindow. Delete the pods that hold these ports, or move "
+                    "spec.portWindow elsewhere, so that the proxy gets another range"
                 )
                 self.ranges.findings.append(finding(self.rosproxies[place], "PortsExhausted", text))
             return
@@ -224,12 +223,11 @@ class _Allocation:
         holders = [
             str(pod.id) for pod in pods if any(p in error.window for p in pod.ports_of(spec))
         ]
-        reasons += [f"others are held by {abbreviated(holders)}"] if holders else []
-        reason = ", ".join(reasons) or "the others were refused a short time ago"
-        return (
-            f"{error}; {reason}: enlarge spec.portWindow ({error.window}), lower spec.ports "
-            f"({error.count}), or delete one of those pods"
-        )
+        reasons += [f"ports of pods {abbreviated(holders)}"] if holders else []
+        reason = ", ".join(reasons) or "ports that the node refused a short time ago"
+        fix = f"Widen spec.portWindow ({error.window}), or lower spec.ports ({error.count})"
+        fix += ", or delete one of these pods" if holders else ""
+        return f"{error}. Not available: {reason}. {fix}"
 
     def _other_pods(self, place: ProxyPlace) -> list[Pod]:
         """All other pods that hold ports on the node."""

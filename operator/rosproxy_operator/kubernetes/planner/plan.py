@@ -212,7 +212,7 @@ def _problems(
     pods = context.view.selected_pods.get(rosproxy.id, ()) if address else ()
     shared = (*context.view.findings, *moved, *context.ranges.findings)
     unlisted = context.observed.policies_error if context.settings.network_policy else ""
-    text = f"the NetworkPolicies can't be listed, so none is made for it: {unlisted}"
+    text = f"the operator can't list NetworkPolicies, so this RosProxy gets none: {unlisted}"
     return (
         *((finding(rosproxy, "NoNetworkPolicy", text),) if unlisted else ()),
         *findings(rosproxy, states, context.retries.failures(rosproxy.id)),

@@ -37,7 +37,7 @@ def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
     return ProxyReport(
         answered=True,
         master_up=up,
-        error="" if up else short(master.error or "not asked yet"),
+        error="" if up else short(master.error or "the proxy has not asked the master yet"),
         participants={
             address: tuple(p.guid_prefix for p in group) for address, group in participants.items()
         },

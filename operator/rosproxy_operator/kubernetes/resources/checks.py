@@ -18,13 +18,13 @@ def quoted(value: object) -> str:
 
 
 def host_problem(host: str) -> str:
-    """What is wrong with a host under which outside is to reach a node; empty if nothing is."""
+    """Why outside can't reach a node at this host name or address; empty if outside can."""
     try:
         parse_host("host", host)
     except SettingError:
         return f"{quoted(host)} is neither a host name nor an address"
     if is_loopback(host.strip("[]")):
-        return f"{quoted(host)} is loopback, which is another machine to everybody else"
+        return f"{quoted(host)} is loopback, which no other host can reach"
     return ""
 
 

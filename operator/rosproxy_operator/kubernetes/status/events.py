@@ -101,7 +101,7 @@ def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:
         for text in lines[:MOST_RESULTS]:
             yield Emit(rosproxy.id, reference, "Normal", reason, _bounded(text))
         if len(lines) > MOST_RESULTS:
-            text = f"and {len(lines) - MOST_RESULTS} more at once, which the operator's log names"
+            text = f"and {len(lines) - MOST_RESULTS} more at the same time. Read the operator's log"
             yield Emit(rosproxy.id, reference, "Normal", reason, text)
 
 
@@ -112,7 +112,7 @@ def _result(action: Action) -> tuple[str, str]:
             place = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
             return "ProxyCreated", f"created pod {name} {place}"
         case SetImage(id=id, image=image):
-            return "ImageSet", f"gave pod {id.name} the image {image}"
+            return "ImageSet", f"set the image of pod {id.name} to {image}"
         case DeleteProxy(id=id, why=why) | EvictPod(id=id, why=why):
             reason, verb = _ENDED[type(action)]
             return reason, f"{verb} pod {id.name}: {why}"

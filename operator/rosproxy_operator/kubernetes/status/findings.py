@@ -37,6 +37,8 @@ WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _LONGEST = 600
 _ENFORCE = "pod-security.kubernetes.io/enforce"
+OF_ANOTHER = "the operator did not create"
+"""Part of the error about an object that has the name already and is not the operator's."""
 
 
 def findings(
@@ -108,15 +110,16 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
     error = proxy.message
     command = f"kubectl -n {id.namespace} describe pod {id.name}"
     texts = {
-        PodFailure.PORTS: f"ports {proxy.range} are not all free there ({error}); others are "
-        "tried: to keep them clear, leave ports that others take out of spec.portWindow",
-        PodFailure.SCHEDULING: f"it is not admitted ({error}): make room on the node, or set "
-        f"spec.tolerations or spec.resources; {command}",
-        PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}): load it there, "
-        "or set spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
-        PodFailure.CRASHING: f"it ends again and again ({error}): "
-        f"kubectl -n {id.namespace} logs --previous {id.name}",
-        PodFailure.SANDBOX: f"the node can't start it ({error}): {command}",
+        PodFailure.PORTS: f"ports {proxy.range} are not all free on the node ({error}). The "
+        "operator tries other ports. Set a spec.portWindow without the ports that other programs "
+        "use",
+        PodFailure.SCHEDULING: f"the scheduler or the kubelet does not admit the pod ({error}). "
+        f"Make room on the node, or set spec.tolerations or spec.resources. Read {command}",
+        PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}). Load the image "
+        "on the node, or set spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
+        PodFailure.CRASHING: f"the proxy's container ends again and again ({error}). "
+        f"Read kubectl -n {id.namespace} logs --previous {id.name}",
+        PodFailure.SANDBOX: f"the node can't start the pod ({error}). Read {command}",
     }
     reason = CONFLICT if cause is PodFailure.PORTS else STUCK
     return _finding(rosproxy, proxy_subject(proxy), texts[cause], reason)
@@ -128,19 +131,19 @@ def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterF
     if check.stuck is PodFailure.IMAGE:
         text = f"the node can't get the image {check.image} ({check.message})"
         fix = (
-            "correct spec.image or the chart's proxy.image, or set spec.imagePullPolicy or "
+            "Correct spec.image or the chart's proxy.image, or set spec.imagePullPolicy or "
             "spec.imagePullSecrets"
         )
     elif check.pod.phase == "Failed":
         text = f"the image {check.image} does not run rosproxy ({check.message})"
         fix = (
-            f"correct spec.image or the chart's proxy.image; kubectl -n {id.namespace} delete pod "
-            f"{id.name} has the same image tried again"
+            "Correct spec.image or the chart's proxy.image. To test the same image again, run "
+            f"kubectl -n {id.namespace} delete pod {id.name}"
         )
     else:
-        text = f"the image {check.image} can't be tried ({check.message})"
-        fix = f"kubectl -n {id.namespace} describe pod {id.name}"
-    kept = f"{text}, so that proxy {proxy.pod.id.name} keeps {proxy.image}: {fix}"
+        text = f"the pod that tests the image {check.image} does not run ({check.message})"
+        fix = f"Read kubectl -n {id.namespace} describe pod {id.name}"
+    kept = f"{text}. So proxy {proxy.pod.id.name} keeps the image {proxy.image}. {fix}"
     subject = f"node {check.node}"
     return finding(rosproxy, "ImageUnusable", bounded(kept, _LONGEST), subject=subject)
 
@@ -148,8 +151,8 @@ def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterF
 def _deaf(rosproxy: RosProxy, lan_relay: HelperPod) -> ClusterFinding:
     id = lan_relay.pod.id
     text = (
-        f"it does not run ({lan_relay.message}), so that the LAN is not heard: "
-        f"kubectl -n {id.namespace} describe pod {id.name}"
+        f"the pod does not run ({lan_relay.message}), so no discovery passes between the LAN and "
+        f"the proxy. Read kubectl -n {id.namespace} describe pod {id.name}"
     )
     subject = f"LAN relay {id.name} on node {lan_relay.node}"
     return finding(rosproxy, "LanRelayStuck", bounded(text, _LONGEST), subject=subject)
@@ -166,16 +169,16 @@ def _answered(
     if not answer.answered:
         if proxy.ready:
             text = (
-                f"it does not answer the operator ({answer.error}): let the operator's pod connect "
-                f"to port {ADMIN_PORT} of this one (NetworkPolicy)"
+                f"does not answer the operator ({answer.error}). Allow connections from the "
+                f"operator's pods to port {ADMIN_PORT} of this pod (NetworkPolicy)"
             )
             # No Event: an operator that is cut off would make one for each proxy.
             yield ClusterFinding(subject, text, reason=SILENT, of=rosproxy.id)
         return
     if answer.refusal:
-        yield _finding(rosproxy, subject, f"it {answer.refusal}", REFUSES)
+        yield _finding(rosproxy, subject, answer.refusal, REFUSES)
     if not answer.master_up:
-        text = f"it does not reach the master ({answer.error}): {_master_remedy(rosproxy)}"
+        text = f"does not reach the master ({answer.error}). {_master_remedy(rosproxy)}"
         yield _finding(rosproxy, subject, text, NO_MASTER)
     probe = answer.range_probe
     if probe is not None and probe.reached is False:
@@ -197,15 +200,19 @@ def _own_problems(answer: ProxyReport) -> list[str]:
 def _master_remedy(rosproxy: RosProxy) -> str:
     master = rosproxy.spec.master
     if master.service is not None:
-        return f"start roscore behind Service {master.service}, port {master.service_port}"
-    return f"start roscore there, let pods connect to {master.uri}, or correct spec.master"
+        return f"Start roscore behind Service {master.service}, port {master.service_port}"
+    return (
+        "Start roscore on the master's host, allow connections from pods to "
+        f"{master.uri}, or correct spec.master"
+    )
 
 
 def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
     message = clean(" ".join(text.split()))
     remedy = _remedy(message, rosproxy)
-    message = message[: _LONGEST - len(f"the API server refused it (): {remedy}")]
-    text = f"the API server refused it ({message}): {remedy}"
+    problem = "the operator could not create, change or delete this object"
+    message = message[: _LONGEST - len(f"{problem} (). {remedy}")]
+    text = f"{problem} ({message}). {remedy}"
     return _finding(rosproxy, str(id), text, NOT_ADMITTED)
 
 
@@ -219,24 +226,24 @@ def _remedy(message: str, rosproxy: RosProxy) -> str:
     if "violates podsecurity" in low or "net_admin" in low or "privilegeescalation" in low:
         return _security_remedy(low, rosproxy)
     if "exceeded quota" in low or "must specify" in low:
-        return "raise the namespace's ResourceQuota, or set spec.resources"
+        return "Raise the namespace's ResourceQuota, or set spec.resources"
     if "is invalid" in low:
-        return "correct the field that is named, in the RosProxy's spec"
+        return "Correct the named field in the RosProxy's spec"
     if "cannot" in low and "user" in low:
-        return "the operator lacks a right: install its chart or manifests anew"
-    if "not the operator's" in low:
-        return "delete or rename that object, or the RosProxy"
-    return "it is tried again"
+        return "The operator lacks a right. Install the operator's chart or manifests again"
+    if OF_ANOTHER in low:
+        return "Delete that object, or use another name for the RosProxy"
+    return "The operator tries again"
 
 
 def _security_remedy(low: str, rosproxy: RosProxy) -> str:
     if "hostport" not in low and ("net_admin" in low or "privilegeescalation" in low):
-        return "allow proxies NET_ADMIN in that namespace, or set spec.dataPlane: Auto"
+        return "Allow NET_ADMIN for proxies in that namespace, or set spec.dataPlane: Auto"
     kernel = rosproxy.spec.data_plane == "kernel"
     takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
     if rosproxy.spec.multicast:
-        takes += ", its LAN relay hostNetwork"
+        takes += ", and the LAN relay of a proxy needs hostNetwork"
     return (
-        f"a proxy takes {takes}, which needs Pod Security privileged: kubectl label namespace "
-        f"{rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"
+        f"A proxy needs {takes}. This requires Pod Security privileged. Run kubectl label namespace"
+        f" {rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"
     )

@@ -51,6 +51,7 @@ _PORTS = 400
 # As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
+_NO_PROXY = "no proxy runs, so this is not known"
 
 
 class Condition(msgspec.Struct, frozen=True):
@@ -269,10 +270,10 @@ def _ready(
     served: str,
 ) -> Condition:
     if not wanted:
-        fix = "give pods the labels that spec.podSelector asks for"
+        fix = "Give pods the labels that spec.podSelector requires"
         if rosproxy.spec.pod_selector is None:
-            fix = f"label pods with {INJECT}=true"
-        return Condition(READY, "True", _NO_PODS, f"no pod is selected: {fix}")
+            fix = f"Add the label {INJECT}=true to the template of your pods"
+        return Condition(READY, "True", _NO_PODS, f"no pod is selected. {fix}")
     waiting = [state for state in wanted if not _serving(state)]
     if not waiting:
         text = f"{len(wanted)} of {len(wanted)} proxies serve {served}"
@@ -282,9 +283,9 @@ def _ready(
         return Condition(READY, "False", blocking[0].reason, _one_line(blocking[0]))
     name = waiting[0].name
     proxy = waiting[0].proxy
-    progress = "its proxy is being created"
+    progress = "the proxy is being created"
     if proxy is not None and not proxy.pod.deleting:
-        progress = f"its proxy {proxy.pod.id.name} is starting"
+        progress = f"proxy {proxy.pod.id.name} is starting"
     return Condition(READY, "False", "ProxiesStarting", f"node {name}: {progress}")
 
 
@@ -303,7 +304,7 @@ def _allocated(wanted: Sequence[RosProxyOnNode], problems: Sequence[ClusterFindi
     reason = CONFLICT if refused else EXHAUSTED
     lines = [_one_line(p) for p in problems if p.reason in (CONFLICT, EXHAUSTED)]
     names = ", ".join(state.name for state in (*refused, *lacking))
-    return Condition(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
+    return Condition(PORTS, "False", reason, ". ".join(lines) or f"node {names}: no ports yet")
 
 
 def _reached(
@@ -315,10 +316,10 @@ def _reached(
     if not all(answer.master_up for answer in answers):
         lines = [_one_line(p) for p in problems if p.reason == NO_MASTER]
         return Condition(
-            MASTER, "False", NO_MASTER, "; ".join(lines) or "not every proxy reaches it"
+            MASTER, "False", NO_MASTER, ". ".join(lines) or "not every proxy reaches the master"
         )
     if not proxies:
-        return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
+        return Condition(MASTER, "Unknown", "NoProxies", _NO_PROXY)
     if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
     return _previous(MASTER, former)
@@ -332,9 +333,10 @@ def _way_in(
     probes = [(s, p, a.range_probe) for s, p, a in proxies if a is not None and a.answered]
     if any(probe is not None and probe.reached is False for _, _, probe in probes):
         lines = [_one_line(p) for p in problems if p.reason == NO_WAY_IN]
-        return Condition(WAY_IN, "False", NO_WAY_IN, "; ".join(lines) or "not those of each proxy")
+        text = ". ".join(lines) or "outside does not reach the ports of every proxy"
+        return Condition(WAY_IN, "False", NO_WAY_IN, text)
     if not proxies:
-        return Condition(WAY_IN, "Unknown", "NoProxies", "there is no proxy that could tell")
+        return Condition(WAY_IN, "Unknown", "NoProxies", _NO_PROXY)
     if len(probes) < len(proxies):
         return _previous(WAY_IN, former)
     open_questions = [(s, p, probe) for s, p, probe in probes if probe is None or not probe.reached]
@@ -342,7 +344,7 @@ def _way_in(
         return Condition(WAY_IN, "True", "Reached", "outside reaches the ports of every proxy")
     lines = [f"{proxy_subject(p)}: {not_proven(s, probe)}" for s, p, probe in open_questions]
     reason = "NotTried" if any(probe is None for _, _, probe in open_questions) else "NotProven"
-    return Condition(WAY_IN, "Unknown", reason, "; ".join(lines))
+    return Condition(WAY_IN, "Unknown", reason, ". ".join(lines))
 
 
 def _may_answer(state: RosProxyOnNode) -> bool:
@@ -360,5 +362,5 @@ def _previous(condition: str, former: Json) -> Condition:
 def _degraded(problems: Sequence[ClusterFinding]) -> Condition:
     if not problems:
         return Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
-    lines = "; ".join(map(_one_line, problems))
+    lines = ". ".join(map(_one_line, problems))
     return Condition(DEGRADED, "True", problems[0].reason, lines)

@@ -107,7 +107,7 @@ class ClusterStore:
             self._put(collection, key, record)
         if collection in self._listed and (gone or differ):
             log.info(
-                "a new list of the %s corrected %d objects that a watch had missed",
+                "watch corrected: %s, the watch had missed changes of %d objects",
                 kind,
                 len(gone) + len(differ),
             )
@@ -324,17 +324,15 @@ def read_master(service: MasterService | None, id: Name, ports: Iterable[int]) -
     ``ports`` are those that RosProxies name; one of them has to be there.
     """
     if service is None:
-        text = f"there is no Service {id.name} in the namespace {id.namespace}: create it"
-        return "", text
+        return "", "does not exist. Create the Service, or correct spec.master.service"
     if not is_address(service.address):
         return "", (
-            f"the Service {id} has no cluster IP ({service.type or 'headless'}): "
-            "make it one of type ClusterIP with an address of its own"
+            f"has no cluster IP ({service.type or 'headless'}). "
+            "Use a Service of type ClusterIP with an address of its own"
         )
     if service.ports.isdisjoint(ports):
         has, wanted = (
             ", ".join(sorted(map(str, numbers))) or "none" for numbers in (service.ports, ports)
         )
-        text = f"has no port {wanted} (it has {has}): set spec.master.service.port"
-        return "", f"the Service {id} {text}"
+        return "", f"has no port {wanted} (its ports: {has}). Set spec.master.service.port"
     return service.address, ""

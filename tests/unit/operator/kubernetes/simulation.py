@@ -421,7 +421,7 @@ class Controller:
             }  # fmt: skip
             existing = kinds.get(type(action), state.policies).get(name)
             if str(error) == "AlreadyExists" and existing is not None:
-                text = "there is already a Pod of this name that is not the operator's"
+                text = "a Pod of this name exists already that the operator did not create"
                 return {} if is_own(existing) else {name: text}
             return {name: str(error)}
         return {}

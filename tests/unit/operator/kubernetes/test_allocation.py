@@ -118,8 +118,8 @@ def test_when_there_are_none_it_is_told_who_holds_them_and_what_to_do() -> None:
     (text,) = told(plan, "PortsExhausted")
     assert text == (
         "node one: no 4 free ports in a row between 11400 and 11406: 6 of 7 are free, "
-        "3 at most in a row; others are held by ros/web: enlarge spec.portWindow (11400-11406), "
-        "lower spec.ports (4), or delete one of those pods"
+        "3 at most in a row. Not available: ports of pods ros/web. Widen spec.portWindow "
+        "(11400-11406), or lower spec.ports (4), or delete one of these pods"
     )
     assert "ports" not in status(plan)["perNode"][0]
 
@@ -127,7 +127,7 @@ def test_when_there_are_none_it_is_told_who_holds_them_and_what_to_do() -> None:
 def test_ports_that_no_pod_may_have_are_named() -> None:
     plan = look(scene(of=rosproxy(window=PortRange(30000, 40000))))
     (text,) = told(plan, "PortsExhausted")
-    assert "NodePorts are 30000-32767, the nodes' ephemeral ports are 32768-60999" in text
+    assert "NodePorts 30000-32767, the nodes' ephemeral ports 32768-60999" in text
 
 
 # changes of what is asked for
@@ -161,8 +161,10 @@ def test_ports_are_not_left_because_there_could_be_more_elsewhere() -> None:
     plan = look(scene(proxy(), pod("web", ports=[11405]), of=of))
     assert plan.state.given[ROBOT_ON_ONE] == RANGE
     (text,) = told(plan, "PortsExhausted")
-    assert "spec.ports is 8, but the proxy on node one keeps its 4 at 11400-11403" in text
-    assert "11404-11407 are not free" in text
+    assert (
+        "the proxy on node one has only the 4 ports 11400-11403, although spec.ports is 8" in text
+    )
+    assert "11404-11407 are not all free" in text
 
 
 def test_who_has_left_his_ports_is_told() -> None:
@@ -188,10 +190,10 @@ def test_ports_that_never_served_are_left_at_once_if_they_can_not_be_had() -> No
     second = look(STUCK, first.state, 101.0)
     (deleted,) = done(second)
     assert isinstance(deleted, DeleteProxy)
-    assert deleted.why == "made anew: its ports are to be 11404-11407 instead of 11400-11403"
+    assert deleted.why == "replaced, since the ports change from 11400-11403 to 11404-11407"
     third = look(scene(), second.state, 102.0)
     assert created(third) == "11404-11407"
-    assert "nothing needs to be done" in told(third, "PortConflict")[0]
+    assert "Nothing needs to be done" in told(third, "PortConflict")[0]
     assert not told(look(scene(proxy(ports=NEXT)), third.state, 170.0), "PortConflict")
 
 
@@ -295,7 +297,7 @@ def test_a_masters_port_that_is_taken_is_told_and_the_rest_works() -> None:
     plan = look(scene(pod("web", ports=[11500]), of=of))
     assert host_ports(creation(plan)) == list(RANGE.ports())
     (text,) = told(plan, "PortConflict")
-    assert "not published on port 11500 of node one, which is held by ros/web" in text
+    assert "not published on port 11500 of node one, since pod ros/web has this port" in text
     assert "spec.master.publish" in text
 
 

@@ -134,7 +134,7 @@ async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carrie
     await carry.out(create_pod())
     ((id, text),) = carry.applier.failures[OF].items()
     assert id == Name(NAMESPACE, "proxy")
-    assert "that is not the operator's: rename it" in text
+    assert "that the operator did not create" in text
     assert (carry.applier.busy, carry.applier.failed) == (0, 1)
     assert server.get("pods", "proxy", NAMESPACE)["metadata"].get("labels") is None
 
@@ -229,7 +229,7 @@ async def test_a_status_that_cannot_be_written_is_a_problem_until_it_can(
     await carry.out(PatchStatus(OF, seen().uid, {"nodes": "?"}))
     (problem,) = carry.applier.problems.values()
     assert problem.subject == f"rosproxy {OF}"
-    assert problem.text == "its status can't be written: status.nodes: Invalid value"
+    assert problem.text == "the operator can't write the status: status.nodes: Invalid value"
     server.refusals.clear()
     await carry.out(PatchStatus(OF, seen().uid, {"nodes": 2}))
     assert not carry.applier.problems

@@ -28,14 +28,14 @@ REFUSED = Name("robots", "rosproxy-arm-node1-1")
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (state(proxy=None, answer=None), "node node1: its proxy is being created"),
+        (state(proxy=None, answer=None), "node node1: the proxy is being created"),
         (
             state(proxy=proxy(pod={"deleting": True}), answer=None),
-            "node node1: its proxy is being created",
+            "node node1: the proxy is being created",
         ),
         (
             state(proxy=proxy(ready=False), answer=None),
-            f"node node1: its proxy {proxy().pod.id.name} is starting",
+            f"node node1: proxy {proxy().pod.id.name} is starting",
         ),
     ],
 )
@@ -51,9 +51,13 @@ def test_a_proxy_that_is_yet_to_come_is_no_problem(given, said):
 @pytest.mark.parametrize(
     ("why", "reason", "said"),
     [
-        (PodFailure.PORTS, "PortConflict", "ports 11400-11431 are not all free there (because)"),
-        (PodFailure.SCHEDULING, "ProxyStuck", "it is not admitted (because): make room"),
-        (PodFailure.IMAGE, "ProxyStuck", "can't get the image rosproxy:1 (because): load it there"),
+        (
+            PodFailure.PORTS,
+            "PortConflict",
+            "ports 11400-11431 are not all free on the node (because)",
+        ),
+        (PodFailure.SCHEDULING, "ProxyStuck", "does not admit the pod (because). Make room"),
+        (PodFailure.IMAGE, "ProxyStuck", "can't get the image rosproxy:1 (because). Load the"),
         (
             PodFailure.CRASHING,
             "ProxyStuck",
@@ -75,7 +79,7 @@ def test_a_proxy_that_does_not_run(why, reason, said):
 
 
 def test_a_node_without_ports():
-    text = "no 32 free ports in a row between 11400 and 11410: widen spec.portWindow"
+    text = "no 32 free ports in a row between 11400 and 11410. Widen spec.portWindow"
     rosproxy_status = status(
         state(range=None, proxy=None, answer=None, obstacle=Obstacle("PortsExhausted", text))
     )
@@ -100,7 +104,7 @@ def test_the_master_is_not_reached():
 
     assert judged(rosproxy_status, "MasterReachable") == ("False", "MasterUnreachable")
     assert judged(rosproxy_status, "Ready") == ("False", "MasterUnreachable")
-    assert "(refused): start roscore there" in message(rosproxy_status)
+    assert "(refused). Start roscore on the master's host" in message(rosproxy_status)
     assert message(rosproxy_status, "Degraded").count("refused") == 1
     assert "/a: hangs" in message(rosproxy_status, "Degraded")
 
@@ -109,25 +113,27 @@ def test_a_master_in_the_cluster_is_told_by_its_service():
     of = rosproxy(master=MasterSpec(service=Name("robots", "roscore")))
     down = state(proxy=proxy(ready=False), answer=ProxyReport(True, False, "refused"))
 
-    assert "start roscore behind Service robots/roscore, port 11311" in message(status(down, of=of))
+    assert "Start roscore behind Service robots/roscore, port 11311" in message(status(down, of=of))
 
 
 def test_a_proxy_that_does_not_answer_the_controller():
     rosproxy_status = status(state(answer=no_answer("timed out")))
 
     assert judged(rosproxy_status, "Ready") == ("False", "ProxyUnreachable")
-    assert "(timed out): let the operator's pod connect to port 11312" in message(rosproxy_status)
+    assert "(timed out). Allow connections from the operator's pods to port 11312" in message(
+        rosproxy_status
+    )
     assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NotAsked")
 
 
 @pytest.mark.parametrize(
     ("from_proxy", "from_master", "cause", "fix"),
     [
-        ("refused", "missed", "nothing listens there", "hostPorts (CNI: the plug-in portmap)"),
+        ("refused", "missed", "nothing listens there", "(CNI: the plug-in portmap)"),
         ("silent", "missed", "there is no answer", "the node's firewall"),
-        ("ok", "missed", "the master's machine does not", "as the master's machine knows the node"),
-        ("stranger", "unknown", "something else answers there", "spec.portWindow"),
-        ("of a later release", "missed", "the try failed", "portmap"),
+        ("ok", "missed", "the master's machine does not", "as the master's machine sees it"),
+        ("stranger", "unknown", "another program answers there", "spec.portWindow"),
+        ("of a later release", "missed", "the test failed", "portmap"),
     ],
 )
 def test_ports_that_outside_does_not_reach(from_proxy, from_master, cause, fix):
@@ -156,8 +162,8 @@ def test_ports_that_outside_does_not_reach(from_proxy, from_master, cause, fix):
 @pytest.mark.parametrize(
     ("probe", "reason", "said"),
     [
-        (None, "NotTried", "it has not tried ports 11400-11431 of 192.0.2.11 yet"),
-        (RangeProbeStatus(None, "silent", "unknown", "tcp"), "NotProven", "11 itself, where"),
+        (None, "NotTried", "has not tested ports 11400-11431 of 192.0.2.11 yet"),
+        (RangeProbeStatus(None, "silent", "unknown", "tcp"), "NotProven", "11 itself. Perhaps"),
         (RangeProbeStatus(None, "silent", "unknown", "udp"), "NotProven", "by UDP itself"),
     ],
 )
@@ -180,12 +186,12 @@ def test_ports_of_a_proxy_that_does_not_answer_are_as_they_were():
 
 
 def test_a_proxy_that_does_not_take_its_policy():
-    refusal = "knows no policies: its image is that of a former release"
+    refusal = "does not support policies, since its image is of a former release"
     rosproxy_status = status(state(answer=ProxyReport(True, True, refusal=refusal)))
 
     assert judged(rosproxy_status, "Ready") == ("True", "Serving")
     assert judged(rosproxy_status, "Degraded") == ("True", "PolicyRefused")
-    assert "it knows no policies" in message(rosproxy_status, "Degraded")
+    assert f"on node node1: {refusal}" in message(rosproxy_status, "Degraded")
 
 
 def test_what_proxies_warn_of_keeps_nobody_from_being_served():
@@ -227,10 +233,10 @@ def test_a_problem_without_a_reason():
         ('Pod "x" is invalid: spec.tolerations[0].effect: Unsupported value', "RosProxy's spec"),
         (
             'pods is forbidden: User "system:serviceaccount:a:b" cannot create resource "pods"',
-            "install its chart or manifests anew",
+            "Install the operator's chart or manifests again",
         ),
-        ("there is already a Pod of this name that is not the operator's: x", "rename"),
-        ("internal error", "tried again"),
+        ("a Pod of this name exists already that the operator did not create", "use another name"),
+        ("internal error", "The operator tries again"),
     ],
 )
 def test_what_the_api_server_refuses(text, fix):
@@ -238,7 +244,7 @@ def test_what_the_api_server_refuses(text, fix):
 
     assert judged(rosproxy_status, "Ready") == ("False", "ProxyNotAdmitted")
     assert message(rosproxy_status).startswith(
-        "robots/rosproxy-arm-node1-1: the API server refused it"
+        "robots/rosproxy-arm-node1-1: the operator could not create, "
     )
     assert fix in message(rosproxy_status)
 
@@ -250,8 +256,8 @@ def test_what_the_api_server_refuses(text, fix):
             'pods "x" is forbidden: violates PodSecurity "baseline:latest": non-default '
             'capabilities (container "rosproxy" must not include "NET_ADMIN" in securityContext.'
             "capabilities.add), hostPort (container uses hostPorts " + "11400, " * 99 + ")",
-            "a proxy takes hostPorts (and NET_ADMIN for spec.dataPlane: Kernel), which needs Pod "
-            "Security privileged: kubectl label namespace robots "
+            "A proxy needs hostPorts (and NET_ADMIN for spec.dataPlane: Kernel). This requires Pod "
+            "Security privileged. Run kubectl label namespace robots "
             "pod-security.kubernetes.io/enforce=privileged --overwrite",
         ),
         (

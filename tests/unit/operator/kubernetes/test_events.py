@@ -141,7 +141,7 @@ def test_what_is_done_is_told():
     name = body["metadata"]["name"]
     assert [(emit.type, emit.reason, emit.message) for emit in emits] == [
         ("Normal", "ProxyCreated", f"created pod {name} on node node1 with ports 11400-11431"),
-        ("Normal", "ImageSet", f"gave pod {pod.name} the image rosproxy:2"),
+        ("Normal", "ImageSet", f"set the image of pod {pod.name} to rosproxy:2"),
         ("Normal", "ProxyDeleted", f"deleted pod {pod.name}: no selected pod is left on node1"),
     ]
     assert {emit.about for emit in emits} == {OF_ARM}
@@ -156,6 +156,5 @@ def test_what_is_done_to_many_is_summed_up():
     *single_results, last = results(rosproxy(), actions)
 
     assert len(single_results) == MOST_RESULTS
-    assert (
-        last.message == f"and {of_all - MOST_RESULTS} more at once, which the operator's log names"
-    )
+    more = of_all - MOST_RESULTS
+    assert last.message == f"and {more} more at the same time. Read the operator's log"

@@ -325,7 +325,8 @@ def test_what_a_proxy_answers():
 
 def test_a_proxy_without_its_master():
     assert report(read_status({"master": {"up": False, "error": "refused"}})).error == "refused"
-    assert report(read_status({"master": {"up": False, "error": ""}})).error == "not asked yet"
+    unasked = report(read_status({"master": {"up": False, "error": ""}}))
+    assert unasked.error == "the proxy has not asked the master yet"
 
 
 def test_a_proxy_that_does_not_answer():

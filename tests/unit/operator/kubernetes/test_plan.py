@@ -125,7 +125,7 @@ def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
         ROBOT,
         PROXY,
         "uid-proxy-robot-one",
-        "no pod on node one has needed it for 30 s",
+        "no pod on node one has needed the proxy for 30 s",
         retire=True,
     )
 
@@ -165,7 +165,7 @@ def test_any_other_change_makes_the_pod_anew_once_the_old_one_is_gone(changes: d
     (deleted,) = done(first)
     assert isinstance(deleted, DeleteProxy)
     assert deleted.retire == ("master" in changes)
-    assert deleted.why.startswith("made anew: ")
+    assert deleted.why.startswith("replaced, since ")
     second = look(scene(proxy(deleting=True), of=of), first.state, 101.0)
     assert done(second) == []
     third = look(scene(of=of), second.state, 102.0)
@@ -255,8 +255,8 @@ def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
     plan = look(scene(namesake))
     assert done(plan) == []
     (text,) = told(plan, "NameTaken")
-    assert f"a pod called {PROXY} is there already, and is not the operator's" in text
-    assert "delete or rename it" in text
+    assert f"a pod {PROXY} exists already that the operator did not create" in text
+    assert "Delete that pod" in text
 
 
 def test_a_proxy_under_a_name_of_former_times_goes_first() -> None:
@@ -285,8 +285,9 @@ def test_outside_is_told_the_address_that_spec_names_if_the_node_has_no_annotati
 @pytest.mark.parametrize(
     ("annotated", "why"),
     [
-        ("a b", ["node one: its annotation rosproxy.io/advertise-host"]),
-        ("", ["node one: it has no address of type ExternalIP (it has: Hostname, InternalIP)",
+        ("a b", ["node one: annotation rosproxy.io/advertise-host: 'a b'"]),
+        ("", ["node one: has no address of type ExternalIP (types of its addresses: Hostname, "
+              "InternalIP)",
               "kubectl annotate node one rosproxy.io/advertise-host=HOST"]),
     ],
 )  # fmt: skip
@@ -307,7 +308,7 @@ def test_a_master_in_the_cluster_is_given_by_name_and_address() -> None:
     assert created["ROSPROXY_MASTER_ADDRESS"] == "10.96.0.9"
 
 
-@pytest.mark.parametrize("masters", [{}, {MASTER: ("", "does not exist: create it")}])
+@pytest.mark.parametrize("masters", [{}, {MASTER: ("", "does not exist. Create the Service")}])
 def test_while_the_masters_service_is_missing_everything_stays(masters: dict) -> None:
     of = rosproxy(master=INSIDE)
     plan = look(replace(scene(proxy(), of=of), masters=masters))
@@ -319,7 +320,7 @@ def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
     plan = look(scene(pod("a"), of=rosproxy(node_selector={"zone": "a"})))
     assert done(plan) == []
     (text,) = told(plan, "NodeLeftOut")
-    assert "node one, which spec.nodeSelector leaves out" in text
+    assert "node one does not match spec.nodeSelector" in text
     assert "ros/a, ros/talker" in text
 
 
@@ -335,7 +336,7 @@ def test_a_pod_of_a_former_rosproxy_is_told() -> None:
     plan = look(complete(pods=(former,), rosproxies=(of,)))
     (text,) = told(plan, "NotWired")
     assert "is older than RosProxy robot" in text
-    assert text.endswith(": kubectl -n ros rollout restart deployment/talker")
+    assert text.endswith(". Run kubectl -n ros rollout restart deployment/talker")
     of_now = pod(created="2026-01-01T00:00:10Z", workload="deployment/talker")
     assert not told(look(complete(pods=(of_now,), rosproxies=(of,))), "NotWired")
 
@@ -370,7 +371,7 @@ def test_a_service_of_former_times_is_made_anew() -> None:
     plan = look(complete(services={ROBOT: service(fingerprint="other")}))
     (deleted,) = done(plan)
     assert isinstance(deleted, DeleteService)
-    assert deleted.why.startswith("made anew: ")
+    assert deleted.why.startswith("replaced, since ")
 
 
 # status
@@ -409,7 +410,7 @@ def test_another_key_makes_one_proxy_anew_at_a_time() -> None:
     (action,) = done(plan)
     assert isinstance(action, DeleteProxy)
     assert (action.id, action.retire) == (PROXY, False)
-    assert action.why.startswith("made anew: its RosProxy, its node or the operator's options")
+    assert action.why.startswith("replaced, since the RosProxy, the node or the operator's options")
     assert plan.next_look_in == 1.0
 
 

@@ -371,7 +371,7 @@ async def test_the_service_of_a_master(server: ApiServer, seen: Seen) -> None:
     server.put("rosproxies", obj, NAMESPACE)
     id = Name("ros", "roscore")
     assert (await begun(server, seen)).masters == {
-        id: ("", "there is no Service roscore in the namespace ros: create it")
+        id: ("", "does not exist. Create the Service, or correct spec.master.service")
     }
     ports = [{"port": 11311}]
     server.put(
@@ -411,8 +411,8 @@ async def test_a_role_without_the_right_to_policies_stops_nothing(
     [
         ({"clusterIP": "None"}, "has no cluster IP (headless)"),
         ({"type": "ExternalName"}, "has no cluster IP (ExternalName)"),
-        ({"clusterIP": "10.96.1.1", "ports": [{"port": 80}]}, "has no port 11311 (it has 80)"),
-        ({"clusterIP": "10.96.1.1"}, "has no port 11311 (it has none)"),
+        ({"clusterIP": "10.96.1.1", "ports": [{"port": 80}]}, "has no port 11311 (its ports: 80)"),
+        ({"clusterIP": "10.96.1.1"}, "has no port 11311 (its ports: none)"),
         ({}, "has no cluster IP"),
     ],
 )

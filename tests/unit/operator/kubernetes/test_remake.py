@@ -50,7 +50,7 @@ def test_one_that_was_not_wired_is_evicted() -> None:
     (event,) = [a for a in plan.actions if isinstance(a, Emit)
                 and a.reason == "PodEvicted"]  # fmt: skip
     assert event.type == "Normal"
-    assert event.message.startswith("evicted pod a: it is not wired to its proxy")
+    assert event.message.startswith("evicted pod a: not wired to its proxy")
 
 
 def test_one_that_was_wired_to_a_former_address_is_evicted() -> None:

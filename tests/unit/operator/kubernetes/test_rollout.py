@@ -150,7 +150,10 @@ def test_so_many_at_a_time_as_the_rosproxy_says(most: MaxUnavailable, expected: 
     [
         ({"stuck": PodFailure.IMAGE, "message": "not found"}, "can't get the image rosproxy:2"),
         ({"phase": "Failed", "message": "exec: rosproxy: not found"}, "does not run rosproxy"),
-        ({"stuck": PodFailure.SCHEDULING, "message": "no room"}, "can't be tried (no room)"),
+        (
+            {"stuck": PodFailure.SCHEDULING, "message": "no room"},
+            "tests the image rosproxy:2 does not run (no room)",
+        ),
     ],
 )
 def test_an_image_that_a_node_can_not_run_stops_the_rollout(
@@ -163,7 +166,7 @@ def test_an_image_that_a_node_can_not_run_stops_the_rollout(
     (problem,) = plan.problems
     assert (problem.reason, problem.subject, problem.fatal) == ("ImageUnusable", "node one", False)
     assert text in problem.text
-    assert "keeps rosproxy:1" in problem.text
+    assert "keeps the image rosproxy:1" in problem.text
     (event,) = (action for action in plan.actions if isinstance(action, Emit))
     assert (event.type, event.reason) == ("Warning", "ImageUnusable")
 

@@ -116,7 +116,10 @@ def test_no_pod_is_selected():
     rosproxy_status = status()
 
     assert judged(rosproxy_status, "Ready") == ("True", "NoPods")
-    assert message(rosproxy_status) == "no pod is selected: label pods with rosproxy.io/inject=true"
+    assert (
+        message(rosproxy_status)
+        == "no pod is selected. Add the label rosproxy.io/inject=true to the template of your pods"
+    )
     assert judged(rosproxy_status, "PortsAllocated") == ("True", "NoPods")
     assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NoProxies")
     assert judged(rosproxy_status, "PortsReachable") == ("Unknown", "NoProxies")

@@ -26,6 +26,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     token_of,
 )
 from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.status.findings import OF_ANOTHER
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""
@@ -70,7 +71,7 @@ def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec
     master = rosproxy.spec.master
     if master.service is None:
         return master, ""
-    address, problem = observed.masters.get(master.service, ("", "is not known yet"))
+    address, problem = observed.masters.get(master.service, ("", "is not listed yet"))
     if problem:
         return None, f"spec.master.service: Service {master.service} {problem}"
     host = f"{master.service.name}.{master.service.namespace}.svc"
@@ -81,15 +82,16 @@ def advertise_host(rosproxy: RosProxy, node: ClusterNode) -> tuple[str, str]:
     """Under which name or address outside reaches a node, else what is wrong."""
     if node.advertise_host:
         problem = host_problem(node.advertise_host)
-        subject = "its annotation rosproxy.io/advertise-host"
-        return ("", f"{subject}: {problem}") if problem else (node.advertise_host, "")
+        fix = "Give the name or address at which outside reaches the node"
+        text = f"annotation rosproxy.io/advertise-host: {problem}. {fix}"
+        return ("", text) if problem else (node.advertise_host, "")
     wanted_type = rosproxy.spec.advertise.value
     if address := node.addresses.get(wanted_type):
         return address, ""
-    types = ", ".join(sorted(node.addresses)) or "none at all"
+    types = ", ".join(sorted(node.addresses)) or "none"
     return "", (
-        f"it has no address of type {wanted_type} (it has: {types}): set another "
-        f"spec.advertise, or kubectl annotate node {node.name} rosproxy.io/advertise-host=HOST"
+        f"has no address of type {wanted_type} (types of its addresses: {types}). Set another "
+        f"spec.advertise, or run kubectl annotate node {node.name} rosproxy.io/advertise-host=HOST"
     )
 
 
@@ -104,23 +106,24 @@ def _site_of(context: ClusterContext, place: ProxyPlace) -> ProxySite | Obstacle
     rosproxy = context.view.rosproxies[place.of]
     node = context.observed.nodes[place.node]
     if not node.ready:
-        text = "is not ready: nothing is changed there until it is: kubectl describe node"
-        return Obstacle("NodeNotReady", f"{text} {node.name}")
+        text = "is not ready. Until the node is ready, the operator changes nothing there. Read"
+        return Obstacle("NodeNotReady", f"{text} kubectl describe node {node.name}")
     master, problem = master_of(rosproxy, context.observed)
     if master is None:
         return Obstacle("MasterUnknown", problem)
     host, problem = advertise_host(rosproxy, node)
     if rosproxy.spec.ros2 and ":" in host:
-        problem = f"its address {host} can't be advertised for ROS 2, which has IPv4 alone"
-        problem += f": kubectl annotate node {node.name} rosproxy.io/advertise-host=ADDRESS"
+        problem = f"advertised host {host} is an IPv6 address, and for ROS 2 a proxy uses IPv4 only"
+        command = f"kubectl annotate node {node.name} rosproxy.io/advertise-host=ADDRESS"
+        problem += f". Give an IPv4 address: run {command}"
     if problem:
         return Obstacle("NoAdvertiseHost", problem)
     if place in context.ranges.exhausted:
         return Obstacle("PortsExhausted", context.ranges.exhausted[place])
     name = proxy_id(place.of, place.node)
     if name in context.view.other_pod_names:
-        text = "is there already, and is not the operator's: delete or rename it"
-        return Obstacle("NameTaken", f"a pod called {name} {text}")
+        text = f"a pod {name} exists already that {OF_ANOTHER}"
+        return Obstacle("NameTaken", f"{text}. Delete that pod, or create it under another name")
     publish = master.publish if place in context.ranges.published else 0
     token = token_of(context.observed.key, name, node.name)
     ports = context.ranges.given[place]

@@ -98,7 +98,7 @@ def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator
         if check.pod.deleting or _is_needed(context, rosproxy, check):
             continue
         if context.retries.is_due(task):
-            why = "its proxy has the image, or is to have another one"
+            why = "the proxy has the image, or needs another image"
             yield DeleteHelper(check.of, check.pod.id, check.pod.uid, IMAGE_CHECK, why)
 
 

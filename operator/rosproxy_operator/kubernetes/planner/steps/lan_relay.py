@@ -92,7 +92,7 @@ def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterato
         if node is None or not node.ready:
             continue  # the garbage collector takes the pods of nodes that are gone
         if place not in places or not rosproxy.spec.multicast:
-            yield from _delete_lan_relays(context, lan_relays, "no proxy needs it")
+            yield from _delete_lan_relays(context, lan_relays, "no longer needed")
         else:
             yield from _ensure_lan_relay(context, place, lan_relays)
 
@@ -103,8 +103,8 @@ def lan_relay_findings(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
         site = site_of(context, place) if place in context.view.wanted else None
         if isinstance(site, ProxySite) and site.lan_relay is None:
             text = (
-                f"node {place.node} has no IPv4 address of type InternalIP, so its LAN is not "
-                "heard: name the hosts outside in spec.peers, and leave spec.multicast out"
+                f"node {place.node} has no IPv4 address of type InternalIP, so its proxy has no "
+                "LAN relay. Name the hosts outside in spec.peers, and remove spec.multicast"
             )
             yield finding(rosproxy, "NoLanAddress", text)
 
@@ -129,7 +129,7 @@ def _ensure_lan_relay(
         if lan_relay.fingerprint != expected or lan_relay.pod.ended
     ]
     yield from _delete_lan_relays(
-        context, outdated, "made anew: its proxy or its settings have changed"
+        context, outdated, "replaced, since the proxy or the settings have changed"
     )
     if not lan_relays and context.retries.is_due(Task(place.of, "create", id)):
         yield CreateHelper(place.of, LAN_RELAY, body)

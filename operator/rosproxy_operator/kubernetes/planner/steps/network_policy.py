@@ -46,6 +46,8 @@ from rosproxy_operator.kubernetes.resources.names import (
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
+_OFF = "the operator has --no-network-policy"
+
 
 def policy(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
     """A RosProxy's NetworkPolicy."""
@@ -96,12 +98,10 @@ def reconcile_policies(context: ClusterContext, rosproxy: RosProxy) -> Iterator[
     existing = {name: p for name, p in context.observed.policies.items() if p.of == rosproxy.id}
     for current in existing.values():
         if current.owner != rosproxy.uid:
-            yield from _delete(context, current, "it belongs to a RosProxy that is gone")
+            yield from _delete(context, current, "its former RosProxy is gone")
         elif current.id not in wanted:
             on = context.settings.network_policy
-            yield from _delete(
-                context, current, "spec.podEgress is not Proxy" if on else "--no-network-policy"
-            )
+            yield from _delete(context, current, "spec.podEgress is not Proxy" if on else _OFF)
     for name, body in wanted.items():
         yield from _keep(context, rosproxy, body, existing.get(name))
 

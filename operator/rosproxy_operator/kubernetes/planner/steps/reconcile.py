@@ -66,10 +66,10 @@ def reconcile_service(context: ClusterContext, rosproxy: RosProxy) -> Iterator[A
         if context.retries.is_due(Task(rosproxy.id, "create", service_id(rosproxy.id))):
             yield CreateService(rosproxy.id, body)
     elif service.owner != rosproxy.uid:
-        yield from _delete_service(context, service, "it belongs to a RosProxy that is gone")
+        yield from _delete_service(context, service, "its former RosProxy is gone")
     elif service.fingerprint != manifests.fingerprint_of(body):
         yield from _delete_service(
-            context, service, "made anew: its RosProxy or the operator has changed"
+            context, service, "replaced, since the RosProxy or the operator has changed"
         )
 
 
@@ -155,7 +155,7 @@ def _reconcile_proxy(
     elif node.ready and not node.deleting and context.grace_left(place) <= 0:
         grace = context.view.rosproxies[place.of].spec.grace
         for proxy in proxies:
-            why = f"no pod on node {place.node} has needed it for {grace:g} s"
+            why = f"no pod on node {place.node} has needed the proxy for {grace:g} s"
             yield from _delete_pod(context, proxy, why, retire=True)
 
 
@@ -168,7 +168,7 @@ def _ensure(
     misplaced = [p for p in context.view.proxies.get(place, ()) if p.pod.id != name]
     if misplaced:
         for proxy in misplaced:
-            yield from _delete_pod(context, proxy, "its name is not that of this node's proxy")
+            yield from _delete_pod(context, proxy, "the proxy of this node has another name")
     elif name in context.view.names:
         _note_creation(context, place)
         if current is not None:  # else its pod is about to go
@@ -183,7 +183,9 @@ def _update(
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.proxy_fingerprint(site, context.settings)
     if proxy.pod.ended:
-        yield from _delete_pod(context, proxy, f"it has ended: {proxy.message or proxy.pod.phase}")
+        yield from _delete_pod(
+            context, proxy, f"the pod has ended: {proxy.message or proxy.pod.phase}"
+        )
     elif proxy.fingerprint == fingerprint and proxy.image == image:
         return
     elif serves(proxy) and proxy.stuck is None and proxy.image != image:
@@ -209,10 +211,10 @@ def _change(
     if not may_stop and not lost:
         context.retries.look_again_in(IN_TURN)
     elif proxy.fingerprint != fingerprint:
-        diff = "its RosProxy, its node or the operator's options have changed"
+        why = "replaced, since the RosProxy, the node or the operator's options have changed"
         if proxy.range != site.ports:
-            diff = f"its ports are to be {site.ports} instead of {proxy.range}"
-        yield from _delete_pod(context, proxy, f"made anew: {diff}", retire=serves(proxy) and lost)
+            why = f"replaced, since the ports change from {proxy.range} to {site.ports}"
+        yield from _delete_pod(context, proxy, why, retire=serves(proxy) and lost)
     elif context.retries.is_due(_setting_image(proxy, image)):
         yield SetImage(proxy.of, proxy.pod.id, proxy.pod.uid, image)
 

@@ -33,7 +33,7 @@ def remake_unwired(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Acti
     busy = any(pod.deleting or pod.phase == "Pending" for pod in selected)
     if candidates and not busy and context.retries.is_due(task):
         pod = min(candidates, key=lambda p: p.id)
-        why = f"it is not wired to its proxy; its {pod.controller} makes it anew"
+        why = f"not wired to its proxy. The {pod.controller} of the pod creates a new pod"
         yield EvictPod(rosproxy.id, pod.id, pod.uid, why)
 
 
