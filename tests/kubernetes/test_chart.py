@@ -60,7 +60,7 @@ def try_to_create(body: Json) -> str:
     except api.Refused as refused:
         exists = refused.status == 409 and "already exists" in refused.text
         return "" if exists else refused.text
-    return "" if "not wired to a proxy: no RosProxy in" in warnings else warnings
+    return "" if "has no RosProxy" in warnings else warnings
 
 
 def plural(kind: str) -> str:
@@ -129,8 +129,8 @@ BAD: list[tuple[Json, str]] = [
     ({"master": {"uri": "http://r:65536"}}, "must be of the form http://host:11311"),
     ({"master": {"uri": "http://r:0"}}, "must be of the form http://host:11311"),
     ({"master": {"uri": "http://r /"}}, "must be of the form http://host:11311"),
-    ({"master": {"uri": "http://LocalHost"}}, "the machine itself"),
-    ({"master": {"uri": "http://[::1]:11311"}}, "the machine itself"),
+    ({"master": {"uri": "http://LocalHost"}}, "a loopback address"),
+    ({"master": {"uri": "http://[::1]:11311"}}, "a loopback address"),
     ({"master": {"uri": "http://r", "address": "1.2.3.256"}}, "an IP address such as"),
     ({"master": {"service": {"name": "m"}, "address": "1.2.3.4"}}, "a service needs none"),
     ({"master": {"service": {"name": "m"}, "publish": 11311}}, "the proxy's own ports"),

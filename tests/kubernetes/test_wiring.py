@@ -78,7 +78,7 @@ def test_a_misspelt_label_is_told_on_the_pod(net: Namespace) -> None:
         net.name, pod.name, "Pod", "UnknownName", "did you mean the label rosproxy.io/inject"
     )
     condition = made.wait_for("Degraded", reason="UnknownName")
-    assert f"pod {net.name}/{pod.name}: has the label rosproxy.io/injekt" in condition["message"]
+    assert f"pod {net.name}/{pod.name}: label rosproxy.io/injekt" in condition["message"]
     pod.remove()
     made.wait_for("Degraded", "False")
 

@@ -147,9 +147,9 @@ def _wanted(
             wanted[place] = pods
             continue
         text = (
-            f"selected pods run on node {place.node}, which spec.nodeSelector leaves out, so they "
-            f"have no proxy: {abbreviated(str(pod.id) for pod in pods)}: widen spec.nodeSelector, "
-            "or give the pods the same one"
+            f"node {place.node} does not match spec.nodeSelector, so selected pods there have no "
+            f"proxy: {abbreviated(str(pod.id) for pod in pods)}. Widen spec.nodeSelector, or set "
+            "the same nodeSelector in the pods"
         )
         findings.append(finding(rosproxy, "NodeLeftOut", text))
     return wanted, findings

@@ -1,7 +1,7 @@
-"""Who is told that a label or annotation is misspelt: the RosProxy that it may be meant for.
+"""Findings about misspelt labels and annotations: at the RosProxy for which they may be meant.
 
-A pod is told of it as well. What is told stays the same from look to look, so that each is told
-once, and there are few of each RosProxy.
+A pod gets an Event as well. The texts stay the same from look to look, so that each becomes one
+Event, and each RosProxy gets only a few.
 """
 
 from collections.abc import Iterable, Iterator
@@ -11,17 +11,17 @@ from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Pod, Ro
 from rosproxy_operator.kubernetes.status.findings import finding, pod_finding
 
 MOST_PODS = 10
-"""Pods of a RosProxy's namespace that are told of: of a Deployment all have the same names."""
+"""Reported pods of a RosProxy's namespace: all pods of a Deployment have the same labels."""
 REASON = "UnknownName"
 
 
 def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
     """What is wrong with the names of labels and annotations, as far as it concerns a RosProxy."""
     observed = view.observed
-    yield from (finding(rosproxy, REASON, f"has {text}") for text in rosproxy.misspelt)
+    yield from (finding(rosproxy, REASON, text) for text in rosproxy.misspelt)
     for pod in _pods(view, rosproxy):
         for text in pod.misspelt:
-            yield pod_finding(pod, rosproxy, REASON, f"has {text}", fatal=False)
+            yield pod_finding(pod, rosproxy, REASON, text, fatal=False)
     for place in view.places.get(rosproxy.id, ()):
         node = observed.nodes.get(place.node)
         yield from _others(rosproxy, f"node {place.node}", node.misspelt if node else ())
@@ -32,11 +32,11 @@ def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
 
 
 def _others(rosproxy: RosProxy, subject: str, texts: Iterable[str]) -> Iterator[ClusterFinding]:
-    return (finding(rosproxy, REASON, f"has {text}", subject=subject) for text in texts)
+    return (finding(rosproxy, REASON, text, subject=subject) for text in texts)
 
 
 def _pods(view: View, rosproxy: RosProxy) -> list[Pod]:
-    """The pods of its namespace; of several RosProxies there the first one is told."""
+    """The pods of its namespace; of several RosProxies there, only the first one reports them."""
     namespace = rosproxy.id.namespace
     if rosproxy.id != min(id for id in view.rosproxies if id.namespace == namespace):
         return []

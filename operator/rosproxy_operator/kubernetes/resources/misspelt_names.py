@@ -1,7 +1,7 @@
-"""Labels and annotations that are meant for the operator, and that it does not know.
+"""Labels and annotations that are meant for the operator, and that the operator does not know.
 
-A pod whose label is misspelt is nobody's: no webhook sees it and no RosProxy selects it, and so
-nobody says anything. What is wrong is told with the name that was meant.
+A pod with a misspelt label belongs to no RosProxy: no webhook sees the pod and no RosProxy selects
+it, so no other message mentions the pod. The text gives the name that was meant.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ class _Named(NamedTuple):
     kind: Kind
 
     def __str__(self) -> str:
-        return f"{_ARTICLE[self.place]} {self.name} of {self.kind}"
+        return f"the {self.place} {self.name} of {self.kind}"
 
 
 _USERS = (
@@ -45,10 +45,9 @@ _OPERATORS = frozenset(
 )
 """Those that the operator sets itself, some of them in users' pods: they may be copied."""
 _PREFIXES = (f"{names.GROUP}/", "rosproxy.", "rosproxy/")
-_ARTICLE = {"label": "the label", "annotation": "the annotation"}
 _PLACES = {"label": "labels", "annotation": "annotations"}
 MOST = 3
-"""Names of one object that are told."""
+"""Names of one object that are reported."""
 MOST_CHECKED = 256
 """Labels, and annotations, of one object whose spelling is checked. That takes 30 us for each."""
 
@@ -67,11 +66,11 @@ def _texts(metadata: Json, kind: Kind) -> Iterator[str]:
             named = _BY_NAME.get(name)
             if name in _OPERATORS or (named and (named.place, named.kind) == (place, kind)):
                 continue
-            shown = f"{_ARTICLE[place]} {shorten(clean(name), 100)}"
+            shown = f"{place} {shorten(clean(name), 100)}"
             if named:
-                yield f"{shown} means nothing here: there is {named}"
+                yield f"{shown} is ignored here. The operator reads only {named}"
             elif _is_ours(name) or nearest(name, tuple(_BY_NAME), VERY_NEAR):
-                yield f"{shown} is unknown and ignored: {_meant(name, kind)}"
+                yield f"{shown} is unknown and ignored. {_meant(name, kind)}"
 
 
 def _is_ours(name: str) -> bool:
@@ -84,5 +83,5 @@ def _meant(name: str, kind: Kind) -> str:
     _, slash, last = name.rpartition("/")
     near = nearest(last if slash else name.partition(".")[2], tuple(_BY_END), _NEAR_END)
     if near:
-        return f"did you mean {_BY_END[near]}?"
-    return f"there is {' and '.join(str(named) for named in _USERS if named.kind == kind)}"
+        return f"Did you mean {_BY_END[near]}?"
+    return f"Known: {' and '.join(str(named) for named in _USERS if named.kind == kind)}"

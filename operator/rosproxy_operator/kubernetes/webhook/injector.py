@@ -5,7 +5,7 @@ namespace and their Service are read as they are at this moment; the planner say
 takes the pod and what it needs. Nothing is written: the Service is the operator's alone to make,
 which knows its address, its owner and what to do when it is refused. Where it is not there yet,
 since pod and RosProxy were created together, the operator is woken and the pod waits. Whatever
-goes wrong, the pod is admitted; a warning says what is amiss and what to do.
+goes wrong, the pod is admitted; a warning gives the problem and the fix.
 """
 
 import asyncio
@@ -31,6 +31,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.status.findings import OF_ANOTHER
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ NOT_WIRED = "rosproxy: this pod was not wired to a proxy: "
 
 
 class NotWired(Exception):
-    """A pod can't be wired; the message says why and what to do."""
+    """A pod can't be wired; the message has the reason and the fix."""
 
 
 class NoService(NotWired):
@@ -83,10 +84,10 @@ class Injector:
         except (ApiError, NotWired) as error:
             text = str(error)
         except Exception as error:
-            log.exception("a pod could not be wired")
+            log.exception("pod not wired by an internal error")
             text = f"the operator failed: {error!r}"
         self._metrics.admissions.labels("failed").inc()
-        log.warning("a pod at admission: %s", text)
+        log.warning("pod not wired: %s", text)
         return Wiring(warnings=(NOT_WIRED + text,))
 
     async def _wiring_by(self, body: Json, dry_run: bool, deadline: float) -> tuple[Wiring, float]:
@@ -94,13 +95,13 @@ class Injector:
 
         For an API server may be just starting, or the Service not be there yet.
         """
-        missing = f"the API server did not answer within {LONGEST:g} s; create the pod anew"
+        missing = f"the API server did not answer within {LONGEST:g} s. Create the pod again"
         while True:
             try:
                 async with asyncio.timeout(deadline - time.monotonic()):
                     return await in_thread(self._wiring, body, dry_run)
             except ApiUnavailable as error:
-                log.debug("a pod at admission: %s; trying again", error)
+                log.debug("pod not wired yet, the operator tries again: %s", error)
             except NoService as error:
                 if dry_run:
                     raise
@@ -127,7 +128,7 @@ class Injector:
             return Wiring(warnings=(NOT_WIRED + rosproxy.text,)), 0.0
         text = why_not_selected(pod, usable)
         reasons = [f"RosProxy {r.id.name}: {r.text}" for r in unusable.values()]
-        return Wiring(warnings=("; ".join([NOT_WIRED + text, *reasons]),) if text else ()), 0.0
+        return Wiring(warnings=(". ".join([NOT_WIRED + text, *reasons]),) if text else ()), 0.0
 
     def _address(self, rosproxy: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and in how many seconds it works everywhere.
@@ -143,7 +144,8 @@ class Injector:
             raise self._missing(rosproxy) from None
         service = objects.service(manifest)
         if service is None:
-            raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
+            text = f"a Service {id} exists already that {OF_ANOTHER}. Delete that Service, or use"
+            raise NotWired(f"{text} another name for the RosProxy")
         if service.owner != rosproxy.uid or service.deleting or not service.cluster_ip:
             raise self._missing(rosproxy)
         if dry_run:
@@ -158,11 +160,11 @@ class Injector:
         Pods wait for the latter alone (NoService).
         """
         if refused := bounds_violation(rosproxy, self._consents(rosproxy), self._settings):
-            return NotWired(f"RosProxy {rosproxy.id.name}: {refused}; then create the pod anew")
+            return NotWired(f"RosProxy {rosproxy.id.name}: {refused}. Then create the pod again")
         id = service_id(rosproxy.id)
         return NoService(
-            f"the Service {id} has no cluster IP yet: kubectl -n {id.namespace} describe rosproxy "
-            f"{rosproxy.id.name} says why; once it has one, create the pod anew"
+            f"the Service {id} has no cluster IP yet. Read kubectl -n {id.namespace} describe "
+            f"rosproxy {rosproxy.id.name}. When the Service has a cluster IP, create the pod again"
         )
 
     def _consents(self, rosproxy: RosProxy) -> Consents:

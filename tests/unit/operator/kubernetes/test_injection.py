@@ -162,7 +162,7 @@ def test_the_own_masters_uri_is_replaced_and_any_other_stays(master, uri, names_
     unwired = objects.pod({**obj, "metadata": {"labels": {INJECT: "true"}}})
     assert has_come_unwired(unwired, of, CLUSTER_IP) == names_it
     finding = wiring_finding(unwired, of, CLUSTER_IP)
-    assert finding is None or ("remove the variable" in finding.text) == (not names_it)
+    assert finding is None or ("Remove the variable" in finding.text) == (not names_it)
 
 
 def test_what_was_replaced_stays_visible_when_it_is_wired_again():
@@ -349,12 +349,12 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
 @pytest.mark.parametrize(
     ("unwired", "said"),
     [
-        (pod(), "reached no operator (port 9443) when the pod was created: kubectl"),
-        (pod(controller="Job"), f": kubectl -n {NAMESPACE} delete pod {pod().id.name}"),
-        (pod(workload="daemonset/arm"), f": kubectl -n {NAMESPACE} rollout restart daemonset/arm"),
-        (pod(created="2026-01-01T00:00:00Z"), "is older than RosProxy arm: kubectl"),
+        (pod(), "reached no operator (port 9443) when the pod was created. Run kubectl"),
+        (pod(controller="Job"), f". Run kubectl -n {NAMESPACE} delete pod {pod().id.name}"),
+        (pod(workload="daemonset/arm"), f"kubectl -n {NAMESPACE} rollout restart daemonset/arm"),
+        (pod(created="2026-01-01T00:00:00Z"), "is older than RosProxy arm. Run kubectl"),
         (pod(labels={"app": "x"}), "rosproxy.io/inject=arm"),
-        (pod(wired_master_uri="http://10.96.0.1:11311"), f"its proxy is at {URI} now"),
+        (pod(wired_master_uri="http://10.96.0.1:11311"), f"the proxy is at {URI} now"),
     ],
 )
 def test_a_pod_that_is_not_wired_is_told_what_to_do(unwired, said):

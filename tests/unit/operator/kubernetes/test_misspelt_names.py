@@ -33,36 +33,36 @@ from tests.unit.operator.kubernetes.objects import (
 from tests.unit.operator.kubernetes.snapshots import snapshot_of
 
 TEXT = (
-    "the label rosproxy.io/injekt is unknown and ignored: did you mean the label "
-    "rosproxy.io/inject of pods?"
+    "label rosproxy.io/injekt is unknown and ignored. Did you mean the label rosproxy.io/inject of "
+    "pods?"
 )
 
 
 @pytest.mark.parametrize(
     ("kind", "place", "name", "said"),
     [
-        ("pods", "labels", "rosproxy.io/injekt", "did you mean the label rosproxy.io/inject of"),
-        ("pods", "labels", "rosproxy/inject", "did you mean the label rosproxy.io/inject of"),
-        ("pods", "labels", "ros-proxy.io/Inject", "did you mean the label rosproxy.io/inject of"),
-        ("pods", "labels", "rosproxy.enable", "there is the label rosproxy.io/inject of pods"),
-        ("pods", "annotations", "rosproxy.io/inject", "here: there is the label rosproxy.io/inj"),
+        ("pods", "labels", "rosproxy.io/injekt", "Did you mean the label rosproxy.io/inject of"),
+        ("pods", "labels", "rosproxy/inject", "Did you mean the label rosproxy.io/inject of"),
+        ("pods", "labels", "ros-proxy.io/Inject", "Did you mean the label rosproxy.io/inject of"),
+        ("pods", "labels", "rosproxy.enable", "Known: the label rosproxy.io/inject of pods"),
+        ("pods", "annotations", "rosproxy.io/inject", "here. The operator reads only the label "),
         ("pods", "annotations", "rosproxy.io/advertise-host", "advertise-host of nodes"),
         ("nodes", "annotations", "rosproxy.io/advertised-host", "rosproxy.io/advertise-host of n"),
         ("nodes", "annotations", "rosproxy.advertise-host", "rosproxy.io/advertise-host of nodes"),
-        ("nodes", "labels", "rosproxy.io/advertise-host", "there is the annotation rosproxy.io/a"),
+        ("nodes", "labels", "rosproxy.io/advertise-host", "only the annotation rosproxy.io/a"),
         ("Services of masters", "annotations", "rosproxy.io/allow-form", "rosproxy.io/allow-from"),
         ("RosProxies", "annotations", "rosproxy.io/remake_unwired", "rosproxy.io/remake-unwired"),
         (
             "RosProxies",
             "annotations",
             "rosproxy.io/x",
-            "there is the annotation rosproxy.io/remake",
+            "Known: the annotation rosproxy.io/remake",
         ),
     ],
 )
 def test_a_name_that_is_not_known_is_told_with_the_one_that_was_meant(kind, place, name, said):
     (text,) = misspelt_names({place: {name: "true"}}, kind)
-    assert text.startswith(f"the {place.removesuffix('s')} {name} ")
+    assert text.startswith(f"{place.removesuffix('s')} {name} ")
     assert said in text
 
 
@@ -113,7 +113,7 @@ def test_it_is_told_once_on_the_pod_and_in_the_status():
 
     (event,) = (a for a in first.actions if isinstance(a, Emit) and a.reason == "UnknownName")
     assert event.about == Reference("Pod", Name("ros", "astray"), "uid-astray")
-    assert event.message == f"has {TEXT}"
+    assert event.message == TEXT
     assert not [a for a in second.actions if isinstance(a, Emit)]
     degraded = next(c for c in status(first)["conditions"] if c["type"] == "Degraded")
     assert (degraded["status"], degraded["reason"]) == ("True", "UnknownName")
@@ -125,7 +125,7 @@ def test_many_pods_of_one_kind_are_told_of_by_some():
     pods = tuple(pod(f"p{number:02}", misspelt=(TEXT,)) for number in range(MOST_PODS + 30))
     gone = pod("a", misspelt=(TEXT,), deleting=True)
     texts = told(look(complete(misspelt_pods=(*pods[::-1], gone))), "UnknownName")
-    assert texts == [f"pod ros/p{number:02}: has {TEXT}" for number in range(MOST_PODS)]
+    assert texts == [f"pod ros/p{number:02}: {TEXT}" for number in range(MOST_PODS)]
 
 
 def test_of_two_rosproxies_the_first_one_is_told():
@@ -145,9 +145,9 @@ def test_nodes_services_and_rosproxies_are_told_of_at_the_rosproxy():
     )
     plan = look(seen)
     assert told(plan, "UnknownName") == [
-        "rosproxy ros/robot: has a",
-        "node one: has b",
-        f"service {service}: has c",
+        "rosproxy ros/robot: a",
+        "node one: b",
+        f"service {service}: c",
     ]
     about = {f.about for f in plan.problems if f.reason == "UnknownName"}
     assert about == {Reference("RosProxy", ROBOT, "uid-robot")}

@@ -103,13 +103,13 @@ def test_what_is_read():
         ({"ros": True}, "spec.ros: True is unknown"),
         ({"ros": 2, **GOOD}, "spec.master"),
         ({"ros": 2, "domain": 233}, "spec.domain"),
-        ({"ros": 2, "peers": ["a b"]}, "spec.peers[0]: 'a b' is no peer"),
-        ({"ros": 2, "peers": ["a"] * 33}, "are too many"),
+        ({"ros": 2, "peers": ["a b"]}, "spec.peers[0]: 'a b' is not a peer"),
+        ({"ros": 2, "peers": ["a"] * 33}, "has too many hosts"),
         ({"ros": 2, "multicast": "yes"}, "spec.multicast"),
-        ({"ros": 2, "ports": 3}, "ask for 4 at least"),
-        ({"ros": 2, "ports": 4, "multicast": True}, "ask for 5 at least"),
+        ({"ros": 2, "ports": 3}, "Write at least 4"),
+        ({"ros": 2, "ports": 4, "multicast": True}, "Write at least 5"),
         ({"domain": 1, **GOOD}, "spec.domain: 1 is for ROS 2"),
-        ({"ros": "1,2"}, "give either uri"),
+        ({"ros": "1,2"}, "give exactly one of uri"),
     ],
 )
 def test_what_is_refused(spec: Any, text: str):
@@ -297,7 +297,7 @@ def test_an_lan_relay_that_does_not_run_is_told():
     deaf = pod_failure({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
     stuck_lan_relay = lan_relay(of, stuck=deaf[0], message=deaf[1])
     plan = look(observed(of, service(of), pod(), proxy_pod, lan_relays=(stuck_lan_relay,)))
-    assert "so that the LAN is not heard" in told(plan, "LanRelayStuck")[0]
+    assert "no discovery passes between the LAN and the proxy" in told(plan, "LanRelayStuck")[0]
 
 
 def test_a_node_without_a_lan_address_is_told():
@@ -311,7 +311,7 @@ def test_an_address_of_ipv6_is_not_advertised():
     of = of2()
     lost = node(addresses={"InternalIP": "fd00::1"})
     plan = look(observed(of, service(of), lost, pod()))
-    assert "IPv4 alone" in told(plan, "NoAdvertiseHost")[0]
+    assert "IPv4 only" in told(plan, "NoAdvertiseHost")[0]
 
 
 def admitted(*env: Any) -> dict[str, Any]:
@@ -383,9 +383,9 @@ def test_what_is_well_is_not_told(container: PodContainer):
 def test_a_pod_that_no_webhook_has_seen_is_told():
     (finding,) = ros2_findings(pod(static_peers=""), of2(), ADDRESS)
     assert finding.reason == "NotWired"
-    assert finding.text.endswith(": kubectl -n ros delete pod talker, and create the pod again")
+    assert finding.text.endswith(". Run kubectl -n ros delete pod talker, and create the pod again")
     (finding,) = ros2_findings(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
-    assert "its proxy is at 10.96.1.1 now" in finding.text
+    assert "the proxy is at 10.96.1.1 now" in finding.text
 
 
 @pytest.mark.parametrize(

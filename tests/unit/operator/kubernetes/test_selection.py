@@ -117,9 +117,9 @@ def test_a_pod_that_is_not_labelled_needs_no_warning():
 @pytest.mark.parametrize(
     ("label", "rosproxies", "said"),
     [
-        ("true", [], "no RosProxy in namespace robots"),
-        ("true", [rosproxy("arm", namespace="other")], "no RosProxy in namespace robots"),
-        ("leg", [rosproxy("arm"), rosproxy("hand")], "set it to arm or hand"),
+        ("true", [], "namespace robots has no RosProxy"),
+        ("true", [rosproxy("arm", namespace="other")], "namespace robots has no RosProxy"),
+        ("leg", [rosproxy("arm"), rosproxy("hand")], "Set the label to arm or hand"),
         ("true", [rosproxy("arm", Selector({"app": "x"}))], "spec.podSelector of RosProxy arm"),
         ("arm", [rosproxy("arm", Selector({"app": "x"}))], "spec.podSelector of RosProxy arm"),
     ],

@@ -225,7 +225,10 @@ async def test_a_pod_whose_service_does_not_come_is_admitted(
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.5)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     answer = await running.admit(pod_obj("talker", INJECT))
-    assert "has no cluster IP yet: kubectl -n robots describe rosproxy arm" in answer["warnings"][0]
+    assert (
+        "has no cluster IP yet. Read kubectl -n robots describe rosproxy arm"
+        in (answer["warnings"][0])
+    )
     assert running.controller.times > 0
 
 
@@ -246,14 +249,17 @@ async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> Non
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     running.server.put("services", service_obj(labels={}), NAMESPACE)
     answer = await running.admit(pod_obj("talker", INJECT))
-    assert "is not the operator's: delete or rename it" in answer["warnings"][0]
+    assert "exists already that the operator did not create. Delete that" in answer["warnings"][0]
 
 
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ({"ports": 65}, "RosProxy arm: spec.ports: 65 is not what the operator allows"),
-        ({"master": {"service": {"name": "m", "namespace": "other"}}}, "not agreed"),
+        ({"ports": 65}, "RosProxy arm: spec.ports: the operator does not allow 65"),
+        (
+            {"master": {"service": {"name": "m", "namespace": "other"}}},
+            "does not allow RosProxies of namespace 'robots'",
+        ),
     ],
 )
 async def test_a_pod_of_a_rosproxy_that_asks_for_too_much_does_not_wait(
@@ -319,7 +325,7 @@ async def test_a_pod_waits_for_a_service_that_is_just_made(
 
 async def test_a_pod_that_nobody_takes_is_told(running: Running) -> None:
     answer = await running.admit(pod_obj("talker", INJECT))
-    assert "no RosProxy in namespace robots" in answer["warnings"][0]
+    assert "namespace robots has no RosProxy" in answer["warnings"][0]
     answer = await running.admit(pod_obj("talker", {"rosproxy.io/inject": "false"}))
     assert "warnings" not in answer
 
@@ -329,7 +335,7 @@ async def test_for_a_pod_without_a_namespace_nothing_is_listed(running: Running)
     pod = pod_obj("talker", INJECT)
     del pod["metadata"]["namespace"]
     answer = await running.admit(pod)
-    assert "no RosProxy in namespace" in answer["warnings"][0]
+    assert "has no RosProxy" in answer["warnings"][0]
     assert not running.server.asked("GET", "rosproxies")
 
 

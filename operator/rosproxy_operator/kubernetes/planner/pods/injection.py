@@ -87,9 +87,10 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
     annotations = texts_at(pod, "metadata", "annotations")
     if MIRROR in annotations:
         warning = (
-            "is a static pod, made from a file on its node, which can't be wired: set "
+            "rosproxy: this pod was not wired to a proxy: the pod is a static pod, made from a "
+            "file on its node. Set "
             f"{'ROS_MASTER_URI and ROS_IP' if target.uri else 'ROS_STATIC_PEERS'} in that file, or "
-            "run it as an ordinary pod"
+            "run an ordinary pod"
         )
         return Wiring(warnings=(warning,))
     spec = submap(pod, "spec")
@@ -156,11 +157,11 @@ def restart_of(pod: Pod) -> str:
     return command if pod.controller else f"{command}, and create the pod again"
 
 
-def _edit_of(pod: Pod) -> str:
-    """Where the template of a pod is changed."""
+def _edited(change: str, pod: Pod) -> str:
+    """How to make a change in the template of a pod."""
     if pod.workload:
-        return f"kubectl -n {pod.id.namespace} edit {pod.workload}"
-    return f"change the template of the pod, then {restart_of(pod)}"
+        return f"{change}: kubectl -n {pod.id.namespace} edit {pod.workload}"
+    return f"{change}, then run {restart_of(pod)}"
 
 
 def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
@@ -183,18 +184,19 @@ def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
     foreign = [uri for uri in around if not _names_one(uri, masters)]
     if foreign:
         return (
-            f"sets ROS_MASTER_URI={clean(foreign[0])[:200]} itself, which does not lead to its "
-            f"proxy: remove the variable: {_edit_of(pod)}"
+            f"variable ROS_MASTER_URI={clean(foreign[0])[:200]} of the template does not lead to "
+            "the proxy, so the nodes bypass the proxy. "
+            f"{_edited('Remove the variable from the template', pod)}"
         )
     if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
         return (
-            f"was wired to {clean(pod.wired_master_uri)[:200]}, but its proxy is at "
-            f"{master_uri(cluster_ip)} now: {restart_of(pod)}"
+            f"was wired to {clean(pod.wired_master_uri)[:200]}, but the proxy is at "
+            f"{master_uri(cluster_ip)} now. Run {restart_of(pod)}"
         )
     if _is_of_former(pod, rosproxy):
         return (
             f"is older than RosProxy {rosproxy.id.name}: the former RosProxy of that name was "
-            "deleted, and the ROS nodes of the pod were unregistered at the master: "
+            "deleted, and the ROS nodes of the pod were unregistered at the master. Run "
             f"{restart_of(pod)}"
         )
     if not around and (pod.wired_master_uri or pod.own_masters):
@@ -203,15 +205,15 @@ def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
 
 
 def missing_variable_text(variable: str, pod: Pod, rosproxy: RosProxy) -> str:
-    """Why a pod has not got a variable of its proxy, and what to do about it."""
-    text = f"has no {variable} of its proxy"
+    """The text about a pod without a variable that names the proxy: the reason and the fix."""
+    text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
-        return f"{text}: add the label {label} to the pod's template: {_edit_of(pod)}"
+        return f"{text}. {_edited(f'Add the label {label} to the template', pod)}"
+    reason = "the API server reached no operator (port 9443) when the pod was created"
     if _is_older(pod, rosproxy):
-        return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}: {restart_of(pod)}"
-    reason = "since the API server reached no operator (port 9443) when the pod was created"
-    return f"{text}, {reason}: {restart_of(pod)}"
+        reason = f"the pod is older than RosProxy {rosproxy.id.name}"
+    return f"{text}, since {reason}. Run {restart_of(pod)}"
 
 
 def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:

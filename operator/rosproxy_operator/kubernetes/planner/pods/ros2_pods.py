@@ -1,8 +1,8 @@
 """What keeps a selected pod's ROS 2 nodes from being discovered, as far as the pod itself tells.
 
 The webhook has set ROS_STATIC_PEERS to the address of the RosProxy's Service, which leads to the
-proxy on the pod's own node. Where that can't help, the pod is told so by an Event. What an image
-sets itself is not seen: only its name may tell the distribution.
+proxy on the pod's own node. Where that can't help, the pod gets an Event. The operator does not see
+variables that an image sets: only the name of the image may give the distribution.
 """
 
 import re
@@ -51,8 +51,8 @@ def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str) -> str:
     """What is wrong with what the webhook has set, or has not."""
     if pod.static_peers and pod.static_peers != address:
         return (
-            f"was told ROS_STATIC_PEERS={clean(pod.static_peers)[:200]}, but its proxy is at "
-            f"{address} now: {restart_of(pod)}"
+            f"was wired to {clean(pod.static_peers)[:200]} (ROS_STATIC_PEERS), but the proxy is at "
+            f"{address} now. Run {restart_of(pod)}"
         )
     if pod.static_peers or any(map(has_peers, pod.containers)):
         return ""
@@ -66,37 +66,41 @@ def _problems(
     get = container.variables.get
     rmw = get("RMW_IMPLEMENTATION", "")
     if not is_dds(rmw):
-        text = f"sets RMW_IMPLEMENTATION={_shown(rmw)}, which is no DDS and can't be proxied"
-        yield "NoDds", f"{text}: use rmw_fastrtps_cpp or rmw_cyclonedds_cpp"
+        text = (
+            f"variable RMW_IMPLEMENTATION={_shown(rmw)} is not DDS, and a proxy forwards DDS only"
+        )
+        yield "NoDds", f"{text}. Use rmw_fastrtps_cpp or rmw_cyclonedds_cpp"
     peers = get("ROS_STATIC_PEERS")
     if (
         peers is not None
         and peers != VALUE_AT_RUNTIME
         and not _names_service(peers, rosproxy, address)
     ):
-        text = f"sets ROS_STATIC_PEERS={_shown(peers)} itself, without its proxy"
-        yield "NotWired", f"{text}: remove the variable from the template, or add {address} to it"
+        text = f"variable ROS_STATIC_PEERS={_shown(peers)} of the template does not name the proxy"
+        fix = f"Remove the variable from the template, or add {address} to the variable"
+        yield "NotWired", f"{text}. {fix}"
     domain = get("ROS_DOMAIN_ID")
     number = rosproxy.spec.ros2.number if rosproxy.spec.ros2 else 0
     if domain not in (None, VALUE_AT_RUNTIME) and str(domain).strip() not in (str(number), ""):
         text = (
-            f"sets ROS_DOMAIN_ID={_shown(str(domain))}, "
-            f"but RosProxy {rosproxy.id.name} is for domain"
+            f"variable ROS_DOMAIN_ID={_shown(str(domain))} is not domain {number} of RosProxy "
+            f"{rosproxy.id.name}"
         )
-        yield "OtherDomain", f"{text} {number}: change either, then {restart_of(pod)}"
+        fix = f"Change the variable or spec.domain, then run {restart_of(pod)}"
+        yield "OtherDomain", f"{text}. {fix}"
     distro = _OLD.search(get("ROS_DISTRO", "").lower()) or _OLD.search(container.image.lower())
     if distro:
-        text = f"is of ROS 2 {distro[1].capitalize()}, which knows no ROS_STATIC_PEERS"
-        yield "TooOld", f"{text}: use Iron or a later one"
+        text = f"has ROS 2 {distro[1].capitalize()}, which does not support ROS_STATIC_PEERS"
+        yield "TooOld", f"{text}. Use Iron or a later distribution"
     reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     if reach.upper() in _RANGES_WITHOUT_PEERS:
-        text = f"sets ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)}, so static peers are not used"
-        yield "Alone", f"{text}: remove the variable"
+        text = f"variable ROS_AUTOMATIC_DISCOVERY_RANGE={_shown(reach)} makes ROS 2 ignore static"
+        yield "Alone", f"{text} peers, such as the proxy. Remove the variable"
     if get("ROS_LOCALHOST_ONLY") == "1":
         yield (
             "Alone",
-            "sets ROS_LOCALHOST_ONLY=1, which keeps its participants from being discovered: "
-            "remove the variable",
+            "variable ROS_LOCALHOST_ONLY=1 keeps the participants of the pod from being "
+            "discovered. Remove the variable",
         )
 
 

@@ -46,15 +46,15 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
     if not named and len(taking) > 1:
         names = [r.id.name for r in taking]
         text = (
-            f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to "
-            f"one of them, as {INJECT}={names[0]}"
+            f"is selected by RosProxy {' and '.join(names)}, so the pod gets no proxy. Set the "
+            f"label to the name of one RosProxy, such as {INJECT}={names[0]}"
         )
         return pod_finding(pod, taking[0], "Ambiguous", text)
     rosproxy = (named or taking)[0]
     if pod.host_network:
         text = (
-            "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get "
-            f"none: remove hostNetwork, or the label {INJECT}"
+            "is on the node's own network (hostNetwork), where ROS nodes need no proxy and get "
+            f"none. Remove the label {INJECT}, or remove hostNetwork"
         )
         return pod_finding(pod, rosproxy, "HostNetwork", text)
     return rosproxy
@@ -69,20 +69,20 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     names = sorted(r.id.name for r in rosproxies if r.id.namespace == pod.id.namespace)
     if label in LABEL_OFF_VALUES:
         return ""
-    lost = "its ROS nodes are not reachable from outside"
+    lost = "outside can't reach the ROS nodes of the pod"
     if not names:
         return (
-            f"no RosProxy in namespace {pod.id.namespace}, so {lost}: create one there, then "
-            "create the pod anew"
+            f"namespace {pod.id.namespace} has no RosProxy, so {lost}. Create a RosProxy there, "
+            "then create the pod again"
         )
     if label not in (_ANY, *names):
         return (
-            f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}: "
-            f"set it to {' or '.join(names)}, then create the pod anew"
+            f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}. "
+            f"Set the label to {' or '.join(names)}, then create the pod again"
         )
     return (
-        f"spec.podSelector of RosProxy {' and '.join(names)} does not fit its labels, so {lost}: "
-        "change either, then create the pod anew"
+        f"the labels of the pod do not match spec.podSelector of RosProxy {' and '.join(names)}, "
+        f"so {lost}. Change the labels or the selector, then create the pod again"
     )
 
 
