@@ -77,7 +77,7 @@ def test_a_master_that_is_not_there_is_the_first_cause(net: Namespace) -> None:
     code, findings = doctor(net.name)
     assert code == 1
     assert findings[0]["text"].startswith("MasterReachable is False: ")
-    assert "edit rosproxy robot: spec.master" in findings[0]["fix"]
+    assert "or correct spec.master" in findings[0]["fix"]
 
 
 def test_a_webhook_whose_configuration_is_gone_is_told(net: Namespace) -> None:
@@ -98,7 +98,7 @@ def test_a_webhook_whose_configuration_is_gone_is_told(net: Namespace) -> None:
         metadata = {**kept, "name": release.FULL_NAME}
         api.json_call("POST", api.path(WEBHOOKS), {**configuration, "metadata": metadata})
     assert severity == "error"
-    assert "no MutatingWebhookConfiguration has wire.rosproxy.io" in text
+    assert "no MutatingWebhookConfiguration has the webhook wire.rosproxy.io" in text
     release.wait_operator()
 
 
@@ -117,9 +117,9 @@ def test_who_may_not_look_is_told_which_right_is_missing(net: Namespace, tmp_pat
     kubeconfig.write_text(json.dumps(config))
     code, findings = doctor(net.name, kubeconfig)
     assert code == 0, findings
-    refused = [f["text"] for f in findings if f["text"].startswith("not looked at")]
+    refused = [f["text"] for f in findings if f["text"].startswith("not checked")]
     assert refused == [
-        "not looked at: you lack the right to list "
+        "not checked: you lack the right to list "
         "mutatingwebhookconfigurations.admissionregistration.k8s.io -A",
-        f"not looked at: you lack the right to list events -n {net.name}",
+        f"not checked: you lack the right to list events -n {net.name}",
     ]

@@ -20,7 +20,7 @@ def test_a_network_plug_in_without_host_ports_is_told_with_the_fix(
     assert condition["reason"] == "PortsUnreachable"
     text = (
         f"proxy {cut_off.name} on node node2: outside does not reach ports {cut_off.ports} of "
-        "10.88.0.12 (nothing listens there): have the nodes' network plug-in do hostPorts (CNI: "
+        "10.88.0.12 (nothing listens there). Enable hostPorts in the nodes' network plug-in (CNI: "
         "the plug-in portmap), then delete the proxy's pod"
     )
     assert condition["message"].startswith(text)

@@ -2,8 +2,8 @@
 
 First what the operator has written into the status of each RosProxy; then whether the webhook can
 work, and which Events there were (`doctor_facts`); then each proxy is asked by the doctor of its
-own pod (``kubectl exec``), which looks from where the proxy is. All of that takes rights that
-whoever looks needs: what is missing is told, and the rest looked at.
+own pod (``kubectl exec``), which tests from the place of the proxy. All requests use the rights of
+the user that calls the doctor: a missing right becomes a finding, and the doctor checks the rest.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -38,9 +38,9 @@ WITHIN = 60
 FIXES = {
     "advertised host": ADDRESS_FIX,
     "published range": PORTS_FIX,
-    "ports": "a larger spec.ports",
+    "ports": "set a larger spec.ports",
 }
-"""What mends what proxies find about themselves, by their checks."""
+"""The fixes of findings that proxies report about themselves, by the checks."""
 
 
 def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFinding]:
@@ -84,8 +84,8 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
     except (ApiException, WebSocketException, OSError) as error:
         reason = getattr(error, "reason", "") or str(error)
         line = str(reason).strip().partition("\n")[0][:300]
-        text = f"its own doctor could not be asked ({line})"
-        fix = "may you create pods/exec? kubectl auth can-i create pods/exec -n "
+        text = f"rosproxy doctor could not run in the proxy's container: {line}"
+        fix = "check that you may create pods/exec: kubectl auth can-i create pods/exec -n "
         yield warning("proxy", subject, text, fix + namespace)
         return
     yield from read_findings(subject, output, FIXES)

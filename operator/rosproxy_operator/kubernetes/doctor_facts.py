@@ -1,4 +1,4 @@
-"""What the doctor looks at besides RosProxies: the webhook, and Events. As whoever calls it.
+"""What the doctor reads besides RosProxies: the webhook, and Events. With the caller's rights.
 
 A question that the API server does not answer, most often for want of a right, becomes a finding,
 and the others are asked all the same.
@@ -96,10 +96,13 @@ class DoctorFacts:
             return question()
         except ApiError as error:
             if right := missing_right(str(error)):
-                text = f"not looked at: you lack the right to {right}"
-                fix = f"kubectl auth can-i {right}; ask whoever has it to run this"
+                text = f"not checked: you lack the right to {right}"
+                fix = (
+                    f"check with kubectl auth can-i {right}; ask a user with this right to run the "
+                    "doctor"
+                )
             else:
-                text = f"could not be looked at: {error}"
+                text = f"not checked: {error}"
                 fix = ""
             self.refused.append(warning(subject, subject, text, fix))
             return None

@@ -128,16 +128,16 @@ def test_a_cluster_tells_the_cause_and_no_text_twice() -> None:
         "MasterReachable is False: no master",
         "Ready is False: no proxy is ready",
     ]
-    assert findings[0].fix == "kubectl -n lab describe rosproxy robot"
+    assert findings[0].fix == "read kubectl -n lab describe rosproxy robot"
 
 
 def test_each_reason_has_its_own_fix() -> None:
     bad = {**condition("PortsAllocated", "False", "no ports"), "reason": "PortsExhausted"}
     dead = {**condition("PortsReachable", "False", "dead"), "reason": "PortsUnreachable"}
     findings = cluster_findings([rosproxy(conditions=[bad, dead])])
-    assert findings[0].fix.startswith("have the nodes' network plug-in do hostPorts")
+    assert findings[0].fix.startswith("enable hostPorts in the nodes' network plug-in")
     assert findings[1].fix == (
-        "kubectl -n lab edit rosproxy robot: fewer spec.ports, or a wider spec.portWindow"
+        "lower spec.ports, or widen spec.portWindow: kubectl -n lab edit rosproxy robot"
     )
 
 
@@ -145,8 +145,10 @@ def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:
     (sound,) = cluster_findings([rosproxy(proxies="1/1")])
     assert sound.severity is Severity.OK
     assert "there is no RosProxy" in cluster_findings([])[0].text
-    assert "selects no pod" in cluster_findings([rosproxy(nodes=0)])[0].text
-    assert "does the operator run?" in cluster_findings([rosproxy(observedGeneration=1)])[0].fix
+    assert "no running pod is selected" in cluster_findings([rosproxy(nodes=0)])[0].text
+    assert (
+        "check that the operator runs" in cluster_findings([rosproxy(observedGeneration=1)])[0].fix
+    )
 
 
 def test_a_name_that_one_proxy_knows_is_unknown_to_none() -> None:

@@ -1,4 +1,4 @@
-"""What the statuses of all RosProxies say is wrong, for the doctor."""
+"""The findings of the doctor from the statuses of all RosProxies."""
 
 from collections.abc import Iterable, Iterator
 
@@ -22,7 +22,10 @@ def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
     """All findings of a cluster, by its RosProxies; each text once, where it is a cause."""
     findings = [finding for rosproxy in rosproxies for finding in _findings_of(rosproxy)]
     if not findings:
-        fix = "kubectl apply -f a RosProxy; kubectl get crd rosproxies.rosproxy.io"
+        fix = (
+            "create a RosProxy with kubectl apply; check that the cluster has the definition: "
+            "kubectl get crd rosproxies.rosproxy.io"
+        )
         return [warning("rosproxy", "cluster", "there is no RosProxy", fix)]
     return findings
 
@@ -34,9 +37,10 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
     subject = f"rosproxy {id}"
     conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}
     if int_at(status, "observedGeneration") < metadata.get("generation", 0):
-        text = "the operator has not looked at its last change yet"
+        text = "the operator has not looked at the last change of this RosProxy yet"
         fix = (
-            "does the operator run? kubectl get pods -A -l app.kubernetes.io/name=rosproxy-operator"
+            "check that the operator runs: kubectl get pods -A -l "
+            "app.kubernetes.io/name=rosproxy-operator"
         )
         yield error("operator", subject, text, fix)
     messages: set[str] = set()
@@ -53,5 +57,6 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
         text = f"proxies {text_at(status, 'proxies')} ready, {int_at(status, 'rosNodes')} ROS nodes"
         yield ok("rosproxy", subject, text)
     else:
-        text = "it selects no pod that runs"
-        yield warning("rosproxy", subject, text, f"label pods with {INJECT}={metadata['name']}")
+        text = "no running pod is selected"
+        fix = f"add the label {INJECT}={metadata['name']} to the template of your pods"
+        yield warning("rosproxy", subject, text, fix)

@@ -1,7 +1,7 @@
 """The last Warning Events of RosProxies and their pods, for the doctor: the newest first.
 
-What holds now the conditions say; an Event of the operator that they don't have is over. What the
-kubelet and the scheduler say of a proxy's pod matters while that is not ready.
+The conditions hold the present problems; an Event of the operator that no condition repeats is
+over. Events of the kubelet and the scheduler about a proxy's pod matter until that pod is ready.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -69,13 +69,13 @@ def event_findings(
         often = f", {event.count} times" if event.count > 1 else ""
         text = f"{event.reason} {duration(event.age)} ago{often}: {brief(event.message, LONGEST)}"
         if event.own:
-            yield note(_CHECK, subject, f"{text} (no condition says so now)")
+            yield note(_CHECK, subject, f"{text} (no condition reports this now)")
         elif event.uid in ready:
-            yield note(_CHECK, subject, f"{text} (it is ready now)")
+            yield note(_CHECK, subject, f"{text} (the pod is ready now)")
         else:
             # The name in an Event is any text that the author of the Event has chosen.
             namespace = quoted(event.id.namespace)
-            fix = f"kubectl -n {namespace} describe pod {quoted(event.id.name)}"
+            fix = f"read kubectl -n {namespace} describe pod {quoted(event.id.name)}"
             yield warning(_CHECK, subject, text, fix)
 
 

@@ -1,6 +1,6 @@
-"""What to do about a condition of a RosProxy, by its reason, as commands and fields: the doctor's.
+"""The fixes of the doctor for conditions of a RosProxy, by the reason of the condition.
 
-The message of the condition names the object and says the same in full.
+The message of the condition names the object and has the same fix in full.
 """
 
 from rosproxy_operator.kubernetes.resources.model import Name
@@ -8,40 +8,43 @@ from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, INJECT, PRO
 from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_FIX
 
 _EDIT = "kubectl -n {of.namespace} edit rosproxy {of.name}"
-_DESCRIBE = "kubectl -n {of.namespace} describe rosproxy {of.name}"
-_PODS = f"kubectl -n {{of.namespace}} describe pods -l {PROXY_OF}={{of.name}}"
+_DESCRIBE = "read kubectl -n {of.namespace} describe rosproxy {of.name}"
+_PODS = f"read kubectl -n {{of.namespace}} describe pods -l {PROXY_OF}={{of.name}}"
 _RESTART = "kubectl -n {of.namespace} rollout restart deployment/NAME"
-_TEMPLATE = f"correct the pod's template as the message says, then {_RESTART}"
+_TEMPLATE = f"correct the pod's template as the message says, then run {_RESTART}"
 _BY_REASON = {
-    "Ambiguous": f"label the pod's template with the name of one: {INJECT}={{of.name}}",
+    "Ambiguous": "set the label in the pod's template to the name of one RosProxy, such as "
+    f"{INJECT}={{of.name}}",
     "LanRelayStuck": _PODS,
-    "ImageUnusable": f"{_EDIT}: spec.image; or the chart's proxy.image",
-    "HostNetwork": f"take hostNetwork, or the label {INJECT}, out of the pod's template",
-    "Invalid": f"{_EDIT}: the field that the message names",
-    "MasterUnknown": f"{_EDIT}: spec.master",
-    "MasterUnreachable": f"start the master; or {_EDIT}: spec.master, with spec.master.address "
-    "where the cluster does not know its name",
-    "NameTaken": "delete or rename the object that the message names",
+    "ImageUnusable": f"correct spec.image ({_EDIT}), or the chart's proxy.image",
+    "HostNetwork": f"remove hostNetwork, or the label {INJECT}, from the pod's template",
+    "Invalid": f"correct the field that the message names: {_EDIT}",
+    "MasterUnknown": f"correct spec.master: {_EDIT}",
+    "MasterUnreachable": "start the master; or correct spec.master, and set spec.master.address if "
+    f"the cluster does not know the master's name: {_EDIT}",
+    "NameTaken": "delete the object that the message names, or create it under another name",
     "NoAdvertiseHost": ADDRESS_FIX,
-    "NodeLeftOut": f"{_EDIT}: spec.nodeSelector",
-    "NodeNotReady": "kubectl get nodes; kubectl describe node NODE",
-    "NotAllowed": f"{_EDIT}: the field that the message names; or allow it, by the chart's allow…",
+    "NodeLeftOut": f"correct spec.nodeSelector: {_EDIT}",
+    "NodeNotReady": "read kubectl get nodes, and kubectl describe node NODE",
+    "NotAllowed": f"change the field that the message names ({_EDIT}), or have the value allowed "
+    "as the message says",
     "NotWired": _TEMPLATE,
     "OtherDomain": _TEMPLATE,
-    "PolicyRefused": f"{_EDIT}: another spec.image, or none",
-    "PortConflict": f"{_EDIT}: leave the ports that others take out of spec.portWindow",
-    "PortsExhausted": f"{_EDIT}: fewer spec.ports, or a wider spec.portWindow",
+    "PolicyRefused": f"change spec.image, or remove spec.image: {_EDIT}",
+    "PortConflict": f"set a spec.portWindow without the ports that other programs use: {_EDIT}",
+    "PortsExhausted": f"lower spec.ports, or widen spec.portWindow: {_EDIT}",
     "PortsUnreachable": PORTS_FIX,
-    "ProxiesStarting": f"wait a moment; {_PODS}",
+    "ProxiesStarting": f"wait a moment, then {_PODS}",
     "ProxyStuck": _PODS,
-    "ProxyUnreachable": f"let the operator's pods connect to port {ADMIN_PORT} of pods with the "
-    f"label {PROXY_OF}={{of.name}} (kubectl -n {{of.namespace}} get networkpolicies)",
-    "ProxyWarns": "what the proxies' own doctors say, below",
-    "UnknownName": "correct the name where the message says; of pods in their template, then "
-    f"{_RESTART}",
+    "ProxyUnreachable": "allow connections from the operator's pods to port "
+    f"{ADMIN_PORT} of pods with the label {PROXY_OF}={{of.name}}; read kubectl -n {{of.namespace}} "
+    "get networkpolicies",
+    "ProxyWarns": "read the findings of the proxies' doctors below",
+    "UnknownName": "correct the name where the message says; if the name is on a pod, correct the "
+    f"pod's template, then run {_RESTART}",
 }
 
 
 def fix_for(reason: str, of: Name) -> str:
-    """What mends a condition with this reason; where that is not known, where to look."""
+    """The fix for a condition with this reason; for other reasons, the command to read more."""
     return _BY_REASON.get(reason, _DESCRIBE).format(of=of)

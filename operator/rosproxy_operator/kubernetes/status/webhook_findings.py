@@ -1,6 +1,6 @@
 """Whether the webhook that wires pods can work, for the doctor: its configuration, CA and Service.
 
-It refuses no pod: where it fails, pods start as they are, and their nodes don't find the proxy.
+The webhook refuses no pod: if it fails, pods start unwired, and their nodes don't find the proxy.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,12 +18,12 @@ NAME = "wire.rosproxy.io"
 OPERATORS = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
 """Label selector of the operators' pods."""
 _CHECK = "webhook"
-_ANEW = "then create the pods anew that came by unwired: kubectl rollout restart"
-_INSTALL = "helm upgrade, or kubectl apply -f manifests/install.yaml, makes it anew"
+_ANEW = "then create unwired pods again: kubectl rollout restart"
+_INSTALL = "create the object again: helm upgrade, or kubectl apply -f manifests/install.yaml"
 
 
 class WebhookFacts(msgspec.Struct, frozen=True):
-    """What the cluster has of the webhook; None: it could not be looked at.
+    """What the cluster has of the webhook; None: the doctor could not read it.
 
     ``configurations`` are the MutatingWebhookConfigurations with our webhook, ``operators`` the
     operators' pods; ``ready`` is how many endpoints of a Service take calls, None where there is no
@@ -58,15 +58,21 @@ def webhook_findings(facts: WebhookFacts) -> Iterator[DoctorFinding]:
 
 
 def _missing(operators: tuple[Json, ...] | None) -> DoctorFinding:
-    text = f"no MutatingWebhookConfiguration has {NAME}, so no pod with the label {INJECT} is wired"
+    text = (
+        f"no MutatingWebhookConfiguration has the webhook {NAME}, so no pod with the label "
+        f"{INJECT} is wired"
+    )
     if operators is None:
-        return warning(_CHECK, _CHECK, text, f"unless it is switched off, {_INSTALL}; {_ANEW}")
+        fix = f"unless the webhook is switched off (webhook.enabled=false), {_INSTALL}; {_ANEW}"
+        return warning(_CHECK, _CHECK, text, fix)
     if not operators:
         fix = "install the operator: helm install, or kubectl apply -f manifests/install.yaml"
-        return warning(_CHECK, _CHECK, f"{text}; and there is no pod of an operator", fix)
+        return warning(_CHECK, _CHECK, f"{text}. The cluster has no pod of an operator", fix)
     if any(_serves(pod) for pod in operators):
-        return error(_CHECK, _CHECK, f"{text}, though operators serve it", f"{_INSTALL}; {_ANEW}")
-    return note(_CHECK, _CHECK, f"{text}: the operators do not serve it (webhook.enabled=false)")
+        text = f"{text}, although operators serve the webhook"
+        return error(_CHECK, _CHECK, text, f"{_INSTALL}; {_ANEW}")
+    text = f"{text}. The operators do not serve the webhook (webhook.enabled=false)"
+    return note(_CHECK, _CHECK, text)
 
 
 def _serves(operator: Json) -> bool:
@@ -81,15 +87,19 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
     subject = f"webhook {text_at(metadata, 'name')}"
     lacks_ca = not text_at(submap(our_webhook(configuration), "clientConfig"), "caBundle")
     if lacks_ca:
-        text = "it has no caBundle, so that the API server trusts no operator: no pod is wired"
+        text = (
+            "the configuration has no caBundle, so the API server trusts no operator, and no pod "
+            "is wired"
+        )
         yield error(_CHECK, subject, text, f"{_ca_fix(metadata, service)}; {_ANEW}")
     if not service.name or service not in facts.ready:
         return
     ready = facts.ready[service]
     if ready is None:
-        yield error(_CHECK, subject, f"its Service {service} is not there", f"{_INSTALL}; {_ANEW}")
+        text = f"the Service {service} of the webhook does not exist, so no pod is wired"
+        yield error(_CHECK, subject, text, f"{_INSTALL}; {_ANEW}")
     elif not ready:
-        text = f"its Service {service} has no endpoint that is ready: no pod is wired"
+        text = f"the Service {service} of the webhook has no ready endpoint, so no pod is wired"
         yield error(_CHECK, subject, text, f"{_operators_at(service)}; {_ANEW}")
     elif not lacks_ca:
         text = f"{plural(ready, 'operator')} ready to wire pods"
@@ -99,15 +109,16 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
 def _ca_fix(metadata: Json, service: Name) -> str:
     if "cert-manager.io/inject-ca-from" in texts_at(metadata, "annotations"):
         source = f"kubectl -n {service.namespace} get certificates"
-        return f"cert-manager has to set it: does its cainjector run? {source}"
+        return f"check that cert-manager's cainjector runs, which sets the caBundle; read {source}"
     return (
-        "the operator that leads sets it within 20 s, where its role may patch that object: "
-        f"kubectl -n {service.namespace} logs -l app.kubernetes.io/component=operator --prefix"
+        "wait 20 s for the leading operator, which sets the caBundle if its role may patch this "
+        f"object; then read kubectl -n {service.namespace} logs -l "
+        "app.kubernetes.io/component=operator --prefix"
     )
 
 
 def _operators_at(service: Name) -> str:
     return (
-        f"kubectl -n {service.namespace} describe pods -l app.kubernetes.io/component=operator; "
-        f"helm -n {service.namespace} list"
+        f"read kubectl -n {service.namespace} describe pods -l "
+        f"app.kubernetes.io/component=operator, and helm -n {service.namespace} list"
     )

@@ -78,11 +78,11 @@ CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}
 @pytest.mark.parametrize(
     ("webhook", "ready", "text", "fix"),
     [
-        ({"ca": ""}, (True,), "no caBundle", "within 20 s"),
-        ({"ca": "", "annotations": CERT_MANAGER}, (True,), "no caBundle", "its cainjector run?"),
-        ({}, None, "its Service system/rosproxy-operator is not there", "helm upgrade"),
-        ({}, (False,), "no endpoint that is ready", "kubectl -n system describe pods"),
-        (None, (True,), "though operators serve it", "helm upgrade"),
+        ({"ca": ""}, (True,), "no caBundle", "wait 20 s"),
+        ({"ca": "", "annotations": CERT_MANAGER}, (True,), "no caBundle", "cainjector runs"),
+        ({}, None, "Service system/rosproxy-operator of the webhook does not", "helm upgrade"),
+        ({}, (False,), "no ready endpoint", "kubectl -n system describe pods"),
+        (None, (True,), "although operators serve the webhook", "helm upgrade"),
     ],
 )
 async def test_a_webhook_that_can_not_work(
@@ -108,7 +108,7 @@ async def test_a_webhook_that_nobody_serves(
         put_operator(server, *args)
     (finding,) = await about_webhook(api)
     assert finding.severity is severity
-    assert "no MutatingWebhookConfiguration has wire.rosproxy.io" in finding.text
+    assert "no MutatingWebhookConfiguration has the webhook wire.rosproxy.io" in finding.text
 
 
 def forbid(server: ApiServer, kind: str, group: str, place: str = "at the cluster scope") -> None:
@@ -126,8 +126,8 @@ async def test_rights_that_are_missing_are_named_and_the_rest_is_looked_at(
     assert "no caBundle" in found.text
     assert refused.severity is Severity.WARNING
     right = "list endpointslices.discovery.k8s.io -n system"
-    assert refused.text == f"not looked at: you lack the right to {right}"
-    assert refused.fix.startswith(f"kubectl auth can-i {right};")
+    assert refused.text == f"not checked: you lack the right to {right}"
+    assert refused.fix.startswith(f"check with kubectl auth can-i {right};")
     forbid(server, "mutatingwebhookconfigurations", "admissionregistration.k8s.io")
     (refused,) = await about_webhook(api)
     assert "list mutatingwebhookconfigurations.admissionregistration.k8s.io -A" in refused.text
@@ -138,7 +138,10 @@ async def test_without_the_right_to_pods_it_is_not_known_whether_the_webhook_is_
 ) -> None:
     forbid(server, "pods", "")
     found, refused = await about_webhook(api)
-    assert (found.severity, "unless it is switched off" in found.fix) == (Severity.WARNING, True)
+    assert (found.severity, "unless the webhook is switched off" in found.fix) == (
+        Severity.WARNING,
+        True,
+    )
     assert "list pods -A" in refused.text
 
 
@@ -189,19 +192,19 @@ def test_events_of_rosproxies_and_their_pods_the_newest_first() -> None:
         event({**rosproxy_obj(name="gone"), "kind": "RosProxy"}, "R", "m", 1, **OWN),
     ]
     assert found(events) == [
-        f"INFO pod {NAMESPACE}/talker: NotWired 30 s ago: has no (no condition says so now)",
+        f"INFO pod {NAMESPACE}/talker: NotWired 30 s ago: has no (no condition reports this now)",
         f"WARNING {name}: BackOff 1 min ago, 7 times: pulling",
-        f"INFO rosproxy {NAMESPACE}/arm: MasterUnreachable 2 min ago: refused (no condition says "
-        "so now)",
+        f"INFO rosproxy {NAMESPACE}/arm: MasterUnreachable 2 min ago: refused (no condition "
+        "reports this now)",
     ]
     assert "WARNING" not in "".join(found(events, ready=True))
-    assert f"INFO {name}: BackOff 1 min ago, 7 times: pulling (it is ready now)" in found(
+    assert f"INFO {name}: BackOff 1 min ago, 7 times: pulling (the pod is ready now)" in found(
         events, ready=True
     )
 
 
 def test_what_a_condition_says_is_not_told_twice() -> None:
-    text = "pod robots/talker: has no ROS_MASTER_URI; and more"
+    text = "pod robots/talker: has no ROS_MASTER_URI. And more"
     of = rosproxy_obj(status={"conditions": [{"type": "Degraded", "message": text}]})
     assert found([event(pod_obj(), "NotWired", "has no ROS_MASTER_URI", **OWN)], of) == []
 
@@ -257,7 +260,7 @@ def test_the_name_in_an_event_is_no_command() -> None:
         own=False,
     )
     (finding,) = event_findings([evil], ())
-    assert finding.fix == "kubectl -n 'robots;reboot' describe pod 'talker;reboot'"
+    assert finding.fix == "read kubectl -n 'robots;reboot' describe pod 'talker;reboot'"
 
 
 def test_only_running_proxies_have_a_doctor() -> None:
