@@ -159,8 +159,9 @@ class SelfCheck:
             return
         self._runtime.problems.solved(subject)
         for finding in wrong:
-            self._runtime.problems.add(subject, f"{finding.text}: {finding.fix}", holds=True)
+            text = f"{finding.text}. {finding.fix}"
+            self._runtime.problems.add(subject, text, holds=True)
             level = logging.ERROR if finding.severity is Severity.ERROR else logging.WARNING
-            log.log(level, "%s: %s; %s", subject, finding.text, finding.fix)
+            log.log(level, "%s: %s", subject, text)
         if previous and not wrong:
             log.info("%s: nothing is wrong any more", subject)

@@ -157,7 +157,8 @@ async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(sta
     (told,) = [
         problem for problem in await problems(process) if problem.startswith("published range: ")
     ]
-    assert "docker run -p" in told
+    assert ". publish the range: docker run -p" in told
+    assert told in process.text
     document = await status(process)
     assert document["range_probe"]["reached"] is False
     assert [p["holds"] for p in document["problems"] if p["subject"] == "published range"] == [True]
