@@ -161,7 +161,7 @@ class KubernetesController:
             await self._tasks.cancel()
             await self._proxy_sync.forget()
             self._applier.forget()
-            # ending a term solves none
+            # The end of a term solves no problem.
             self._problems = {}
             self._log = ProblemLog()
             self._state = ClusterState(former=self._state.former)
@@ -204,7 +204,8 @@ class KubernetesController:
         planned = self._planned(observed, scope)
         took = time.monotonic() - started
         self._metrics.look_time.observe(took)
-        log.debug("looked in %.3f s, %s", took, "at all" if scope is None else scope.namespaces)
+        text = "look ended in %.3f s: %s"
+        log.debug(text, took, "all namespaces" if scope is None else scope.namespaces)
         await self._carry_out(planned, observed, scope)
         self._report(observed)
         return self._due.again_in(time.monotonic(), self._sandbox.again_in())

@@ -103,7 +103,7 @@ class LeaderElection:
                 candidate = leadership.after_write(candidate, record, begun, clock())
             self._error = ""
         except ApiConflict:
-            log.debug("Lease %s: somebody else was faster", lease)
+            log.debug("Lease %s: another operator was faster", lease)
         except ApiError as error:
             if str(error) != self._error:
                 log.warning("Lease %s: %s", lease, error)
@@ -115,10 +115,10 @@ class LeaderElection:
             record = leadership.released_record(self._read(lease), self._candidate.name)
             if record is not None:
                 self._write(lease, record)
-                log.info("this operator leads no more: it has released the Lease %s", lease)
+                log.info("this operator no longer leads: Lease %s released", lease)
         except ApiError as error:
             log.warning(
-                "the Lease %s was not released: %s; another operator leads once it has run out",
+                "Lease %s not released: %s. Another operator leads when the Lease expires",
                 lease,
                 error,
             )
@@ -159,7 +159,7 @@ class LeaderElection:
         if term:
             log.info("this operator leads now (%s)", holder)
         else:
-            log.info("this operator stands by: %s leads", holder or "nobody")
+            log.info("this operator stands by: %s leads", holder or "no operator")
         changed()
 
 

@@ -11,14 +11,14 @@ from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 def read_namespace(text: str) -> str:
     """The name of a namespace. Raises ValueError."""
     if not is_label(text):
-        raise ValueError(f"{text!r} is not a namespace's name")
+        raise ValueError(f"{text!r} can't be the name of a namespace")
     return text
 
 
 def read_object_name(text: str) -> str:
     """The name of an object that has no namespace; empty for no text. Raises ValueError."""
     if text and not is_subdomain(text):
-        raise ValueError(f"{text!r} is not an object's name")
+        raise ValueError(f"{text!r} can't be the name of an object")
     return text
 
 
@@ -35,7 +35,7 @@ def read_name(text: str) -> Name | None:
 def read_glob(text: str) -> str:
     """A pattern with ``*`` and ``?``. Raises ValueError."""
     if not text or any(c.isspace() for c in text):
-        raise ValueError(f"{text!r} is no pattern such as http://192.0.2.*:11311")
+        raise ValueError(f"{text!r} is not a pattern such as http://192.0.2.*:11311")
     return text
 
 
@@ -50,7 +50,7 @@ def read_peers(text: str) -> tuple[Json, ...] | None:
     try:
         return tuple(msgspec.to_builtins(msgspec.json.decode(text, type=list[_Peer])))
     except msgspec.DecodeError as error:
-        raise ValueError(f"is no JSON list of NetworkPolicyPeers: {error}") from None
+        raise ValueError(f"not a JSON list of NetworkPolicyPeers: {error}") from None
 
 
 class _Requirement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):

@@ -75,7 +75,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     health = HealthServer(metrics.registry, controller.dead, unready, page)
     await health.start(settings.admin)
     log.info(
-        "rosproxy-operator %s: looking after %s at %s; health and metrics at http://%s",
+        "rosproxy-operator %s: manages %s at %s, health and metrics at http://%s",
         __version__,
         ", ".join(settings.namespaces) or "all namespaces",
         api.server,

@@ -122,7 +122,7 @@ class ClusterServing:
             pass  # by `restart`
         except Exception as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            log.warning("serving the webhook has ended (%s); starting it again", reason)
+            log.warning("webhook server ended, the operator starts it again: %s", reason)
         finally:
             self._running = None
 

@@ -243,7 +243,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     namespaces: Annotated[
         tuple[str, ...],
         Option(
-            "Namespace whose RosProxies the operator looks after. Repeatable.",
+            "Namespace whose RosProxies the operator manages. Repeatable.",
             option_values.NAMESPACE,
             name="--namespace",
             repeatable=True,
@@ -316,10 +316,12 @@ def _check_shared(options: Mapping[str, Any]) -> None:
     if options["lease"] is None:
         return
     if options["key_secret"] is None:
-        raise SettingError("--key-secret", "is needed with --lease: all operators share the key")
+        raise SettingError(
+            "--key-secret", "is needed with --lease, since all operators share the key"
+        )
     own = options["webhook_bind"] and not options["webhook_cert_dir"]
     if own and options["webhook_secret"] is None:
-        text = "is needed with --lease: all operators serve the same certificate"
+        text = "is needed with --lease, since all operators serve the same certificate"
         raise SettingError("--webhook-secret", text)
 
 
@@ -328,12 +330,13 @@ def _make_webhook(options: Mapping[str, Any]) -> WebhookSettings:
     if settings.directory and (settings.secret or settings.configuration):
         raise SettingError(
             "--webhook-cert-dir",
-            "the certificate comes from there: leave out --webhook-secret and "
+            "the certificate comes from this directory. Remove --webhook-secret and "
             "--webhook-configuration",
         )
     if not settings.directory and settings.service is None:
         raise SettingError(
             "--webhook-service",
-            "NAMESPACE/NAME is needed to make the webhook's certificate (or --webhook-cert-dir)",
+            "is needed to create the webhook's certificate. Give NAMESPACE/NAME, or "
+            "--webhook-cert-dir",
         )
     return settings

@@ -157,7 +157,7 @@ class Watch:
                 *lines, partial = (partial + chunk).split(b"\n")
                 yield [_EVENT.decode(line) for line in lines if line]
         except (HTTPError, OSError, msgspec.DecodeError, UnicodeDecodeError, ValueError) as error:
-            raise ApiLost(f"a watch was lost: {' '.join(str(error).split())[:200]}") from error
+            raise ApiLost(f"watch lost: {' '.join(str(error).split())[:200]}") from error
         finally:
             self._response.close()
 
@@ -345,7 +345,9 @@ class Api:
             raise self._no_server(path) from None
 
     def _no_server(self, path: str = "") -> ApiUnavailable:
-        return ApiUnavailable(f"what answers at {self.server}{path} is no API server")
+        return ApiUnavailable(
+            f"the program that answers at {self.server}{path} is not an API server"
+        )
 
     def _data(
         self,
@@ -469,7 +471,7 @@ def refusal(status: int, reason: str, body: bytes) -> ApiError:
     if status == 422 and message == _TEST_FAILED:
         return ApiConflict("the object has changed meanwhile")
     if status == 401:
-        message = f"the API server does not know the operator's token or certificate ({message})"
+        message = f"the API server does not accept the operator's token or certificate ({message})"
     elif kind is ApiUnavailable:
         message = f"the API server answers HTTP {status}: {message}"
     return kind(message)

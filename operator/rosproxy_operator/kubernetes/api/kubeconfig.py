@@ -11,7 +11,7 @@ CONNECTIONS = 16
 
 
 class NoCluster(Exception):
-    """No cluster is known here; the message says what to do."""
+    """No cluster is configured; the message has the fix."""
 
 
 def configuration() -> Any:
@@ -24,8 +24,8 @@ def configuration() -> Any:
             load_kube_config(client_configuration=settings)  # type: ignore[no-untyped-call]
     except (ConfigException, OSError) as error:
         raise NoCluster(
-            f"no cluster is known here ({error}): run it in a pod with a service account, or name "
-            "a kubeconfig (KUBECONFIG)"
+            f"no Kubernetes cluster is configured ({error}). Run this program in a pod with a "
+            "service account, or name a kubeconfig file in KUBECONFIG"
         ) from error
     # Callers try again themselves, and are to know of an error at once.
     settings.retries = False

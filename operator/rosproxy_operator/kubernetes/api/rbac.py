@@ -1,4 +1,4 @@
-"""What the API server says of a right that is missing, in words that help whoever grants it."""
+"""Reads the missing right from a message of the API server, for users that grant the right."""
 
 import re
 
@@ -22,7 +22,7 @@ def missing_rule(message: str) -> str:
 
 
 def missing_right(message: str) -> str:
-    """The right that whoever asks lacks, as ``kubectl auth can-i`` takes it; else empty."""
+    """The right that the caller lacks, as ``kubectl auth can-i`` takes it; else empty."""
     match = _RBAC.search(message)
     if match is None:
         return ""

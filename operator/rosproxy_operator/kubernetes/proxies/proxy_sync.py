@@ -257,7 +257,7 @@ class ProxyPoller:
             self._refusal = short(str(error))
             return False
         except ProxyError as error:
-            log.debug("%s was not told its policy: %s", self.session.admin, error)
+            log.debug("policy not sent: proxy %s: %s", self.session.admin, error)
             return False
         self._recheck = self._recheck or bool(self._refusal)  # it has another report now
         self._refusal = ""
@@ -278,7 +278,8 @@ class ProxyPoller:
                     return
                 await self.session.tell_callers(callers)
         except ProxyError as error:
-            log.debug("%s was not told that %s may use it: %s", self.session.admin, callers, error)
+            text = "allowed callers not sent: proxy %s, %s: %s"
+            log.debug(text, self.session.admin, callers, error)
             return
         self._callers_told_at = time.monotonic()
 
@@ -294,10 +295,10 @@ class ProxyPoller:
                 answer = await self.session.tell_containers({"gone": gone})
         except ProxyError as error:
             # It may just be without its master; it is sent again with the next poll.
-            log.debug("%s was not told that %s are gone: %s", self.session.admin, gone, error)
+            log.debug("gone addresses not sent: proxy %s, %s: %s", self.session.admin, gone, error)
             return False
         self._gone -= set(gone)
-        log.debug("%s was told that %s are gone: %s", self.session.admin, gone, answer)
+        log.debug("gone addresses sent: proxy %s, %s: %s", self.session.admin, gone, answer)
         return True
 
     def _has_waited(self, seconds: float) -> bool:

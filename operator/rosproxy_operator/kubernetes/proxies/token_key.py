@@ -63,13 +63,13 @@ class TokenKey:
         return key
 
     def _put(self, secret: Name, key: bytes, manifest: Json) -> None:
-        """Write a key to the Secret; if somebody else was faster theirs counts. Raises ApiError."""
+        """Write a key to the Secret; a key of a faster operator counts. Raises ApiError."""
         entries = {ENTRY: base64.b64encode(key).decode()}
         try:
             self._api.fill_secret(secret, manifest, entries)
         except (ApiInvalid, ApiConflict) as error:
-            raise ApiUnavailable(f"somebody else writes Secret {secret}: {error}") from None
-        log.info("made a key for the proxies' tokens in Secret %s", secret)
+            raise ApiUnavailable(f"another program has written Secret {secret}: {error}") from None
+        log.info("key of the proxies' tokens created: Secret %s", secret)
 
     def _kept_key(self) -> bytes:
         """The key that was known last, else one that lasts as long as this process."""
@@ -78,11 +78,11 @@ class TokenKey:
 
     def _complain(self, error: ApiError) -> None:
         text = (
-            f"Secret {self._secret}: {error}; the key of the proxies' tokens is kept in memory, "
-            "and proxies are made anew when the operator starts again"
+            f"Secret {self._secret}: {error}. The key of the proxies' tokens is in memory only, and"
+            " the operator replaces the proxies at its next start"
         )
         if isinstance(error, ApiNotFound):
-            text += ": create an empty Secret of this name (the chart does)"
+            text += ". Create an empty Secret of this name (the chart does so)"
         self.problems = (Problem("proxies' tokens", text),)
 
 

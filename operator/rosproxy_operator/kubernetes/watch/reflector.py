@@ -121,14 +121,15 @@ class Reflector:
                 if not isinstance(error, ApiLost) or failures > 1:
                     self._pause(failures)
             except Exception as error:  # a mistake of ours must not blind the operator
-                log.exception("watching %s failed; trying again", self._kind)
+                text = "watch failed by an internal error, the operator tries again: %s"
+                log.exception(text, self._kind)
                 self._version = ""
                 failures = failures + 1
-                self._complain(ApiUnavailable(f"watching {self._kind} failed: {error!r}"))
+                self._complain(ApiUnavailable(f"the watch of {self._kind} failed: {error!r}"))
                 self._pause(failures)
 
     def _complain(self, error: ApiError) -> None:
-        log.debug("watching %s %s: %s", self._kind, self._place, error)
+        log.debug("watch ended: %s %s: %s", self._kind, self._place, error)
         self._lost()
         if not isinstance(error, ApiExpired | ApiLost):
             self._tell(self._listener.failed, error)
@@ -174,7 +175,7 @@ class Reflector:
             self._version = _version(events) or self._version
             heard = True
         if not heard and time.monotonic() - began < SHORT:
-            raise ApiLost("a watch has ended at once")
+            raise ApiLost("the watch ended at once")
 
     def _changes(self, events: Iterable[Event]) -> dict[str, Record | None]:
         """The objects that have changed, by their keys. Raises ApiError for an ERROR event."""
@@ -204,7 +205,7 @@ def _version(events: Iterable[Event]) -> str:
 
 def _error(status: Json) -> ApiError:
     """The error with which a watch has ended."""
-    text = text_at(status, "message") or "a watch has ended"
+    text = text_at(status, "message") or "the watch ended"
     return ApiExpired(text) if status.get("code") == 410 else ApiLost(text)
 
 

@@ -1,6 +1,7 @@
 """The admission webhook's certificate, made here.
 
-The CA signs one certificate and its key is then forgotten: nobody can ever sign another with it.
+The CA signs one certificate, and the operator then drops the key of the CA: no second certificate
+can be signed.
 """
 
 import base64
@@ -34,7 +35,7 @@ class InvalidCertificate(Exception):
 class KeyPair(msgspec.Struct, frozen=True):
     """A certificate with its key, and the CAs by which it is trusted, all as PEM.
 
-    ``ca`` is empty where that is somebody else's affair.
+    ``ca`` is empty if another program manages the CA.
     """
 
     certificate: bytes
@@ -107,9 +108,9 @@ def read(data: Mapping[str, str]) -> KeyPair:
     try:
         decoded = [base64.b64decode(data[name], validate=True) for name in names]
     except KeyError as error:
-        raise InvalidCertificate(f"it has no {error.args[0]}") from None
+        raise InvalidCertificate(f"no entry {error.args[0]}") from None
     except ValueError:
-        raise InvalidCertificate("it is not valid base64") from None
+        raise InvalidCertificate("not valid base64") from None
     return checked(KeyPair(*decoded))
 
 

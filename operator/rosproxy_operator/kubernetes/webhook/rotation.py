@@ -150,7 +150,7 @@ class SelfSigned:
         if self._unsaved is None or not self._is_usable(self._unsaved):
             trusted = previous.ca if previous else b""
             self._unsaved = certificates.make(self._names, self._now(), trusted)
-            log.info("webhook: made a certificate that is valid until %s", self._unsaved.expires)
+            log.info("webhook certificate created: valid until %s", self._unsaved.expires)
         return self._unsaved
 
     def _is_usable(self, pair: KeyPair) -> bool:
@@ -158,12 +158,12 @@ class SelfSigned:
         return not pair.due(self._now()) and pair.names() >= set(self._names)
 
     def _put(self, secret: Name, pair: KeyPair, manifest: Json) -> None:
-        """Write a pair into the Secret. If somebody else was faster, theirs counts."""
+        """Write a pair into the Secret. If another operator was faster, its pair counts."""
         try:
             self._api.fill_secret(secret, manifest, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
             self._unsaved = None
-            raise ApiUnavailable(f"somebody else writes Secret {secret}: {error}") from None
+            raise ApiUnavailable(f"another program has written Secret {secret}: {error}") from None
         except NotLeading:
             raise
         except ApiError as error:
@@ -171,9 +171,9 @@ class SelfSigned:
 
     def _complain(self, error: ApiError) -> None:
         """Report that the Secret can't be used: the certificate is then in this process alone."""
-        text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
+        text = f"Secret {self._secret}: {error}. The certificate is in memory only"
         if isinstance(error, ApiNotFound):
-            text += "; create an empty Secret of this name (the chart does)"
+            text += ". Create an empty Secret of this name (the chart does so)"
         self.problems.append(Problem(_SUBJECT, text))
 
     def _read(self, secret: Json) -> KeyPair | None:
@@ -184,7 +184,7 @@ class SelfSigned:
             return certificates.read(data)
         except InvalidCertificate as error:
             log.warning(
-                "webhook: Secret %s holds no usable certificate: %s; making another one",
+                "webhook certificate replaced: Secret %s has no usable certificate: %s",
                 self._secret,
                 error,
             )
@@ -201,11 +201,12 @@ class SelfSigned:
                 return False
             if operations:
                 self._api.patch(WEBHOOKS, name, operations)
-                log.info("webhook: its CA is now in %s", self._configuration)
+                text = "webhook CA written: MutatingWebhookConfiguration %s"
+                log.info(text, self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
             if isinstance(error, ApiNotFound):
-                text += "; without it no pod is wired: install it anew (the chart has it)"
+                text += ". Without this object no pod is wired. Install the chart again"
             if not isinstance(error, ApiUnavailable):
                 self.problems.append(Problem(_SUBJECT, text))
             return False
@@ -256,14 +257,17 @@ class CertificateRotation:
         except NotMadeYet:
             not_made_yet = True
         except (ApiError, InvalidCertificate) as error:
-            problems = [Problem(_SUBJECT, f"no certificate: {error}")]
+            problems = [
+                Problem(_SUBJECT, f"the operator could not read or renew the certificate: {error}")
+            ]
         except Exception as error:  # a mistake of ours must not end the certificate
-            log.exception("checking the webhook's certificate failed; trying again")
+            text = "webhook certificate not checked by an internal error, the operator tries again"
+            log.exception(text)
             problems = [Problem(_SUBJECT, f"the operator failed: {error!r}")]
         else:
             problems = [*self._source.problems]
             if pair != self.pair:
-                log.info("webhook: serving a certificate that is valid until %s", pair.expires)
+                log.info("webhook certificate served: valid until %s", pair.expires)
             self.pair = pair
             self._metrics.certificate_expiry.set(pair.expires.timestamp())
         self.not_made_yet = not_made_yet

@@ -64,7 +64,7 @@ class WebhookServer:
         """
         if self._serving or self._rotation.not_made_yet:
             return None
-        return "the webhook is not served yet"
+        return "the operator does not serve the webhook yet"
 
     def drain(self) -> None:
         """Close each connection after its next response: serving ends soon."""
@@ -93,7 +93,7 @@ class WebhookServer:
         try:
             bind = self._bind
             listener.start(bind)
-            log.info("wiring pods at https://%s", bind)
+            log.info("webhook started: https://%s", bind)
             self._serving = True
             # For kopf's own webhook configuration, of which there is none (`admission.managed`).
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
@@ -116,7 +116,9 @@ class WebhookServer:
                 try:
                     certificates.load(context, pair)
                 except ssl.SSLError:
-                    log.exception("the new certificate can't be served; the one before stays")
+                    log.exception(
+                        "webhook certificate not replaced: the new certificate is unusable"
+                    )
                 served = pair  # also if it can't be: it would fail, and be logged, at each look
 
 
@@ -154,11 +156,11 @@ async def _answer(fn: kopf.WebhookFn, body: bytes, webhook: str) -> web.Response
         review = json.loads(body)
         uid = review["request"]["uid"]
     except (ValueError, TypeError, KeyError, RecursionError):
-        return web.Response(status=400, text="this is no AdmissionReview\n")
+        return web.Response(status=400, text="the request is not an AdmissionReview\n")
     try:
         return web.json_response(await fn(review, webhook=webhook))
     except Exception as error:  # the pod passes as it is
-        log.warning("a pod at admission: %r", error)
+        log.warning("pod not wired: the operator failed: %r", error)
         warning = f"{NOT_WIRED}the operator failed: {error!r}"[:200]
         response = {"uid": uid, "allowed": True, "warnings": [warning]}
         return web.json_response(

@@ -145,7 +145,7 @@ async def test_an_api_server_that_is_away_and_back(
 
 async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> None:
     server.refuse("GET", "nodes", 200, "hello")
-    with pytest.raises(ApiError, match="is no API server") as caught:
+    with pytest.raises(ApiError, match="is not an API server") as caught:
         await in_thread(api.page, "nodes", "")
     assert type(caught.value) is ApiUnavailable
 
@@ -162,7 +162,7 @@ async def test_what_does_not_answer_in_json_is_away(
     def listed() -> None:
         list(api.page("nodes", "").items)
 
-    with pytest.raises(ApiUnavailable, match="/api/v1/nodes is no API server"):
+    with pytest.raises(ApiUnavailable, match="/api/v1/nodes is not an API server"):
         await in_thread(listed)
 
 
@@ -202,7 +202,7 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
     monkeypatch.setattr(
         "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(tmp_path / "none")
     )
-    with pytest.raises(ApiError, match=r"no cluster is known here .* name a kubeconfig"):
+    with pytest.raises(ApiError, match=r"no Kubernetes cluster is configured .* name a kubeconfig"):
         Api()
 
 
@@ -222,7 +222,7 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
             ApiNotFound,
             "terminated",
         ),
-        (401, "Unauthorized", ApiUnavailable, "does not know the operator's token"),
+        (401, "Unauthorized", ApiUnavailable, "does not accept the operator's token"),
         (404, 'pods "p" not found', ApiNotFound, 'pods "p" not found'),
         (409, "exists", ApiConflict, "exists"),
         (422, "spec.clusterIP: Invalid value", ApiInvalid, "spec.clusterIP"),

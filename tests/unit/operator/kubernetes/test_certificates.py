@@ -154,7 +154,7 @@ def test_a_secret_holds_it() -> None:
 def test_what_is_no_pair_is_unfit(change: dict[str, str]) -> None:
     with pytest.raises(InvalidCertificate):
         certificates.read({**certificates.make(NAMES, NOW).secret(), **change})
-    with pytest.raises(InvalidCertificate, match=r"it has no tls.crt"):
+    with pytest.raises(InvalidCertificate, match=r"no entry tls.crt"):
         certificates.read({})
 
 
@@ -188,7 +188,7 @@ async def test_one_that_cannot_be_written_is_kept(server: ApiServer, api: Api) -
         authorities = {c.subject for c in x509.load_pem_x509_certificates(bundle(server))}
         assert x509.load_pem_x509_certificate(served[-1].certificate).issuer in authorities
         assert len(authorities) == 2
-        assert "kept in memory" in self_signed.problems[0].text
+        assert "The certificate is in memory only" in self_signed.problems[0].text
         clock.forward(seconds=20)
     assert served[0] == old
     assert served[1] != old
@@ -272,7 +272,7 @@ async def test_without_the_secret_it_is_kept_in_memory(
     pair = await in_thread(self_signed.refresh)
     assert await in_thread(self_signed.refresh) == pair
     assert bundle(server) == pair.ca
-    assert "the certificate is kept in memory meanwhile" in self_signed.problems[0].text
+    assert "The certificate is in memory only" in self_signed.problems[0].text
 
 
 async def test_without_the_api_server_nothing_is_made(server: ApiServer, api: Api) -> None:
@@ -308,7 +308,7 @@ async def test_who_writes_the_secret_first_has_the_right_one(server: ApiServer, 
     put(server)
     server.refuse("PATCH", "secrets", 409, "the object has been modified")
     self_signed = source(api, Clock())
-    with pytest.raises(ApiError, match="somebody else writes Secret ns/wh"):
+    with pytest.raises(ApiError, match="another program has written Secret ns/wh"):
         await in_thread(self_signed.refresh)
     theirs = certificates.make(NAMES, NOW)
     put(server, theirs.secret())

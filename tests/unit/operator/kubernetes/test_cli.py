@@ -107,7 +107,7 @@ def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--namespace=A b"], "--namespace: 'A b' is not a namespace's name"),
+        (["--namespace=A b"], "--namespace: 'A b' can't be the name of a namespace"),
         (["--proxy-image="], "--proxy-image: '' is not the name of an image"),
         (["--node-port-range=5"], "--node-port-range: '5' is not a range"),
         (["--ephemeral-range=9-1"], "--ephemeral-range: '9-1' must rise"),
@@ -115,21 +115,24 @@ def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
         (["--admin-bind=x"], "--admin-bind: 'x' is not of the form 0.0.0.0:11313"),
         (["--liveness-bind=x"], "--liveness-bind: 'x' is not of the form 0.0.0.0:8080"),
         (["--webhook-bind=x"], "--webhook-bind: 'x' is not of the form 0.0.0.0:9443"),
-        (["--allow-master= "], "--allow-master: ' ' is no pattern such as http://192.0.2.*:11311"),
+        (
+            ["--allow-master= "],
+            "--allow-master: ' ' is not a pattern such as http://192.0.2.*:11311",
+        ),
         (["--max-ports=501"], "--max-ports: "),
         (["--allow-data-plane=Kernel"], "--allow-data-plane: "),
-        (["--admin-from=all"], "--admin-from: is no JSON list of NetworkPolicyPeers"),
-        (['--admin-from=[{"pods":{}}]'], "--admin-from: is no JSON list of NetworkPolicyPeers"),
+        (["--admin-from=all"], "--admin-from: not a JSON list of NetworkPolicyPeers"),
+        (['--admin-from=[{"pods":{}}]'], "--admin-from: not a JSON list of NetworkPolicyPeers"),
         (["--key-secret=key"], "--key-secret: 'key' is not of the form NAMESPACE/NAME"),
-        (HOOK, "--webhook-service: NAMESPACE/NAME is needed"),
+        (HOOK, "--webhook-service: is needed to create"),
         ([*HOOK, "--webhook-service=wh"], "--webhook-service: 'wh' is not of the form NAMESPACE/"),
         (
             [*HOOK, "--webhook-service=ns/wh", "--webhook-configuration=A/b"],
-            "--webhook-configuration: 'A/b' is not an object's name",
+            "--webhook-configuration: 'A/b' can't be the name of an object",
         ),
         (
             [*HOOK, "--webhook-cert-dir=/x", "--webhook-secret=ns/wh"],
-            "--webhook-cert-dir: the certificate comes from there",
+            "--webhook-cert-dir: the certificate comes from this directory",
         ),
     ],
 )
@@ -154,7 +157,7 @@ def test_no_cluster_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: objec
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
     result = run()
     assert result.exit_code == 1
-    assert result.stderr.startswith("rosproxy-operator: no cluster is known here")
+    assert result.stderr.startswith("rosproxy-operator: no Kubernetes cluster is configured")
     assert result.stderr.count("\n") == 1
 
 

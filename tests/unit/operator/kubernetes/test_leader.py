@@ -121,7 +121,7 @@ async def test_one_that_can_not_renew_ceases(
     server.refuse("PATCH", "leases", 403, "patch is not for you")
     now[0] += leadership.DEADLINE
     assert election.term() == 0
-    await until(lambda: "stands by: nobody leads" in caplog.text)
+    await until(lambda: "stands by: no operator leads" in caplog.text)
     assert caplog.text.count("patch is not for you") == 1
     server.refusals.clear()
     await until(election.leads)
