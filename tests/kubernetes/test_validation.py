@@ -15,8 +15,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "empty master": ({"master": {}}, "exactly one of uri"),
     "both": ({"master": {**GOOD, "service": {"name": "x"}}}, "exactly one of uri"),
     "https": ({"master": {"uri": "https://robot:11311"}}, "http://host:11311"),
-    "localhost": ({"master": {"uri": "http://localhost:11311"}}, "the machine itself"),
-    "loopback": ({"master": {"uri": "http://127.0.0.1:11311"}}, "the machine itself"),
+    "localhost": ({"master": {"uri": "http://localhost:11311"}}, "a loopback address"),
+    "loopback": ({"master": {"uri": "http://127.0.0.1:11311"}}, "a loopback address"),
     "address": ({"master": {**GOOD, "address": "robot"}}, "IP address"),
     "no ports": ({"master": GOOD, "ports": 0}, "ports"),
     "many ports": ({"master": GOOD, "ports": 501}, "ports"),
@@ -49,7 +49,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
             "master": GOOD,
             "policy": {"rules": [{**RULE, "names": ["/a"] * 17, "nodes": ["/b"]}] * 30},
         },
-        "500 names at most",
+        "at most 500 names",
     ),
     "mode": ({"master": GOOD, "policy": {"mode": "Tell"}}, "mode"),
     "publish": ({"master": {**GOOD, "publish": 11302}}, "publish"),
@@ -59,7 +59,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "ROS 1 with a domain": ({"master": GOOD, "domain": 3}, "are for ROS 2"),
     "no domain": ({"ros": 2, "domain": 233}, "domain"),
     "no peer": ({"ros": 2, "peers": ["a b"]}, "peers[0]"),
-    "few ports for ROS 2": ({"ros": 2, "ports": 4, "multicast": True}, "too few for ROS 2"),
+    "few ports for ROS 2": ({"ros": 2, "ports": 4, "multicast": True}, "too low for ROS 2"),
 }
 
 

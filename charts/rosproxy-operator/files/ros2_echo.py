@@ -7,7 +7,7 @@ import rclpy
 from std_msgs.msg import String
 
 if not os.environ.get("ROS_STATIC_PEERS"):
-    sys.exit("this pod was not wired at its admission: the operator's webhook did not answer")
+    sys.exit("this pod was not wired at admission: the operator's webhook did not answer")
 print("the proxy is", os.environ["ROS_STATIC_PEERS"], flush=True)
 rclpy.init()
 node = rclpy.create_node(os.environ["NODE_NAME"])

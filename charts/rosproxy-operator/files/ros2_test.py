@@ -43,7 +43,7 @@ def wait_for_answer():
 
 
 if not os.environ.get("ROS_STATIC_PEERS"):
-    fail("this pod was not wired at its admission", "Does the operator's webhook answer?")
+    fail("this pod was not wired at admission", "Check that the operator's webhook answers.")
 say("on node %s, the proxy is %s" % (ON, os.environ["ROS_STATIC_PEERS"]))
 rclpy.init()
 node = rclpy.create_node("rosproxy_test")
@@ -51,9 +51,9 @@ there = wait_for_answer()
 if there is None:
     fail(
         "no message comes to the node %s and back" % ECHO,
-        "While the test runs, look at: kubectl -n %s describe rosproxy %s; is the operator ready? "
-        "Do nodes reach each other's hostPorts by UDP? A firewall or a network policy may be in "
-        "the way." % (NAMESPACE, ROSPROXY),
+        "While the test runs, read kubectl -n %s describe rosproxy %s. Check that the nodes reach "
+        "each other's hostPorts by UDP: a firewall or a NetworkPolicy may block the datagrams."
+        % (NAMESPACE, ROSPROXY),
     )
 if there == ON:
     say("both pods are on node %s, so no port of a host was used" % ON)

@@ -57,15 +57,15 @@ master = rosgraph.Master("/rosproxy_test")
 wait_for(
     master.getPid,
     "the master at %s does not answer" % os.environ["ROS_MASTER_URI"],
-    "Look at the test's pods: kubectl -n %s get pods" % NAMESPACE,
+    "Read kubectl -n %s get pods: the pods of the test must run." % NAMESPACE,
 )
 say("the master answers at " + os.environ["ROS_MASTER_URI"])
 
 address = wait_for(
     proxied_address,
     "no node %s is registered through a proxy" % ECHO,
-    "While the test runs, look at: kubectl -n %s describe rosproxy %s; is the operator ready? "
-    "A pod made while it was not is not wired." % (NAMESPACE, ROSPROXY),
+    "While the test runs, read kubectl -n %s describe rosproxy %s. Check that the operator was "
+    "ready when the pod was created: otherwise the pod is not wired." % (NAMESPACE, ROSPROXY),
 )
 say("the node in the labelled pod is registered as " + address)
 
@@ -77,7 +77,7 @@ questions = rospy.Publisher(ECHO + "/ping", String, queue_size=10)
 wait_for(
     hear_answer,
     "no message comes through %s" % address,
-    "Can pods connect to hostPorts of their nodes? A firewall or a network policy may be in "
-    "the way.",
+    "Check that pods can connect to hostPorts of their nodes. A firewall or a NetworkPolicy may "
+    "block the connection.",
 )
 say("PASSED: a message went to the pod and back, through " + address)
