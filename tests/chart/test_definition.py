@@ -69,6 +69,14 @@ def test_bounded(path: str) -> None:
     assert any(bound in field for bound in bounds), f"{path} needs one of {bounds}"
 
 
+@pytest.mark.parametrize("path", SPEC)
+def test_a_number_or_text_is_structural(path: str) -> None:
+    """The API server refuses a definition that has ``type`` and more in ``anyOf``."""
+    alternatives = SPEC[path].get("anyOf", [])
+    types = [{"type": "integer"}, {"type": "string"}]
+    assert alternatives in ([], types) or all("type" not in each for each in alternatives)
+
+
 def test_columns_show_fields() -> None:
     for column in VERSION["additionalPrinterColumns"]:
         path = column["jsonPath"].partition("[")[0]
