@@ -116,7 +116,7 @@ def test_arguments(combination: str) -> None:
     ports = {port["name"]: port["containerPort"] for port in pod["containers"][0]["ports"]}
     assert settings.admin.port == ports["metrics"]
     assert settings.liveness.port == ports["liveness"]
-    assert settings.resync == (10 if "extraArgs" in values else 30)
+    assert settings.resync == (10 if "extraArgs" in values else 300)
     check_bounds(settings, values, pod)
     check_webhook(settings.webhook, ports, list(rendered(combination)))
 

@@ -271,7 +271,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     ] = None
     resync: Annotated[
         float, Option("Longest time between two looks at the cluster.", time(1.0))
-    ] = 30.0
+    ] = 300.0
     webhook: WebhookSettings | None = None
     admin: Annotated[
         HostPort,

@@ -21,7 +21,7 @@ POLL_INTERVAL = 0.5
 """Seconds between two looks at the state, at least."""
 SHARE = 0.01
 """Share of a processor that polling may cost for each caller that waits."""
-LONGEST = 300.0
+LONGEST = 1800.0
 """Seconds that a caller may wait."""
 MOST_WAITING = 8
 """Callers that may wait at the same time: operators, one after the other."""

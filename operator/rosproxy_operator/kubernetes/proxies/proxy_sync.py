@@ -38,8 +38,11 @@ LEAST_INTERVAL = 0.5
 """Seconds between two changes that are taken: a hostile proxy may report them for ever."""
 EVERY_FORMER = 15.0
 """The same for one that does not report changes (``/status/changes``)."""
-WAIT = 300.0
-"""Longest wait for a change, in seconds, until a proxy answers in any case; half of it at least."""
+WAIT = 1800.0
+"""Longest wait for a change, in seconds, until a proxy answers in any case.
+
+Keep-alive probes of TCP find a proxy that is cut off (`common.proxy_client`).
+"""
 STARTING = 10.0
 """Seconds for which a proxy may be silent after its pod has an address: it is just starting."""
 SILENT = 2
@@ -391,7 +394,7 @@ class ClusterProxySync:
 
 def _random_wait() -> float:
     """Seconds to wait for a change: not the same for all pollers, which begin together."""
-    return WAIT * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
+    return WAIT * random.random()  # noqa: S311 - no secret
 
 
 def address_of(proxy: ProxyPod) -> HostPort:
