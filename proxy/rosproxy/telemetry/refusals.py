@@ -28,8 +28,13 @@ OF_STARTS = frozenset(
 )
 """Reasons that nodes of ROS 2 give at each start, for a second or two: a datagram of a participant
 overtakes the announcement of that participant."""
+RATE = "rate"
+"""The reason that a source sends more discovery of ROS 2 than the proxy reads. Fast DDS sends a
+thousand heartbeats a second while participants meet, and a proxy without a free processor reads
+them a little later; participants repeat what is lost."""
 PATIENCE = 10.0
-"""Seconds that refusals for a reason of `OF_STARTS` go on before the log and the status tell it."""
+"""Seconds that refusals for a reason of `OF_STARTS`, or for `RATE`, go on before the log and the
+status tell it."""
 PAUSE = 15.0
 """Seconds without a refusal after which these begin anew. Cyclone DDS announces itself each 8 s."""
 LINES = 20
@@ -95,7 +100,7 @@ class Refusals:
         key = reason, source
         span = self._spans.setdefault(reason, _Span(now, now))
         span.extend(source, now)
-        if reason in OF_STARTS and span.length < PATIENCE:
+        if (reason in OF_STARTS or reason == RATE) and span.length < PATIENCE:
             return
         if now - self._logged_at.get(key, -QUIET) < QUIET:
             return

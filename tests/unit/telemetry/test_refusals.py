@@ -13,6 +13,7 @@ from rosproxy.telemetry.refusals import (
     PATIENCE,
     PAUSE,
     QUIET,
+    RATE,
     Refusals,
 )
 
@@ -51,11 +52,11 @@ def test_forged_sources_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) ->
     clock = [0.0]
     refusals = Refusals(Metrics(), Problems(), lambda: clock[0])
     for number in range(1000):
-        refusals.note("rate", str(number), "x")
+        refusals.note("long_body", str(number), "x")
     refusals.note("malformed", "10.0.0.5", "another reason")
     assert len(caplog.records) == LINES + 1
     clock[0] = QUIET
-    refusals.note("rate", "10.0.0.5", "x")
+    refusals.note("long_body", "10.0.0.5", "x")
     assert len(caplog.records) == LINES + 2
 
 
@@ -63,20 +64,20 @@ def test_a_refusal_that_is_over_is_not_shown() -> None:
     problems = Problems()
     clock = [0.0]
     refusals = Refusals(Metrics(), problems, lambda: clock[0])
-    refusals.note("rate", "10.0.0.5", "x")
+    refusals.note("long_body", "10.0.0.5", "x")
     clock[0] = QUIET / 2
-    refusals.note("rate", "10.0.0.5", "x")
+    refusals.note("long_body", "10.0.0.5", "x")
     clock[0] = OVER_AFTER
     refusals.end_old()
     assert problems.all(), "the last one was a while later"
     clock[0] = QUIET / 2 + OVER_AFTER
     refusals.end_old()
     assert not problems.all()
-    refusals.note("rate", "10.0.0.5", "x")
+    refusals.note("long_body", "10.0.0.5", "x")
     assert problems.all(), "it is told when it comes again"
 
 
-@pytest.mark.parametrize("reason", sorted(OF_STARTS))
+@pytest.mark.parametrize("reason", [*sorted(OF_STARTS), RATE])
 def test_what_a_start_brings_for_a_moment_is_not_told(
     reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -116,6 +117,17 @@ def test_a_node_that_starts_again_and_again_is_not_told(reason: str) -> None:
         refusals.note(reason, "10.0.0.5", "x")
         refusals.settle("10.0.0.5")
     assert not problems.all()
+
+
+def test_a_source_that_floods_is_told_though_it_is_met_again_and_again() -> None:
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for started in range(12):
+        clock[0] = float(started)
+        refusals.note(RATE, "10.0.0.5", "x")
+        refusals.settle("10.0.0.5")
+    assert problems.all()
 
 
 def test_another_source_that_settles_hides_nothing() -> None:
