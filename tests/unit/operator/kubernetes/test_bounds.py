@@ -13,7 +13,7 @@ from rosproxy_operator.kubernetes.planner.access.bounds import (
     within_bounds,
 )
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
-from rosproxy_operator.kubernetes.resources.model import MasterSpec, Name
+from rosproxy_operator.kubernetes.resources.model import MasterSpec, Name, Ros2Spec
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
@@ -85,7 +85,13 @@ def condition(rosproxy_status: Mapping[str, Any], kind: str = "Ready") -> tuple[
          "allow.images)"),
         (bounded(images=("registry.example/ros/*",)), {"image": "registry.example/ros/a:1"}, ""),
         (bounded(images=("registry.example/ros/*",)), {"image": "registry.example/b:1"},
-         "allow.images"),
+         "Remove the field, or choose an image that fits 'registry.example/ros/*', or ask"),
+        (bounded(masters=("http://a:1", "http://b:*")), {}, "spec.master.uri: the operator does "
+         "not allow 'http://robot:11311/'. Choose a master that fits 'http://a:1' or 'http://b:*', "
+         "or ask the operator's administrator"),
+        (bounded(masters=tuple(f"http://m{n}:1" for n in range(9))), {}, "or 'http://m4:1', or"),
+        (bounded(peers=("192.0.2.*",)), {"ros2": Ros2Spec(peers=("198.51.100.1",))}, "spec.peers: "
+         "the operator does not allow '198.51.100.1'. Choose a peer that fits '192.0.2.*', or"),
     ],
 )  # fmt: skip
 def test_what_the_administrator_allows(

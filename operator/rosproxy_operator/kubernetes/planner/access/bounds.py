@@ -8,8 +8,9 @@ is, and nothing is made or changed for it; its condition says what would allow i
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
+from itertools import islice
 
 from msgspec.structs import replace
 
@@ -32,6 +33,8 @@ from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 NOT_ALLOWED = "NotAllowed"
 Consents = Mapping[Name, frozenset[str]]
 """By a master's Service, the namespaces whose RosProxies may name it, besides its own."""
+MOST_PATTERNS = 5
+"""Allowed patterns that a refusal names."""
 _EVERYBODY = "*"
 _NUMERIC = re.compile(r"http://([0-9.*?]*[0-9][0-9.*?]*|\[.*\])(:[0-9*?]*)?")
 """A pattern whose host has digits and no letters: it is meant for addresses."""
@@ -87,7 +90,8 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
         for uri in _masters(spec):
             if not is_allowed_master(uri, bounds.masters):
                 field = "spec.master.uri" if spec.master.uri else "spec.master.service"
-                yield _refusal(field, uri, "Choose an allowed master", "allow.masters")
+                fix = f"Choose a master that fits {_any_of(bounds.masters)}"
+                yield _refusal(field, uri, fix, "allow.masters")
     if spec.ros2:
         yield from _ros2_violations(spec.ros2, bounds)
     yield from _port_violations(spec, bounds)
@@ -99,7 +103,8 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
         yield _refusal("spec.podEgress", "Proxy", "Choose Any", "proxy.networkPolicy.enabled")
     patterns = (settings.image, *bounds.images)
     if spec.image and not any(_fits(spec.image, p) for p in patterns):
-        yield _refusal("spec.image", spec.image, "Remove the field", "allow.images")
+        choice = f", or choose an image that fits {_any_of(bounds.images)}" if bounds.images else ""
+        yield _refusal("spec.image", spec.image, f"Remove the field{choice}", "allow.images")
 
 
 def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
@@ -107,7 +112,8 @@ def _ros2_violations(spec: Ros2Spec, bounds: Bounds) -> Iterator[str]:
     for peer in spec.peers if bounds.peers else ():
         uri = slave_uri(HostPort(read_peer(peer).host, 1))
         if not is_allowed_master(uri, tuple(f"http://{p}:1" for p in bounds.peers)):
-            yield _refusal("spec.peers", peer, "Choose an allowed peer", "allow.peers")
+            fix = f"Choose a peer that fits {_any_of(bounds.peers)}"
+            yield _refusal("spec.peers", peer, fix, "allow.peers")
     if spec.multicast and not bounds.multicast:
         fix = "Remove the field, and name the hosts outside in spec.peers"
         yield _refusal("spec.multicast", True, fix, "allow.multicast")
@@ -124,6 +130,10 @@ def _port_violations(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
     if spec.master.publish and spec.master.publish not in bounds.window:
         inside = f"Choose a port in {bounds.window}"
         yield _refusal("spec.master.publish", spec.master.publish, inside, "allow.portWindow")
+
+
+def _any_of(patterns: Iterable[str]) -> str:
+    return " or ".join(map(quoted, islice(patterns, MOST_PATTERNS)))
 
 
 def _refusal(field: str, value: object, fix: str, allowing: str) -> str:
