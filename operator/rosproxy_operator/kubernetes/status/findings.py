@@ -37,6 +37,8 @@ WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _LONGEST = 600
 _ENFORCE = "pod-security.kubernetes.io/enforce"
+_UNRESOLVED = "can't be resolved"
+"""Part of a proxy's error about a host name (rosproxy.net.http_client)."""
 OF_ANOTHER = "the operator did not create"
 """Part of the error about an object that has the name already and is not the operator's."""
 
@@ -178,7 +180,8 @@ def _answered(
     if answer.refusal:
         yield _finding(rosproxy, subject, answer.refusal, REFUSES)
     if not answer.master_up:
-        text = f"does not reach the master ({answer.error}). {_master_remedy(rosproxy)}"
+        fix = _master_remedy(rosproxy, answer.error)
+        text = f"does not reach the master ({answer.error}). {fix}"
         yield _finding(rosproxy, subject, text, NO_MASTER)
     probe = answer.range_probe
     if probe is not None and probe.reached is False:
@@ -197,10 +200,16 @@ def _own_problems(answer: ProxyReport) -> list[str]:
     return [problem for problem in answer.problems if not problem.startswith(tuple(told))]
 
 
-def _master_remedy(rosproxy: RosProxy) -> str:
+def _master_remedy(rosproxy: RosProxy, error: str) -> str:
+    """What to do about a master that is not reached; ``error`` is in the words of the proxy."""
     master = rosproxy.spec.master
     if master.service is not None:
         return f"Start roscore behind Service {master.service}, port {master.service_port}"
+    if _UNRESOLVED in error:
+        return (
+            "Correct the host name in spec.master.uri, or set spec.master.address to the IP "
+            "address of that host"
+        )
     return (
         "Start roscore on the master's host, allow connections from pods to "
         f"{master.uri}, or correct spec.master"

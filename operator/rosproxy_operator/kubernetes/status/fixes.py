@@ -20,8 +20,8 @@ _BY_REASON = {
     "HostNetwork": f"remove hostNetwork, or the label {INJECT}, from the pod's template",
     "Invalid": f"correct the field that the message names: {_EDIT}",
     "MasterUnknown": f"correct spec.master: {_EDIT}",
-    "MasterUnreachable": "start the master; or correct spec.master, and set spec.master.address if "
-    f"the cluster does not know the master's name: {_EDIT}",
+    "MasterUnreachable": "start the master, allow connections, or correct spec.master, as the "
+    f"message says: {_EDIT}",
     "NameTaken": "delete the object that the message names, or create it under another name",
     "NoAdvertiseHost": ADDRESS_FIX,
     "NodeLeftOut": f"correct spec.nodeSelector: {_EDIT}",

@@ -109,6 +109,16 @@ def test_the_master_is_not_reached():
     assert "/a: hangs" in message(rosproxy_status, "Degraded")
 
 
+def test_a_master_whose_name_is_unknown_needs_another_name_or_an_address():
+    """The advice was to start roscore, which ran."""
+    error = "http://robto:11311: host name robto can't be resolved"
+    down = ProxyReport(True, False, error)
+    text = message(status(state(answer=down)), "MasterReachable")
+
+    assert f"({error}). Correct the host name in spec.master.uri, or set spec.master.address" in text
+    assert "roscore" not in text
+
+
 def test_a_master_in_the_cluster_is_told_by_its_service():
     of = rosproxy(master=MasterSpec(service=Name("robots", "roscore")))
     down = state(proxy=proxy(ready=False), answer=ProxyReport(True, False, "refused"))
