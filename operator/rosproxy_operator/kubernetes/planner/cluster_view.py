@@ -5,12 +5,13 @@ Everything after this works by place, that is a RosProxy on a node, and not by p
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 import msgspec
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy
+from rosproxy_operator.kubernetes.planner.pods.selection import on_node, select_rosproxy, selects
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     PodFailure,
@@ -124,7 +125,15 @@ def _taken(
     taken = group_by_key(
         (choice.id, pod) for choice, pod in choices if isinstance(choice, RosProxy)
     )
-    return taken, [choice for choice, _ in choices if isinstance(choice, ClusterFinding)]
+    refused = [(choice, pod) for choice, pod in choices if isinstance(choice, ClusterFinding)]
+    # Each RosProxy that selects the pod reports that.
+    findings = [
+        replace(choice, of=r.id)
+        for choice, pod in refused
+        for r in rosproxies.values()
+        if selects(r, pod)
+    ]
+    return taken, findings
 
 
 def _wanted(

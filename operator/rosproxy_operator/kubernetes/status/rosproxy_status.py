@@ -51,6 +51,8 @@ _PORTS = 400
 # As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
+_KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotSelected")
+"""Reasons of problems that leave pods without a proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
 
 
@@ -270,9 +272,13 @@ def _ready(
     served: str,
 ) -> Condition:
     if not wanted:
+        cause = next((p for p in problems if p.reason in _KEEPS_PODS_OUT), None)
+        if cause is not None:
+            return Condition(READY, "True", _NO_PODS, f"no pod has a proxy. {_one_line(cause)}")
         fix = "Give pods the labels that spec.podSelector requires"
         if rosproxy.spec.pod_selector is None:
-            fix = f"Add the label {INJECT}=true to the template of your pods"
+            # Not "true": with several RosProxies this value is ambiguous.
+            fix = f"Add the label {INJECT}={rosproxy.id.name} to the template of your pods"
         return Condition(READY, "True", _NO_PODS, f"no pod is selected. {fix}")
     waiting = [state for state in wanted if not _serving(state)]
     if not waiting:

@@ -324,6 +324,18 @@ def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
     assert "ros/a, ros/talker" in text
 
 
+def test_each_of_two_rosproxies_names_the_pod_that_both_select() -> None:
+    """The status advised the label value true, which is the fault."""
+    plan = look(observed(rosproxy("arm"), rosproxy("leg"), pod()))
+    for name in ("arm", "leg"):
+        ready = status(plan, Name("ros", name))["conditions"][0]
+        assert ready["message"] == (
+            "no pod has a proxy. pod ros/talker: is selected by RosProxy arm and leg, so the pod "
+            "gets no proxy. Set the label to the name of one RosProxy, such as "
+            "rosproxy.io/inject=arm"
+        )
+
+
 def test_a_pod_that_is_not_wired_is_told() -> None:
     plan = look(complete(pods=(pod(wired_master_uri=""),)))
     assert "kubectl -n ros delete pod talker" in told(plan, "NotWired")[0]

@@ -118,7 +118,7 @@ def test_no_pod_is_selected():
     assert judged(rosproxy_status, "Ready") == ("True", "NoPods")
     assert (
         message(rosproxy_status)
-        == "no pod is selected. Add the label rosproxy.io/inject=true to the template of your pods"
+        == "no pod is selected. Add the label rosproxy.io/inject=arm to the template of your pods"
     )
     assert judged(rosproxy_status, "PortsAllocated") == ("True", "NoPods")
     assert judged(rosproxy_status, "MasterReachable") == ("Unknown", "NoProxies")
