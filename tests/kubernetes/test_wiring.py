@@ -75,11 +75,26 @@ def test_a_misspelt_label_is_told_on_the_pod(net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE)
     pod = net.idle(labels={"rosproxy.io/injekt": "true"})
     wait_event(
-        net.name, pod.name, "Pod", "UnknownName", "did you mean the label rosproxy.io/inject"
+        net.name, pod.name, "Pod", "UnknownName", "Did you mean the label rosproxy.io/inject"
     )
     condition = made.wait_for("Degraded", reason="UnknownName")
     assert f"pod {net.name}/{pod.name}: label rosproxy.io/injekt" in condition["message"]
     pod.remove()
+    made.wait_for("Degraded", "False")
+
+
+def test_a_label_that_no_rosproxy_answers_to_is_told_on_the_pod(net: Namespace) -> None:
+    """A minute later: a RosProxy may be created after its pods."""
+    made = rosproxy(net.name, master=NOWHERE)
+    with namespace() as bare:
+        lonely = bare.idle(labels={INJECT: "true"})
+        astray = net.idle(labels={INJECT: "robott"})
+        text = f"label {INJECT}=robott names no RosProxy"
+        wait_event(net.name, astray.name, "Pod", "NotWired", text, 120)
+        wait_event(bare.name, lonely.name, "Pod", "NotWired", "has no RosProxy", 120)
+    condition = made.wait_for("Degraded", reason="NotWired")
+    assert f"pod {net.name}/{astray.name}: label {INJECT}=robott" in condition["message"]
+    astray.remove()
     made.wait_for("Degraded", "False")
 
 

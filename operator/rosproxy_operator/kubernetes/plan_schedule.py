@@ -58,6 +58,7 @@ class PlanSchedule:
             self._at = {}
             planned = {rosproxy.id.namespace for rosproxy in observed.rosproxies}
             planned |= {proxy.of.namespace for proxy in observed.proxies}
+            planned |= {pod.id.namespace for pod in observed.unselected_pods}
         else:
             planned = {*scope.namespaces}
             for namespace in planned:

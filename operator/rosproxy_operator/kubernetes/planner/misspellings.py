@@ -7,6 +7,7 @@ Event, and each RosProxy gets only a few.
 from collections.abc import Iterable, Iterator
 
 from rosproxy_operator.kubernetes.planner.cluster_view import View
+from rosproxy_operator.kubernetes.planner.pods.injection import edited
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Pod, RosProxy
 from rosproxy_operator.kubernetes.status.findings import finding, pod_finding
 
@@ -20,8 +21,10 @@ def misspellings(view: View, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
     observed = view.observed
     yield from (finding(rosproxy, REASON, text) for text in rosproxy.misspelt)
     for pod in _pods(view, rosproxy):
+        fix = edited("Correct the name in the template", pod)
         for text in pod.misspelt:
-            yield pod_finding(pod, rosproxy, REASON, text, fatal=False)
+            joint = " " if text.endswith("?") else ". "
+            yield pod_finding(pod, rosproxy, REASON, f"{text}{joint}{fix}", fatal=False)
     for place in view.places.get(rosproxy.id, ()):
         node = observed.nodes.get(place.node)
         yield from _others(rosproxy, f"node {place.node}", node.misspelt if node else ())

@@ -56,6 +56,7 @@ def partitions(observed: ClusterSnapshot) -> Iterator[Partition]:
     pending |= {name.namespace for name in observed.unusable}
     pending |= {namespace for namespace, _ in _uses(observed)}
     pending |= {name.namespace for name in (*observed.services, *observed.policies)}
+    pending |= {pod.id.namespace for pod in observed.unselected_pods}
     while pending:
         partition = partition_of(observed, [min(pending)])
         pending -= partition.namespaces
@@ -85,6 +86,7 @@ def partition_snapshot(observed: ClusterSnapshot, partition: Partition) -> Clust
         pods=tuple(
             p for p in observed.pods if p.id.namespace in namespaces or p.node in partition.nodes
         ),
+        unselected_pods=tuple(p for p in observed.unselected_pods if p.id.namespace in namespaces),
         misspelt_pods=tuple(p for p in observed.misspelt_pods if p.id.namespace in namespaces),
         proxies=tuple(p for p in observed.proxies if p.of.namespace in namespaces),
         lan_relays=_within(observed.lan_relays, namespaces),
@@ -108,7 +110,15 @@ def merge_state(state: ClusterState, partition: Partition, new: ClusterState) ->
     outside = _filtered(state, partition, False)
     merged = {
         name: {**getattr(outside, name), **getattr(new, name)}
-        for name in (*_BY_PLACE, *_BY_NODE, "attempts", "reported", "taken", "strange")
+        for name in (
+            *_BY_PLACE,
+            *_BY_NODE,
+            "attempts",
+            "reported",
+            "taken",
+            "strange",
+            "unselected",
+        )
     }
     return replace(new, **merged)
 
@@ -127,6 +137,9 @@ def _filtered(state: ClusterState, partition: Partition, inside: bool) -> Cluste
         },
         "reported": {
             f: at for f, at in state.reported.items() if (f.of.namespace in namespaces) == inside
+        },
+        "unselected": {
+            id: at for id, at in state.unselected.items() if (id.namespace in namespaces) == inside
         },
         "taken": {key: at for key, at in state.taken.items() if (key[0] in nodes) == inside},
         "strange": {key: at for key, at in state.strange.items() if (key[0] in nodes) == inside},

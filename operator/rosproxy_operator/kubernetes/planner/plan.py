@@ -26,6 +26,10 @@ from rosproxy_operator.kubernetes.planner.former_ports import former_ports, reme
 from rosproxy_operator.kubernetes.planner.misspellings import misspellings
 from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.planner.pods.unselected import (
+    unselected_findings,
+    unselected_waits,
+)
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.steps.context import (
@@ -117,12 +121,13 @@ def plan(
     retries = Retries(decided.attempts, observed.failures, now)
     context = ClusterContext(cluster_view, settings, decided, ranges, retries, now)
     actions = [*reconcile_orphans(context), *reconcile_orphaned_policies(context)]
-    problems = [*cluster_view.findings]
-    moved = tuple(moves(cluster_view, decided, ranges.given))
+    unselected = tuple(unselected_findings(cluster_view, decided.unselected, now))
+    problems = [*cluster_view.findings, *unselected]
+    shared = (*cluster_view.findings, *unselected, *moves(cluster_view, decided, ranges.given))
     for _, rosproxy in sorted(cluster_view.rosproxies.items()):
         own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))
-        own_problems = _problems(context, rosproxy, states, moved)
+        own_problems = _problems(context, rosproxy, states, shared)
         status = _status(context, rosproxy, states, own_problems, stamp)
         problems += own_problems
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
@@ -132,8 +137,6 @@ def plan(
     unique = tuple(dict.fromkeys(problems))
     warnings = events.warnings(unique, decided.reported, now)
     departed = departures.find_departures(observed, decided, now)
-    soon = (seconds for seconds in ends(context) if seconds > 0)
-    waits = (*soon, *retries.pauses(), *departures.next_checks(departed, now))
     return ClusterPlan(
         actions=(*actions, *warnings.emits),
         problems=unique,
@@ -143,8 +146,16 @@ def plan(
         policies=policies(full_snapshot, settings),
         peers=peers(context),
         former_ports=former_ports(cluster_view, decided.former),
-        next_look_in=min(waits, default=None),
+        next_look_in=min(_waits(context, departed), default=None),
     )
+
+
+def _waits(context: ClusterContext, departed: departures.Departures) -> Iterator[float]:
+    """The seconds until something is due, whatever happens."""
+    yield from (seconds for seconds in ends(context) if seconds > 0)
+    yield from context.retries.pauses()
+    yield from departures.next_checks(departed, context.now)
+    yield from unselected_waits(context.state.unselected, context.now)
 
 
 def _status(
@@ -205,18 +216,17 @@ def _problems(
     context: ClusterContext,
     rosproxy: RosProxy,
     states: tuple[RosProxyOnNode, ...],
-    moved: Iterable[ClusterFinding],
+    shared: Iterable[ClusterFinding],
 ) -> tuple[ClusterFinding, ...]:
     """All that is wrong with a RosProxy."""
     address = context.cluster_ip(rosproxy)
     pods = context.view.selected_pods.get(rosproxy.id, ()) if address else ()
-    shared = (*context.view.findings, *moved, *context.ranges.findings)
     unlisted = context.observed.policies_error if context.settings.network_policy else ""
     text = f"the operator can't list NetworkPolicies, so this RosProxy gets none: {unlisted}"
     return (
         *((finding(rosproxy, "NoNetworkPolicy", text),) if unlisted else ()),
         *findings(rosproxy, states, context.retries.failures(rosproxy.id)),
-        *(f for f in shared if f.of == rosproxy.id),
+        *(f for f in (*shared, *context.ranges.findings) if f.of == rosproxy.id),
         *filter(
             None, (wiring_finding(pod, rosproxy, address) for pod in pods if rosproxy.spec.ros1)
         ),

@@ -27,6 +27,7 @@ from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
 from rosproxy_operator.kubernetes.resources.cluster import PodFailure
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
+    Name,
     Pod,
     ProxyPlace,
     RosProxySpec,
@@ -49,6 +50,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     ``reported`` problems that Events were made of. ``addresses`` are, by node, those that pods have
     or had, and when they were last seen to; ``strange``, by node and address, those that a proxy
     has named and that no pod was seen with, since when. ``former``: see `former_ports`.
+    ``unselected`` are labelled pods that no RosProxy selects, since when.
     """
 
     begun: bool = False
@@ -65,6 +67,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     addresses: Mapping[str, Mapping[str, float]] = {}
     strange: Mapping[tuple[str, str], float] = {}
     former: Mapping[ProxyPlace, FormerPorts] = {}
+    unselected: Mapping[Name, float] = {}
 
 
 def learn(view: View, state: ClusterState, now: float) -> ClusterState:
@@ -90,6 +93,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         taken=taken | dict.fromkeys(refused, now),
         moved=_recent(view, state.moved, now - MOVED_FOR),
         tried=_recent(view, state.tried, now - TRIED_FOR),
+        unselected={p.id: state.unselected.get(p.id, now) for p in view.observed.unselected_pods},
     )
 
 

@@ -180,7 +180,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     run all others of the namespaces that have such, and any that take ports there. ``masters``
     gives, for each Service that a RosProxy names as its master, its address and what is wrong; one
     of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it,
-    besides its own. ``selected`` are the uids of the pods that a RosProxy selects;
+    besides its own. ``selected`` are the uids of the pods that a RosProxy selects,
+    ``unselected_pods`` those that ask for a proxy by their label and that no RosProxy selects;
     ``misspelt_pods`` are those of the RosProxies' namespaces that have a misspelt label or
     annotation, ``misspelt_services`` says what is wrong with those of ``masters``. ``policies`` are
     the operator's own NetworkPolicies by their names; ``policies_error`` is why they can't be
@@ -201,6 +202,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     masters: Mapping[Name, tuple[str, str]] = {}
     consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()
+    unselected_pods: tuple[Pod, ...] = ()
     misspelt_pods: tuple[Pod, ...] = ()
     misspelt_services: Mapping[Name, tuple[str, ...]] = {}
     policies: Mapping[Name, ProxyPolicy] = {}

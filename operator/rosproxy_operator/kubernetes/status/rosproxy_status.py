@@ -51,7 +51,7 @@ _PORTS = 400
 # As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
-_KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotSelected")
+_KEEPS_PODS_OUT = ("Ambiguous", "HostNetwork", "NodeLeftOut", "NotWired")
 """Reasons of problems that leave pods without a proxy."""
 _NO_PROXY = "no proxy runs, so this is not known"
 

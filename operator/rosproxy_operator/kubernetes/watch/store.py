@@ -8,7 +8,7 @@ something: a later look corrects the consequences, and nothing is deleted by it 
 import asyncio
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -21,7 +21,7 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiUnavailable,
     crd_missing,
 )
-from rosproxy_operator.kubernetes.planner.pods.selection import selects
+from rosproxy_operator.kubernetes.planner.pods.selection import selects, wants_proxy
 from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     HelperPod,
@@ -82,6 +82,7 @@ class ClusterStore:
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
         self._helpers: dict[str, dict[str, HelperPod]] = defaultdict(dict)
+        self._labelled: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
         self._touched = StoreChanges()
@@ -188,8 +189,15 @@ class ClusterStore:
             lan_relays=tuple(h for h in helpers if h.component == LAN_RELAY),
             image_checks=tuple(h for h in helpers if h.component == IMAGE_CHECK),
             selected=frozenset(pod.uid for pod in selected if not pod.ended),
+            unselected_pods=tuple(self._unselected({pod.uid for pod in selected})),
             misspelt_pods=tuple(pod for pod in candidates if pod.misspelt),
         )
+
+    def _unselected(self, selected: Container[str]) -> Iterator[Pod]:
+        for group in self._labelled.values():
+            for pod in group.values():
+                if not (pod.uid in selected or pod.ended or pod.deleting):
+                    yield pod
 
     def _masters(
         self, rosproxies: Iterable[RosProxy]
@@ -255,6 +263,8 @@ class ClusterStore:
             _set(self._helpers, record.of.namespace, key, record if add else None)
         elif isinstance(record, Pod):
             _set(self._pods, record.id.namespace, key, record if add else None)
+            if self._is_looked_after(record.id.namespace) and wants_proxy(record):
+                _set(self._labelled, record.id.namespace, key, record if add else None)
             if record.every_port and record.node:
                 _set(self._pods_with_ports, record.node, key, record if add else None)
 
@@ -285,8 +295,10 @@ class ClusterStore:
         """A pod of others matters if a RosProxy selects it or is meant to, or if it takes ports."""
         selected = self._is_selected(pod)
         misspelt = bool(pod.misspelt) and pod.id.namespace in self._rosproxies
-        if selected or misspelt:
+        labelled = wants_proxy(pod) and self._is_looked_after(pod.id.namespace)
+        if selected or misspelt or labelled:
             self._touched.namespaces.add(pod.id.namespace)
+            self._wake()
         if selected or misspelt or pod.every_port:
             self._touched.nodes.add(pod.node)
             self._wake()

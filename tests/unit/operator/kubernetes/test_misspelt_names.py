@@ -36,6 +36,7 @@ TEXT = (
     "label rosproxy.io/injekt is unknown and ignored. Did you mean the label rosproxy.io/inject of "
     "pods?"
 )
+FIX = "Correct the name in the template, then run kubectl -n ros delete pod"
 
 
 @pytest.mark.parametrize(
@@ -113,7 +114,7 @@ def test_it_is_told_once_on_the_pod_and_in_the_status():
 
     (event,) = (a for a in first.actions if isinstance(a, Emit) and a.reason == "UnknownName")
     assert event.about == Reference("Pod", Name("ros", "astray"), "uid-astray")
-    assert event.message == TEXT
+    assert event.message == f"{TEXT} {FIX} astray, and create the pod again"
     assert not [a for a in second.actions if isinstance(a, Emit)]
     degraded = next(c for c in status(first)["conditions"] if c["type"] == "Degraded")
     assert (degraded["status"], degraded["reason"]) == ("True", "UnknownName")
@@ -125,7 +126,8 @@ def test_many_pods_of_one_kind_are_told_of_by_some():
     pods = tuple(pod(f"p{number:02}", misspelt=(TEXT,)) for number in range(MOST_PODS + 30))
     gone = pod("a", misspelt=(TEXT,), deleting=True)
     texts = told(look(complete(misspelt_pods=(*pods[::-1], gone))), "UnknownName")
-    assert texts == [f"pod ros/p{number:02}: {TEXT}" for number in range(MOST_PODS)]
+    named = [text.partition(", and")[0] for text in texts]
+    assert named == [f"pod ros/p{n:02}: {TEXT} {FIX} p{n:02}" for n in range(MOST_PODS)]
 
 
 def test_of_two_rosproxies_the_first_one_is_told():

@@ -157,11 +157,16 @@ def restart_of(pod: Pod) -> str:
     return command if pod.controller else f"{command}, and create the pod again"
 
 
-def _edited(change: str, pod: Pod) -> str:
+def again(pod: Pod) -> str:
+    """What to do to create a pod anew. A pod at admission has no uid, and may have no name."""
+    return f"run {restart_of(pod)}" if pod.uid or pod.workload else "create the pod again"
+
+
+def edited(change: str, pod: Pod) -> str:
     """How to make a change in the template of a pod."""
     if pod.workload:
         return f"{change}: kubectl -n {pod.id.namespace} edit {pod.workload}"
-    return f"{change}, then run {restart_of(pod)}"
+    return f"{change}, then {again(pod)}"
 
 
 def _is_of_former(pod: Pod, rosproxy: RosProxy) -> bool:
@@ -186,7 +191,7 @@ def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
         return (
             f"variable ROS_MASTER_URI={clean(foreign[0])[:200]} of the template does not lead to "
             "the proxy, so the nodes bypass the proxy. "
-            f"{_edited('Remove the variable from the template', pod)}"
+            f"{edited('Remove the variable from the template', pod)}"
         )
     if pod.wired_master_uri and pod.wired_master_uri != master_uri(cluster_ip):
         return (
@@ -209,7 +214,7 @@ def missing_variable_text(variable: str, pod: Pod, rosproxy: RosProxy) -> str:
     text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
-        return f"{text}. {_edited(f'Add the label {label} to the template', pod)}"
+        return f"{text}. {edited(f'Add the label {label} to the template', pod)}"
     reason = "the API server reached no operator (port 9443) when the pod was created"
     if _is_older(pod, rosproxy):
         reason = f"the pod is older than RosProxy {rosproxy.id.name}"

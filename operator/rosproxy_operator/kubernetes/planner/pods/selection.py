@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
+from rosproxy_operator.kubernetes.planner.pods.injection import again, edited
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterNode,
@@ -14,6 +15,8 @@ from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 LABEL_OFF_VALUES = ("", "false")
 """Values of the label with which a pod is left alone, whatever a podSelector says."""
+MOST_NAMES = 5
+"""RosProxies that a text names."""
 _ANY = "true"
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
 
@@ -61,7 +64,7 @@ def select_rosproxy(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | Clus
 
 
 def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
-    """Why no RosProxy takes a pod that is labelled, for a warning at admission.
+    """Why no RosProxy takes a pod that is labelled, and what to do.
 
     Empty if the pod is not labelled, or its label says that it is to be left alone.
     """
@@ -73,17 +76,26 @@ def why_not_selected(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     if not names:
         return (
             f"namespace {pod.id.namespace} has no RosProxy, so {lost}. Create a RosProxy there, "
-            "then create the pod again"
+            f"then {again(pod)}"
         )
     if label not in (_ANY, *names):
+        value = " or ".join(names[:MOST_NAMES])
+        if label.lower() in (_ANY, *LABEL_OFF_VALUES):
+            value = f"{label.lower()} in lower case"
         return (
             f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}. "
-            f"Set the label to {' or '.join(names)}, then create the pod again"
+            f"{edited(f'Set the label to {value} in the template', pod)}"
         )
     return (
-        f"the labels of the pod do not match spec.podSelector of RosProxy {' and '.join(names)}, "
-        f"so {lost}. Change the labels or the selector, then create the pod again"
+        "the labels of the pod do not match spec.podSelector of RosProxy "
+        f"{' and '.join(names[:MOST_NAMES])}, "
+        f"so {lost}. Change the labels or the selector, then {again(pod)}"
     )
+
+
+def wants_proxy(pod: Pod) -> bool:
+    """Whether a pod asks for a proxy by its label."""
+    return pod.labels.get(INJECT, "") not in LABEL_OFF_VALUES and not _is_ours(pod.labels)
 
 
 def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
