@@ -119,6 +119,7 @@ def test_who_may_not_look_is_told_which_right_is_missing(net: Namespace, tmp_pat
     assert code == 0, findings
     refused = [f["text"] for f in findings if f["text"].startswith("not checked")]
     assert refused == [
+        "not checked: you lack the right to list pods -A",
         "not checked: you lack the right to list "
         "mutatingwebhookconfigurations.admissionregistration.k8s.io -A",
         f"not checked: you lack the right to list events -n {net.name}",

@@ -28,6 +28,7 @@ from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import PROXY, component
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import event_findings
+from rosproxy_operator.kubernetes.status.operator_findings import operator_findings
 from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_FIX
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
@@ -50,9 +51,11 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         rosproxies = api.rosproxies()
         own_pods = api.own_pods()
         facts = DoctorFacts(api, namespaces)
+        operators = facts.operators(rosproxies)
         findings = [
-            *cluster_findings(rosproxies),
-            *webhook_findings(facts.webhook()),
+            *operator_findings(operators),
+            *cluster_findings(rosproxies, operators),
+            *webhook_findings(facts.webhook(operators)),
             *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),
             *facts.refused,
         ]

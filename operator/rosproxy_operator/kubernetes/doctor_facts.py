@@ -20,9 +20,14 @@ from rosproxy_operator.kubernetes.api.api_client import (
 from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.status.condition_findings import is_unnoticed
 from rosproxy_operator.kubernetes.status.event_findings import MOST, RecentEvent, recent_events
-from rosproxy_operator.kubernetes.status.webhook_findings import (
+from rosproxy_operator.kubernetes.status.operator_findings import (
     OPERATORS,
+    Operators,
+    service_account,
+)
+from rosproxy_operator.kubernetes.status.webhook_findings import (
     WebhookFacts,
     our_webhook,
     service_of,
@@ -41,7 +46,23 @@ class DoctorFacts:
         self._places = tuple(namespaces) or ("",)
         self.refused: list[DoctorFinding] = []
 
-    def webhook(self) -> WebhookFacts:
+    def operators(self, rosproxies: Iterable[Json]) -> Operators:
+        """The operators' pods, and where they may not write what the RosProxies' status is."""
+        pods = self._ask("operator", lambda: self._api.list_fresh("pods", "", labels=OPERATORS))
+        found = Operators(None if pods is None else tuple(pods))
+        account = service_account(found)
+        unnoticed = (rosproxy for rosproxy in rosproxies if is_unnoticed(rosproxy))
+        namespaces = {text_at(submap(r, "metadata"), "namespace") for r in unnoticed}
+        if account is None or not namespaces:
+            return found
+        refused = self._ask("operator", lambda: self._refused(account, namespaces))
+        return Operators(found.pods, refused or frozenset())
+
+    def _refused(self, account: Name, namespaces: Iterable[str]) -> frozenset[str]:
+        may_write = self._api.may_patch_status
+        return frozenset(n for n in sorted(namespaces) if not may_write(account, n))
+
+    def webhook(self, operators: Operators) -> WebhookFacts:
         """What there is of the webhook."""
         api = self._api
         listed = self._ask("webhook", lambda: api.list_fresh(WEBHOOKS, ""))
@@ -49,8 +70,7 @@ class DoctorFacts:
             return WebhookFacts()
         ours = tuple(configuration for configuration in listed if our_webhook(configuration))
         if not ours:
-            pods = self._ask("webhook", lambda: api.list_fresh("pods", "", labels=OPERATORS))
-            return WebhookFacts((), None if pods is None else tuple(pods))
+            return WebhookFacts((), operators.pods)
         ready: dict[Name, int | None] = {}
         for service in {service_of(configuration) for configuration in ours}:
             self._ask("webhook", partial(self._count_ready, service, ready))

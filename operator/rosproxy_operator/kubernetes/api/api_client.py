@@ -65,14 +65,18 @@ WEBHOOKS = "mutatingwebhookconfigurations"
 POLICIES = "networkpolicies"
 LEASES = "leases"
 ENDPOINTS = "endpointslices"
+REVIEWS = "subjectaccessreviews"
 _ROOTS = {
     PLURAL: f"/apis/{GROUP}/{VERSION}",
     WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
     POLICIES: "/apis/networking.k8s.io/v1",
     LEASES: "/apis/coordination.k8s.io/v1",
     ENDPOINTS: "/apis/discovery.k8s.io/v1",
+    REVIEWS: "/apis/authorization.k8s.io/v1",
 }
 """The API's paths for kinds that are not of the core group."""
+_ACCOUNTS = "system:serviceaccounts"
+"""The group of all service accounts."""
 _TERMINATING = "because it is being terminated"
 """What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted.
 
@@ -291,6 +295,27 @@ class Api:
     def create(self, kind: str, body: Json, within: Timeout = WITHIN) -> None:
         """Create an object in the namespace that it names."""
         self._ask("POST", _path(kind, body["metadata"]["namespace"]), body=body, within=within)
+
+    def may_patch_status(self, account: Name, namespace: str) -> bool:
+        """Whether a service account may write the status of a namespace's RosProxies.
+
+        Only the doctor asks, with the rights of its user.
+        """
+        groups = [_ACCOUNTS, f"{_ACCOUNTS}:{account.namespace}", "system:authenticated"]
+        resource = {"verb": "patch", "group": GROUP, "resource": PLURAL, "subresource": "status"}
+        spec = {
+            "user": f"system:serviceaccount:{account.namespace}:{account.name}",
+            "groups": groups,
+            "resourceAttributes": {**resource, "namespace": namespace},
+        }
+        body = {
+            "apiVersion": "authorization.k8s.io/v1",
+            "kind": "SubjectAccessReview",
+            "metadata": {},
+            "spec": spec,
+        }
+        answer = self._ask("POST", _path(REVIEWS, ""), body=body)
+        return submap(answer, "status").get("allowed") is True
 
     def delete(self, kind: str, id: Name, uid: str, version: str = "") -> None:
         """Delete an object if it still has this uid, and this version if one is given."""

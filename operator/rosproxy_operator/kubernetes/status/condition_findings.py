@@ -1,12 +1,18 @@
 """The findings of the doctor from the statuses of all RosProxies."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, ok, warning
-from rosproxy_operator.kubernetes.resources.checks import int_at, submaps, text_at
+from rosproxy_operator.kubernetes.resources.checks import int_at, submap, submaps, text_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.fixes import fix_for
+from rosproxy_operator.kubernetes.status.operator_findings import (
+    UNKNOWN,
+    Operators,
+    unmanaged,
+    unnoticed,
+)
 
 _WRONG = {
     "MasterReachable": "False",
@@ -18,10 +24,12 @@ _WRONG = {
 """By condition, the status that means trouble; causes go before what follows from them."""
 
 
-def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
+def cluster_findings(
+    rosproxies: Collection[Json], operators: Operators = UNKNOWN
+) -> list[DoctorFinding]:
     """All findings of a cluster, by its RosProxies; each text once, where it is a cause."""
-    findings = [finding for rosproxy in rosproxies for finding in _findings_of(rosproxy)]
-    if not findings:
+    findings = [f for rosproxy in rosproxies for f in _findings_of(rosproxy, operators)]
+    if not rosproxies:
         fix = (
             "create a RosProxy with kubectl apply; check that the cluster has the definition: "
             "kubectl get crd rosproxies.rosproxy.io"
@@ -30,19 +38,23 @@ def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
     return findings
 
 
-def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
+def is_unnoticed(rosproxy: Json) -> bool:
+    """Whether no operator has written a status since the last change."""
+    generation = int_at(submap(rosproxy, "metadata"), "generation")
+    return int_at(submap(rosproxy, "status"), "observedGeneration") < generation
+
+
+def _findings_of(rosproxy: Json, operators: Operators) -> Iterator[DoctorFinding]:
     metadata = rosproxy["metadata"]
     status = rosproxy.get("status", {})
     id = Name(metadata["namespace"], metadata["name"])
     subject = f"rosproxy {id}"
     conditions = {text_at(c, "type"): c for c in submaps(status, "conditions")}
-    if int_at(status, "observedGeneration") < metadata.get("generation", 0):
-        text = "the operator has not looked at the last change of this RosProxy yet"
-        fix = (
-            "check that the operator runs: kubectl get pods -A -l "
-            "app.kubernetes.io/name=rosproxy-operator"
-        )
-        yield error("operator", subject, text, fix)
+    if foreign := unmanaged(id, operators):
+        yield foreign
+        return
+    if is_unnoticed(rosproxy) and not operators.missing:
+        yield unnoticed(id, operators)
     messages: set[str] = set()
     for kind, bad in _WRONG.items():
         condition = conditions.get(kind, {})
@@ -51,7 +63,7 @@ def _findings_of(rosproxy: Json) -> Iterator[DoctorFinding]:
             messages.add(message)
             fix = fix_for(text_at(condition, "reason"), id)
             yield error("rosproxy", subject, f"{kind} is {bad}: {message}", fix)
-    if messages:
+    if messages or is_unnoticed(rosproxy):
         return
     if int_at(status, "nodes"):
         text = f"proxies {text_at(status, 'proxies')} ready, {int_at(status, 'rosNodes')} ROS nodes"

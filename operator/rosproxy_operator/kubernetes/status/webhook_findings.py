@@ -12,11 +12,10 @@ from rosproxy.telemetry.text import plural
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.status.operator_findings import describe_operators
 
 NAME = "wire.rosproxy.io"
 """What the webhook is called in its configuration."""
-OPERATORS = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
-"""Label selector of the operators' pods."""
 _CHECK = "webhook"
 _ANEW = "then create unwired pods again: kubectl rollout restart"
 _INSTALL = "create the object again: helm upgrade, or kubectl apply -f manifests/install.yaml"
@@ -51,7 +50,7 @@ def webhook_findings(facts: WebhookFacts) -> Iterator[DoctorFinding]:
     """What is wrong with the webhook, as far as could be looked at."""
     if facts.configurations is None:
         return
-    if not facts.configurations:
+    if not facts.configurations and facts.operators != ():  # else there is no operator at all
         yield _missing(facts.operators)
     for configuration in facts.configurations:
         yield from _findings_of(configuration, facts)
@@ -65,9 +64,6 @@ def _missing(operators: tuple[Json, ...] | None) -> DoctorFinding:
     if operators is None:
         fix = f"unless the webhook is switched off (webhook.enabled=false), {_INSTALL}; {_ANEW}"
         return warning(_CHECK, _CHECK, text, fix)
-    if not operators:
-        fix = "install the operator: helm install, or kubectl apply -f manifests/install.yaml"
-        return warning(_CHECK, _CHECK, f"{text}. The cluster has no pod of an operator", fix)
     if any(_serves(pod) for pod in operators):
         text = f"{text}, although operators serve the webhook"
         return error(_CHECK, _CHECK, text, f"{_INSTALL}; {_ANEW}")
@@ -100,7 +96,7 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
         yield error(_CHECK, subject, text, f"{_INSTALL}; {_ANEW}")
     elif not ready:
         text = f"the Service {service} of the webhook has no ready endpoint, so no pod is wired"
-        yield error(_CHECK, subject, text, f"{_operators_at(service)}; {_ANEW}")
+        yield error(_CHECK, subject, text, f"{describe_operators(service.namespace)}; {_ANEW}")
     elif not lacks_ca:
         text = f"{plural(ready, 'operator')} ready to wire pods"
         yield ok(_CHECK, subject, text)
@@ -114,11 +110,4 @@ def _ca_fix(metadata: Json, service: Name) -> str:
         "wait 20 s for the leading operator, which sets the caBundle if its role may patch this "
         f"object; then read kubectl -n {service.namespace} logs -l "
         "app.kubernetes.io/component=operator --prefix"
-    )
-
-
-def _operators_at(service: Name) -> str:
-    return (
-        f"read kubectl -n {service.namespace} describe pods -l "
-        f"app.kubernetes.io/component=operator, and helm -n {service.namespace} list"
     )

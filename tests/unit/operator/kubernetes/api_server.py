@@ -50,6 +50,7 @@ class ApiServer:
         self.refusals: dict[tuple[str, str], tuple[int, str]] = {}
         self.address_refusals = Counter[str]()  # how often each is still to be refused
         self.gone_for_watches = False
+        self.granted = False  # what the answer to a SubjectAccessReview says
         self.retry_after = ""
         self.url = ""
         self._numbers = itertools.count(1)
@@ -133,6 +134,8 @@ class ApiServer:
         if request.method == "POST" and sub == "eviction":
             must = body["deleteOptions"]
             return self._delete(key, sub, must) if key in self.objects else _status(404, "gone")
+        if kind == "subjectaccessreviews":
+            return web.json_response({"status": {"allowed": self.granted}})
         if request.method == "POST":
             return self._create(kind, namespace, body)
         if not name:

@@ -115,7 +115,9 @@ def test_a_master_whose_name_is_unknown_needs_another_name_or_an_address():
     down = ProxyReport(True, False, error)
     text = message(status(state(answer=down)), "MasterReachable")
 
-    assert f"({error}). Correct the host name in spec.master.uri, or set spec.master.address" in text
+    assert (
+        f"({error}). Correct the host name in spec.master.uri, or set spec.master.address" in text
+    )
     assert "roscore" not in text
 
 

@@ -20,12 +20,14 @@ from rosproxy_operator.kubernetes.resources.names import (
     LAN_RELAY,
     PROXY,
 )
+from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import (
     MOST,
     RecentEvent,
     event_findings,
     recent_events,
 )
+from rosproxy_operator.kubernetes.status.operator_findings import Operators, operator_findings
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, proxy_obj, rosproxy_obj
@@ -50,15 +52,25 @@ def put_service(server: ApiServer, *ready: bool) -> None:
     server.put("endpointslices", endpoint_slice, "system")
 
 
+def operator_obj(*args: str, ready: bool = True) -> Obj:
+    ready_at = {"type": "Ready", "status": str(ready), "lastTransitionTime": "2026-11-01T00:00:00Z"}
+    return {
+        "metadata": {"name": "o", "namespace": "system", "labels": OPERATOR},
+        "spec": {"serviceAccountName": "op", "containers": [{"args": ["kubernetes", *args]}]},
+        "status": {"conditions": [ready_at]},
+    }
+
+
 def put_operator(server: ApiServer, *args: str) -> None:
-    spec = {"containers": [{"args": ["kubernetes", *args]}]}
-    server.put("pods", {"metadata": {"name": "o", "labels": OPERATOR}, "spec": spec}, "system")
+    server.put("pods", operator_obj(*args), "system")
 
 
 async def about_webhook(api: Api) -> list[DoctorFinding]:
     def look() -> list[DoctorFinding]:
         facts = DoctorFacts(api, ())
-        return [*webhook_findings(facts.webhook()), *facts.refused]
+        operators = facts.operators([])
+        found = [*operator_findings(operators), *webhook_findings(facts.webhook(operators))]
+        return [*found, *facts.refused]
 
     return await in_thread(look)
 
@@ -66,6 +78,7 @@ async def about_webhook(api: Api) -> list[DoctorFinding]:
 async def test_a_webhook_that_can_work(server: ApiServer, api: Api) -> None:
     other = {"metadata": {"name": "other"}, "webhooks": [{"name": "x.example"}]}
     server.put("mutatingwebhookconfigurations", other)
+    put_operator(server)
     put_webhook(server)
     put_service(server, True, False, True)
     (finding,) = await about_webhook(api)
@@ -100,14 +113,53 @@ async def test_a_webhook_that_can_not_work(
     assert "rollout restart" in finding.fix
 
 
-@pytest.mark.parametrize(("operators", "severity"), [([()], Severity.INFO), ([], Severity.WARNING)])
-async def test_a_webhook_that_nobody_serves(
-    server: ApiServer, api: Api, operators: list[tuple[str, ...]], severity: Severity
-) -> None:
-    for args in operators:
-        put_operator(server, *args)
+async def test_without_an_operator_that_is_the_first_finding(server: ApiServer, api: Api) -> None:
+    """After helm uninstall the doctor began with a consequence, and warned of the cause."""
     (finding,) = await about_webhook(api)
-    assert finding.severity is severity
+    assert (finding.severity, finding.check) == (Severity.ERROR, "operator")
+    assert finding.text.startswith("no operator runs in the cluster")
+    assert "helm upgrade --install rosproxy" in finding.fix
+    assert cluster_findings([rosproxy_obj()], Operators(())) == []
+
+
+def test_operators_that_are_not_ready() -> None:
+    (finding,) = operator_findings(Operators((operator_obj(ready=False),)))
+    assert finding.text == "no operator is ready (pods system/o), so no pod is wired"
+    assert finding.fix.startswith("read the operator's log: kubectl -n system logs -l")
+
+
+@pytest.mark.parametrize("option", [("--namespace=a", "--namespace=b"), ("--namespace", "a")])
+def test_a_namespace_that_no_operator_manages(option: tuple[str, ...]) -> None:
+    """The doctor asked whether the operator runs, and said that no pod is selected."""
+    operators = Operators((operator_obj(*option),))
+    (finding,) = cluster_findings([rosproxy_obj()], operators)
+    assert finding.severity is Severity.ERROR
+    assert finding.text.startswith(f"no operator manages the namespace {NAMESPACE} (option ")
+    assert "the chart's value namespaces" in finding.fix
+    another = operator_obj(f"--namespace={NAMESPACE}")
+    (finding,) = cluster_findings([rosproxy_obj()], Operators((operator_obj(*option), another)))
+    assert "has not looked at the last change" in finding.text
+    assert "kubectl -n system logs -l" in finding.fix
+
+
+async def test_an_operator_that_may_not_write_the_status(server: ApiServer, api: Api) -> None:
+    put_operator(server)
+    facts = DoctorFacts(api, ())
+    operators = await in_thread(facts.operators, [rosproxy_obj()])
+    assert server.bodies[-1]["spec"]["user"] == "system:serviceaccount:system:op"
+    (finding,) = cluster_findings([rosproxy_obj()], operators)
+    assert finding.text.startswith("the operator lacks the right to patch rosproxies/status")
+    server.granted = True
+    operators = await in_thread(facts.operators, [rosproxy_obj()])
+    (finding,) = cluster_findings([rosproxy_obj()], operators)
+    assert "has not looked at the last change" in finding.text
+    assert facts.refused == []
+
+
+async def test_a_webhook_that_no_operator_serves(server: ApiServer, api: Api) -> None:
+    put_operator(server)
+    (finding,) = await about_webhook(api)
+    assert finding.severity is Severity.INFO
     assert "no MutatingWebhookConfiguration has the webhook wire.rosproxy.io" in finding.text
 
 
@@ -120,6 +172,7 @@ async def test_rights_that_are_missing_are_named_and_the_rest_is_looked_at(
     server: ApiServer, api: Api
 ) -> None:
     forbid(server, "endpointslices", "discovery.k8s.io", 'in the namespace "system"')
+    put_operator(server)
     put_webhook(server, "")
     put_service(server)
     found, refused = await about_webhook(api)

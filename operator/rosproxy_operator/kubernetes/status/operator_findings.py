@@ -1,0 +1,140 @@
+"""Whether an operator runs, and whether it manages a RosProxy's namespace, for the doctor.
+
+Without an operator everything else that the doctor finds is a consequence.
+"""
+
+from collections.abc import Iterator
+
+import msgspec
+
+from rosproxy.admin.doctor_finding import DoctorFinding, error
+from rosproxy.telemetry.text import listed
+from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
+from rosproxy_operator.kubernetes.resources.model import Json, Name
+
+OPERATORS = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=rosproxy"
+"""Label selector of the operators' pods."""
+_CHECK = "operator"
+_OPTION = "--namespace"
+
+
+class Operators(msgspec.Struct, frozen=True):
+    """What the cluster has of operators; ``pods`` None: the doctor could not read them.
+
+    ``refused_namespaces`` are those in which the operator's role does not let it write the status
+    of a RosProxy.
+    """
+
+    pods: tuple[Json, ...] | None = None
+    refused_namespaces: frozenset[str] = frozenset()
+
+    @property
+    def missing(self) -> bool:
+        """Whether there is certainly no operator."""
+        return self.pods == ()
+
+    @property
+    def namespaces(self) -> frozenset[str]:
+        """The namespaces that they manage; empty for all, or if that is not known."""
+        managed = [frozenset(_namespaces(pod)) for pod in self.pods or ()]
+        return frozenset().union(*managed) if all(managed) else frozenset()
+
+
+UNKNOWN = Operators()
+
+
+def operator_findings(operators: Operators) -> Iterator[DoctorFinding]:
+    """An error if no operator runs."""
+    if operators.missing:
+        text = "no operator runs in the cluster, so no pod is wired and no proxy is created"
+        fix = (
+            "install the operator: helm upgrade --install rosproxy charts/rosproxy-operator "
+            "--namespace rosproxy-system --create-namespace, or kubectl apply -f "
+            "manifests/install.yaml"
+        )
+        yield error(_CHECK, _CHECK, text, fix)
+    elif operators.pods and not any(ready_since(pod) for pod in operators.pods):
+        ids = sorted(str(_id(pod)) for pod in operators.pods)
+        text = f"no operator is ready (pods {listed(ids)}), so no pod is wired"
+        namespace = _id(operators.pods[0]).namespace
+        fix = f"{_log(namespace)}; {describe_operators(namespace)}"
+        yield error(_CHECK, _CHECK, text, fix)
+
+
+def unmanaged(rosproxy: Name, operators: Operators) -> DoctorFinding | None:
+    """The error about a RosProxy in a namespace that no operator manages."""
+    managed = operators.namespaces
+    if not managed or rosproxy.namespace in managed:
+        return None
+    text = (
+        f"no operator manages the namespace {rosproxy.namespace} (option {_OPTION} of the "
+        f"operator: {listed(sorted(managed))})"
+    )
+    fix = (
+        "add the namespace to the chart's value namespaces and run helm upgrade, or create the "
+        "RosProxy in a namespace of the value"
+    )
+    return error(_CHECK, f"rosproxy {rosproxy}", text, fix)
+
+
+def unnoticed(rosproxy: Name, operators: Operators) -> DoctorFinding:
+    """The error about a RosProxy whose last change no operator has looked at."""
+    subject = f"rosproxy {rosproxy}"
+    namespace = rosproxy.namespace
+    if namespace in operators.refused_namespaces:
+        text = "the operator lacks the right to patch rosproxies/status in this namespace"
+        fix = (
+            "install the operator's chart or manifests again, which contain the role; with "
+            "rbac.create=false, add the right to your role"
+        )
+        return error(_CHECK, subject, text, fix)
+    text = "the operator has not looked at the last change of this RosProxy yet"
+    fix = f"check that the operator runs: kubectl get pods -A -l {OPERATORS}"
+    if operators.pods:
+        fix = _log(_id(operators.pods[0]).namespace)
+    return error(_CHECK, subject, text, fix)
+
+
+def _log(namespace: str) -> str:
+    return (
+        f"read the operator's log: kubectl -n {namespace} logs -l "
+        "app.kubernetes.io/component=operator --prefix"
+    )
+
+
+def describe_operators(namespace: str) -> str:
+    """The commands that show why operators are not ready."""
+    return (
+        f"read kubectl -n {namespace} describe pods -l app.kubernetes.io/component=operator, and "
+        f"helm -n {namespace} list"
+    )
+
+
+def ready_since(pod: Json) -> str:
+    """Since when a pod is ready, in RFC 3339; empty if it is not."""
+    conditions = submaps(submap(pod, "status"), "conditions")
+    ready = (c for c in conditions if c.get("type") == "Ready" and c.get("status") == "True")
+    return next((text_at(c, "lastTransitionTime") for c in ready), "")
+
+
+def service_account(operators: Operators) -> Name | None:
+    """The service account of the operator's pods; None if there are none."""
+    pods = operators.pods or ()
+    ids = (Name(_id(p).namespace, text_at(submap(p, "spec"), "serviceAccountName")) for p in pods)
+    return next((id for id in ids if id.name), None)
+
+
+def _id(pod: Json) -> Name:
+    metadata = submap(pod, "metadata")
+    return Name(text_at(metadata, "namespace"), text_at(metadata, "name"))
+
+
+def _namespaces(pod: Json) -> Iterator[str]:
+    """The values of the option --namespace, in either of its forms."""
+    for container in submaps(submap(pod, "spec"), "containers"):
+        words = [str(word) for word in container.get("args") or ()]
+        for word, following in zip(words, [*words[1:], ""], strict=True):
+            if word == _OPTION:
+                yield following
+            elif word.startswith(f"{_OPTION}="):
+                yield word.partition("=")[2]
