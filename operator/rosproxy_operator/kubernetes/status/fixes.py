@@ -10,8 +10,7 @@ from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_F
 _EDIT = "kubectl -n {of.namespace} edit rosproxy {of.name}"
 _DESCRIBE = "read kubectl -n {of.namespace} describe rosproxy {of.name}"
 _PODS = f"read kubectl -n {{of.namespace}} describe pods -l {PROXY_OF}={{of.name}}"
-_RESTART = "kubectl -n {of.namespace} rollout restart deployment/NAME"
-_TEMPLATE = f"correct the pod's template as the message says, then run {_RESTART}"
+_BY_POD = "follow the message, which gives the command for each pod"
 _BY_REASON = {
     "Ambiguous": "set the label in the pod's template to the name of one RosProxy, such as "
     f"{INJECT}={{of.name}}",
@@ -28,8 +27,8 @@ _BY_REASON = {
     "NodeNotReady": "read kubectl get nodes, and kubectl describe node NODE",
     "NotAllowed": f"change the field that the message names ({_EDIT}), or have the value allowed "
     "as the message says",
-    "NotWired": _TEMPLATE,
-    "OtherDomain": _TEMPLATE,
+    "NotWired": _BY_POD,
+    "OtherDomain": _BY_POD,
     "PolicyRefused": f"change spec.image, or remove spec.image: {_EDIT}",
     "PortConflict": f"set a spec.portWindow without the ports that other programs use: {_EDIT}",
     "PortsExhausted": f"lower spec.ports, or widen spec.portWindow: {_EDIT}",
@@ -40,8 +39,8 @@ _BY_REASON = {
     f"{ADMIN_PORT} of pods with the label {PROXY_OF}={{of.name}}; read kubectl -n {{of.namespace}} "
     "get networkpolicies",
     "ProxyWarns": "read the findings of the proxies' doctors below",
-    "UnknownName": "correct the name where the message says; if the name is on a pod, correct the "
-    f"pod's template, then run {_RESTART}",
+    "UnknownName": "correct the name where the message says; for a pod, run the command in the "
+    "message",
 }
 
 
