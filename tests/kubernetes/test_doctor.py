@@ -4,16 +4,20 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tests.docker.engine import wait_until
 from tests.kubernetes import api, release
 from tests.kubernetes.cluster.control_plane import kubectl
-from tests.kubernetes.cluster.layout import KUBECONFIG
+from tests.kubernetes.cluster.layout import KUBECONFIG, NODES
+from tests.kubernetes.cluster.network import inside
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
-from tests.kubernetes.rosproxies import NOWHERE, rosproxy
+from tests.kubernetes.rosproxies import NOWHERE, rosproxy, wait_event
 from tests.kubernetes.traffic import START, wait_for_service
 
 WEBHOOKS = "mutatingwebhookconfigurations"
@@ -100,6 +104,42 @@ def test_a_webhook_whose_configuration_is_gone_is_told(net: Namespace) -> None:
     assert severity == "error"
     assert "no MutatingWebhookConfiguration has the webhook wire.rosproxy.io" in text
     release.wait_operator()
+
+
+@contextmanager
+def webhook_cut_off() -> Iterator[None]:
+    """Let no packet get to port 9443 of the operators' pods, as a firewall does."""
+    rule = ("FORWARD", "-p", "tcp", "--dport", "9443", "-j", "DROP")
+    for node in NODES:
+        inside(node, "iptables", "-w", "-I", *rule)
+    try:
+        yield
+    finally:
+        for node in NODES:
+            inside(node, "iptables", "-w", "-D", *rule)
+        release.wait_operator()
+
+
+def test_a_webhook_that_the_api_server_does_not_reach_is_told(net: Namespace) -> None:
+    made = rosproxy(net.name, master=NOWHERE)
+    wait_until(lambda: bool(made.service), 60, made.tell)
+    settled = time.monotonic() + 62
+    wait_until(lambda: time.monotonic() > settled, 90, "RosProxy and operators are a minute old")
+    with webhook_cut_off():
+        pod = net.idle(on="node1")
+    wait_event(net.name, pod.name, "Pod", "NotWired", "although an operator was ready")
+    code, findings = doctor(net.name)
+    assert code == 1
+    (found,) = [f for f in findings if f["check"] == "webhook" and f["severity"] == "error"]
+    assert found["text"].startswith("the API server reached no operator (port 9443)")
+    assert f"{net.name}/{pod.name}" in found["text"]
+
+
+def test_labelled_pods_without_a_rosproxy_are_told(net: Namespace) -> None:
+    pod = net.idle(on="node1")
+    (found,) = [f for f in doctor(net.name)[1] if f["check"] == "pods"]
+    assert (found["severity"], found["subject"]) == ("error", f"namespace {net.name}")
+    assert pod.name in found["text"]
 
 
 def test_who_may_not_look_is_told_which_right_is_missing(net: Namespace, tmp_path: Path) -> None:

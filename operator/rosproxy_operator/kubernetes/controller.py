@@ -39,7 +39,11 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxies.proxy_sync import ClusterProxySync
 from rosproxy_operator.kubernetes.proxies.sandbox import SandboxFailures
 from rosproxy_operator.kubernetes.proxies.token_key import TokenKey
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
+from rosproxy_operator.kubernetes.resources.cluster import (
+    ClusterSnapshot,
+    ProxyPod,
+    WebhookState,
+)
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
@@ -77,6 +81,7 @@ class KubernetesController:
         self._api = api
         self._metrics = metrics
         self._term = term
+        self._webhook = WebhookState(settings.webhook is not None, stamp(time.time()))
         self._acting = 0
         pace = Pace("API server", settings.resync, DEBOUNCE, LONGEST_LOOK)
         self._loop = loop = ControlLoop(pace, metrics)
@@ -196,7 +201,10 @@ class KubernetesController:
         observed = self._sandbox.with_messages(observed)
         self._proxy_sync.follow(observed.proxies, observed.key)
         observed = replace(
-            observed, reports=self._proxy_sync.reports, failures=self._applier.failures
+            observed,
+            reports=self._proxy_sync.reports,
+            failures=self._applier.failures,
+            webhook=self._webhook,
         )
         scope = self._due.due_partition(
             observed, touched.namespaces, touched.nodes, time.monotonic()

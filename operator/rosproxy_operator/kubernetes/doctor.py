@@ -23,9 +23,11 @@ from rosproxy_operator.common.proxy_doctor import (
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
-from rosproxy_operator.kubernetes.resources.checks import submap, texts_at
+from rosproxy_operator.kubernetes.planner.pods.labelled import lonely_findings, unreached
+from rosproxy_operator.kubernetes.resources.checks import submap, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import PROXY, component
+from rosproxy_operator.kubernetes.resources.spec import rosproxies as read_rosproxies
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import event_findings
 from rosproxy_operator.kubernetes.status.operator_findings import operator_findings
@@ -52,10 +54,14 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         own_pods = api.own_pods()
         facts = DoctorFacts(api, namespaces)
         operators = facts.operators(rosproxies)
+        pods = facts.labelled_pods()
+        usable, _ = read_rosproxies(rosproxies)
+        cut_off = unreached(pods, [*usable.values()], operators.ready_since)
         findings = [
             *operator_findings(operators),
             *cluster_findings(rosproxies, operators),
-            *webhook_findings(facts.webhook(operators)),
+            *lonely_findings(pods, namespaces_of(rosproxies)),
+            *webhook_findings(facts.webhook(operators, cut_off)),
             *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),
             *facts.refused,
         ]
@@ -65,6 +71,11 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
     with ThreadPoolExecutor(AT_ONCE) as threads:
         answers = threads.map(lambda pod: [*_ask(pod["metadata"], names)], proxies)
         return [*findings, *without_names_of_others([*answers], names)]
+
+
+def namespaces_of(objs: Iterable[Json]) -> frozenset[str]:
+    """The namespaces of objects."""
+    return frozenset(text_at(submap(obj, "metadata"), "namespace") for obj in objs)
 
 
 def running_proxies(own_pods: Iterable[Json]) -> list[Json]:

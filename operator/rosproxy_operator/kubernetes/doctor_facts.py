@@ -18,8 +18,10 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiNotFound,
 )
 from rosproxy_operator.kubernetes.api.rbac import missing_right
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at
-from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.model import Json, Name, Pod
+from rosproxy_operator.kubernetes.resources.names import INJECT
 from rosproxy_operator.kubernetes.status.condition_findings import is_unnoticed
 from rosproxy_operator.kubernetes.status.event_findings import MOST, RecentEvent, recent_events
 from rosproxy_operator.kubernetes.status.operator_findings import (
@@ -62,7 +64,18 @@ class DoctorFacts:
         may_write = self._api.may_patch_status
         return frozenset(n for n in sorted(namespaces) if not may_write(account, n))
 
-    def webhook(self, operators: Operators) -> WebhookFacts:
+    def labelled_pods(self) -> list[Pod]:
+        """The users' pods with the label rosproxy.io/inject."""
+        objs: list[Json] = []
+        for place in self._places:
+            objs += self._ask("pods", partial(self._labelled, place)) or []
+        pods = map(objects.pod, objs)
+        return [pod for pod in pods if not (pod.ended or pod.deleting)]
+
+    def _labelled(self, place: str) -> list[Json]:
+        return [*self._api.list_fresh("pods", place, labels=INJECT)]
+
+    def webhook(self, operators: Operators, unreached: Sequence[str]) -> WebhookFacts:
         """What there is of the webhook."""
         api = self._api
         listed = self._ask("webhook", lambda: api.list_fresh(WEBHOOKS, ""))
@@ -74,7 +87,7 @@ class DoctorFacts:
         ready: dict[Name, int | None] = {}
         for service in {service_of(configuration) for configuration in ours}:
             self._ask("webhook", partial(self._count_ready, service, ready))
-        return WebhookFacts(ours, ready=ready)
+        return WebhookFacts(ours, ready=ready, unreached=unreached)
 
     def events(self, rosproxies: Sequence[Json], own_pods: Sequence[Json]) -> list[RecentEvent]:
         """The Warning Events of these, and of users' pods that are there, the newest first."""

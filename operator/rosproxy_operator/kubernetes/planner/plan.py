@@ -221,6 +221,7 @@ def _problems(
     """All that is wrong with a RosProxy."""
     address = context.cluster_ip(rosproxy)
     pods = context.view.selected_pods.get(rosproxy.id, ()) if address else ()
+    webhook = context.observed.webhook
     unlisted = context.observed.policies_error if context.settings.network_policy else ""
     text = f"the operator can't list NetworkPolicies, so this RosProxy gets none: {unlisted}"
     return (
@@ -228,9 +229,10 @@ def _problems(
         *findings(rosproxy, states, context.retries.failures(rosproxy.id)),
         *(f for f in (*shared, *context.ranges.findings) if f.of == rosproxy.id),
         *filter(
-            None, (wiring_finding(pod, rosproxy, address) for pod in pods if rosproxy.spec.ros1)
+            None,
+            (wiring_finding(p, rosproxy, address, webhook) for p in pods if rosproxy.spec.ros1),
         ),
-        *(f for pod in pods for f in ros2_findings(pod, rosproxy, address)),
+        *(f for pod in pods for f in ros2_findings(pod, rosproxy, address, webhook)),
         *lan_relay_findings(context, rosproxy),
         *misspellings(context.view, rosproxy),
     )

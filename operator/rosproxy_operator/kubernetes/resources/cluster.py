@@ -173,6 +173,13 @@ class RosProxyOnNode(msgspec.Struct, frozen=True):
     image_check: HelperPod | None = None
 
 
+class WebhookState(msgspec.Struct, frozen=True):
+    """Whether the operator serves the webhook, and since when, in RFC 3339; empty: not known."""
+
+    served: bool = True
+    since: str = ""
+
+
 class ClusterSnapshot(msgspec.Struct, frozen=True):
     """A cluster at one moment, as far as it matters.
 
@@ -188,8 +195,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     listed. ``key`` is that from which the proxies' tokens are made. ``unusable`` are the RosProxies
     that can't be read at all: what they have is left as it is. ``reports`` are what the proxies say
     of themselves, by the uid of the pod; ``failures`` are, by RosProxy and object, what the API
-    server said of the actions that failed at the last try: neither is listed, the operator puts
-    them here.
+    server said of the actions that failed at the last try; ``webhook`` is that of this operator:
+    none of these is listed, the operator puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -211,3 +218,4 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     reports: Mapping[str, ProxyReport] = {}
     unusable: Mapping[Name, InvalidRosProxy] = {}
     failures: Mapping[Name, Mapping[Name, str]] = {}
+    webhook: WebhookState = WebhookState()

@@ -34,6 +34,11 @@ class Operators(msgspec.Struct, frozen=True):
         return self.pods == ()
 
     @property
+    def ready_since(self) -> str:
+        """Since when one of them is ready, in RFC 3339; empty if none is."""
+        return min(filter(None, map(ready_since, self.pods or ())), default="")
+
+    @property
     def namespaces(self) -> frozenset[str]:
         """The namespaces that they manage; empty for all, or if that is not known."""
         managed = [frozenset(_namespaces(pod)) for pod in self.pods or ()]
@@ -53,7 +58,7 @@ def operator_findings(operators: Operators) -> Iterator[DoctorFinding]:
             "manifests/install.yaml"
         )
         yield error(_CHECK, _CHECK, text, fix)
-    elif operators.pods and not any(ready_since(pod) for pod in operators.pods):
+    elif operators.pods and not operators.ready_since:
         ids = sorted(str(_id(pod)) for pod in operators.pods)
         text = f"no operator is ready (pods {listed(ids)}), so no pod is wired"
         namespace = _id(operators.pods[0]).namespace

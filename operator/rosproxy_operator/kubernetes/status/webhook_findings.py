@@ -3,12 +3,12 @@
 The webhook refuses no pod: if it fails, pods start unwired, and their nodes don't find the proxy.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
-from rosproxy.telemetry.text import plural
+from rosproxy.telemetry.text import listed, plural
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import INJECT
@@ -26,12 +26,14 @@ class WebhookFacts(msgspec.Struct, frozen=True):
 
     ``configurations`` are the MutatingWebhookConfigurations with our webhook, ``operators`` the
     operators' pods; ``ready`` is how many endpoints of a Service take calls, None where there is no
-    such Service; those that could not be looked at are left out.
+    such Service; those that could not be looked at are left out. ``unreached`` are the pods that no
+    operator has wired, though an operator was ready.
     """
 
     configurations: tuple[Json, ...] | None = None
     operators: tuple[Json, ...] | None = None
     ready: Mapping[Name, int | None] = {}
+    unreached: Sequence[str] = ()
 
 
 def our_webhook(configuration: Json) -> Json:
@@ -97,9 +99,24 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
     elif not ready:
         text = f"the Service {service} of the webhook has no ready endpoint, so no pod is wired"
         yield error(_CHECK, subject, text, f"{describe_operators(service.namespace)}; {_ANEW}")
+    elif not lacks_ca and facts.unreached:
+        yield _cut_off(subject, service, facts.unreached)
     elif not lacks_ca:
         text = f"{plural(ready, 'operator')} ready to wire pods"
         yield ok(_CHECK, subject, text)
+
+
+def _cut_off(subject: str, service: Name, pods: Sequence[str]) -> DoctorFinding:
+    text = (
+        "the API server reached no operator (port 9443) when these pods were created, although an "
+        f"operator was ready: {listed(pods)}"
+    )
+    fix = (
+        "allow connections from the API server to port 9443 of the operator's pods in namespace "
+        f"{service.namespace} (NetworkPolicy, firewall of the control plane); the API server's log "
+        f'has failed calling webhook "{NAME}"; {_ANEW}'
+    )
+    return error(_CHECK, subject, text, fix)
 
 
 def _ca_fix(metadata: Json, service: Name) -> str:

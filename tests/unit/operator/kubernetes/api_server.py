@@ -282,7 +282,7 @@ def _status(code: int, message: str) -> web.Response:
 
 
 def _labelled(selector: str, labels: dict[str, str]) -> bool:
-    """Whether a selector fits: ``a=b``, ``a in (b,c)`` and ``a notin (b,c)`` are known."""
+    """Whether a selector fits: ``a``, ``a=b``, ``a in (b,c)`` and ``a notin (b,c)`` are known."""
     for requirement in filter(None, _parts(selector)):
         if " notin " in requirement:
             key, values = requirement.split(" notin ")
@@ -293,8 +293,8 @@ def _labelled(selector: str, labels: dict[str, str]) -> bool:
             if labels.get(key) not in values.strip("()").split(","):
                 return False
         else:
-            key, _, value = requirement.partition("=")
-            if labels.get(key) != value:
+            key, equals, value = requirement.partition("=")
+            if key not in labels or (equals and labels[key] != value):
                 return False
     return True
 

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from rosproxy.admin.doctor_finding import DoctorFinding, Severity
 from rosproxy_operator.common.threads import in_thread
@@ -13,6 +14,7 @@ from rosproxy_operator.kubernetes.api.api_client import Api, ApiNotFound
 from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.doctor import running_proxies
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
+from rosproxy_operator.kubernetes.planner.pods.labelled import lonely_findings, unreached
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import (
     COMPONENT_LABEL,
@@ -30,7 +32,16 @@ from rosproxy_operator.kubernetes.status.event_findings import (
 from rosproxy_operator.kubernetes.status.operator_findings import Operators, operator_findings
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 from tests.unit.operator.kubernetes.api_server import ApiServer
-from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, proxy_obj, rosproxy_obj
+from tests.unit.operator.kubernetes.builders_api import (
+    CLUSTER_IP,
+    NAMESPACE,
+    URI,
+    pod,
+    pod_obj,
+    proxy_obj,
+    rosproxy,
+    rosproxy_obj,
+)
 
 Obj = dict[str, Any]
 NAME = "rosproxy-operator"
@@ -65,11 +76,14 @@ def put_operator(server: ApiServer, *args: str) -> None:
     server.put("pods", operator_obj(*args), "system")
 
 
-async def about_webhook(api: Api) -> list[DoctorFinding]:
+async def about_webhook(api: Api, unreached: tuple[str, ...] = ()) -> list[DoctorFinding]:
     def look() -> list[DoctorFinding]:
         facts = DoctorFacts(api, ())
         operators = facts.operators([])
-        found = [*operator_findings(operators), *webhook_findings(facts.webhook(operators))]
+        found = [
+            *operator_findings(operators),
+            *webhook_findings(facts.webhook(operators, unreached)),
+        ]
         return [*found, *facts.refused]
 
     return await in_thread(look)
@@ -83,6 +97,49 @@ async def test_a_webhook_that_can_work(server: ApiServer, api: Api) -> None:
     put_service(server, True, False, True)
     (finding,) = await about_webhook(api)
     assert (finding.severity, finding.text) == (Severity.OK, "2 operators ready to wire pods")
+
+
+async def test_a_webhook_that_the_api_server_does_not_reach(server: ApiServer, api: Api) -> None:
+    """The doctor said "2 operators ready to wire pods", while each new pod stayed unwired."""
+    put_operator(server)
+    put_webhook(server)
+    put_service(server, True)
+    (finding,) = await about_webhook(api, ("robots/talker",))
+    assert finding.severity is Severity.ERROR
+    assert finding.text == (
+        "the API server reached no operator (port 9443) when these pods were created, although an "
+        "operator was ready: robots/talker"
+    )
+    assert "port 9443 of the operator's pods in namespace system" in finding.fix
+
+
+def test_which_pods_show_that_the_api_server_reached_no_operator() -> None:
+    of = replace(rosproxy(cluster_ip=CLUSTER_IP), created="2026-01-02T00:00:00Z")
+    late: Obj = {"created": "2026-02-01T00:00:00Z"}
+    pods = [
+        pod("unwired", **late),
+        pod("wired", wired_master_uri=URI, **late),
+        pod("its-own", own_masters=("http://mine:1",), **late),
+        pod("unlabelled", {}, **late),
+        pod("astray", {"rosproxy.io/inject": "leg"}, **late),
+        pod("old", created="2026-01-01T00:00:00Z"),
+    ]
+    assert unreached(pods, [of], "2026-01-31T00:00:00Z") == ["robots/unwired"]
+    assert unreached(pods, [of], "2026-01-31T23:59:30Z") == []
+    assert unreached(pods, [of], "") == []
+
+
+async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer, api: Api) -> None:
+    """Only an admission warning mentioned them, which no user of a Deployment sees."""
+    for name in ("talker", "listener"):
+        server.put("pods", pod_obj(name, {"rosproxy.io/inject": "true"}), NAMESPACE)
+    server.put("pods", pod_obj("off", {"rosproxy.io/inject": "false"}), NAMESPACE)
+    pods = await in_thread(DoctorFacts(api, ()).labelled_pods)
+    (finding,) = lonely_findings(pods, frozenset({"other"}))
+    assert (finding.severity, finding.subject) == (Severity.ERROR, f"namespace {NAMESPACE}")
+    assert "2 pods with the label rosproxy.io/inject (listener, talker)" in finding.text
+    assert "create a RosProxy in the namespace, then run kubectl -n robots delete" in finding.fix
+    assert list(lonely_findings(pods, frozenset({NAMESPACE}))) == []
 
 
 CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}
@@ -320,8 +377,8 @@ def test_only_running_proxies_have_a_doctor() -> None:
     """A LAN relay has none: its pod was reported as an ERROR, with a cure for Docker."""
     proxy = proxy_obj("robot")
     pods = [proxy, *(copy.deepcopy(proxy) for _ in range(3))]
-    for pod, component in zip(pods[1:], (LAN_RELAY, IMAGE_CHECK, PROXY), strict=True):
-        pod["metadata"]["labels"][COMPONENT_LABEL] = component
+    for obj, component in zip(pods[1:], (LAN_RELAY, IMAGE_CHECK, PROXY), strict=True):
+        obj["metadata"]["labels"][COMPONENT_LABEL] = component
     pods[3]["status"]["phase"] = "Pending"
     assert running_proxies(pods) == [proxy]
 

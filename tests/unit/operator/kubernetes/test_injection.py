@@ -19,6 +19,7 @@ from rosproxy_operator.kubernetes.planner.pods.injection import (
     wiring_finding,
 )
 from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,
     MasterSpec,
@@ -363,3 +364,28 @@ def test_a_pod_that_is_not_wired_is_told_what_to_do(unwired, said):
 
     assert finding is not None
     assert said in finding.text
+
+
+@pytest.mark.parametrize(
+    ("created", "said"),
+    [
+        ("2026-01-03T00:01:00Z", "although an operator was ready. Allow connections from the API"),
+        ("2026-01-03T00:00:59Z", "when the pod was created. Run kubectl"),
+    ],
+)
+def test_a_pod_that_no_operator_wired_though_one_was_ready_needs_another_fix(created, said):
+    """The advice was to create the pod anew, which fails again while port 9443 is closed."""
+    of = replace(rosproxy(), created="2026-01-02T00:00:00Z")
+    webhook = WebhookState(since="2026-01-03T00:00:00Z")
+    finding = wiring_finding(pod(created=created), of, CLUSTER_IP, webhook)
+
+    assert finding is not None
+    assert said in finding.text
+
+
+def test_without_the_webhook_the_template_sets_the_variable():
+    unwired = pod(workload="deployment/talker")
+    finding = wiring_finding(unwired, rosproxy(), CLUSTER_IP, WebhookState(served=False))
+
+    assert finding is not None
+    assert "(webhook.enabled=false). Set ROS_MASTER_URI in the template: kubectl" in finding.text

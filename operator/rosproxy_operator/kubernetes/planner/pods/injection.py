@@ -7,6 +7,7 @@ webhook has seen.
 """
 
 from collections.abc import Collection, Iterable, Mapping
+from datetime import datetime, timedelta
 from typing import Any
 
 import msgspec
@@ -15,6 +16,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.kubernetes.resources.checks import submap, submaps, text_at, texts_at
+from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,
     ClusterFinding,
@@ -38,6 +40,9 @@ from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"
 """Annotation of the API server's picture of a static pod: a change of it changes no container."""
+SETTLED = timedelta(minutes=1)
+"""By so much a pod is newer than what ought to have wired it, if that was ready for certain."""
+UNKNOWN = WebhookState()
 _KINDS = ("initContainers", "containers")
 
 
@@ -114,12 +119,14 @@ def wire(pod: Json, target: Target, host_aliases: Iterable[Json] = ()) -> Wiring
     return Wiring({**spec, **wired} if changed else None, new_annotations)
 
 
-def wiring_finding(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | None:
+def wiring_finding(
+    pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState = UNKNOWN
+) -> ClusterFinding | None:
     """What is wrong with a selected pod's ROS_MASTER_URI (reason NotWired); None if nothing is.
 
     ``cluster_ip`` is that of the RosProxy's Service.
     """
-    text = _wrong_master(pod, rosproxy, cluster_ip)
+    text = _wrong_master(pod, rosproxy, cluster_ip, webhook)
     return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
 
 
@@ -183,7 +190,16 @@ def _is_older(pod: Pod, rosproxy: RosProxy) -> bool:
     return bool(pod.created) and pod.created < rosproxy.created
 
 
-def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
+def is_late(pod: Pod, rosproxy: RosProxy, ready_since: str) -> bool:
+    """Whether a pod is newer than its RosProxy and than a ready operator, by `SETTLED`."""
+    if not (pod.created and rosproxy.created and ready_since):
+        return False
+    others = (rosproxy.created, ready_since)
+    latest = max(datetime.fromisoformat(time) for time in others)
+    return datetime.fromisoformat(pod.created) - latest >= SETTLED
+
+
+def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str, webhook: WebhookState) -> str:
     masters = _masters_of(rosproxy)
     around = [uri for uri in pod.own_masters if not _leads_to_proxy(uri, rosproxy.id, cluster_ip)]
     foreign = [uri for uri in around if not _names_one(uri, masters)]
@@ -206,19 +222,30 @@ def _wrong_master(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> str:
         )
     if not around and (pod.wired_master_uri or pod.own_masters):
         return ""
-    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy)
+    return missing_variable_text("ROS_MASTER_URI", pod, rosproxy, webhook)
 
 
-def missing_variable_text(variable: str, pod: Pod, rosproxy: RosProxy) -> str:
+def missing_variable_text(
+    variable: str, pod: Pod, rosproxy: RosProxy, webhook: WebhookState
+) -> str:
     """The text about a pod without a variable that names the proxy: the reason and the fix."""
     text = f"has no variable {variable} with the address of the proxy"
     if INJECT not in pod.labels:
         label = f"{INJECT}={rosproxy.id.name}"
         return f"{text}. {edited(f'Add the label {label} to the template', pod)}"
-    reason = "the API server reached no operator (port 9443) when the pod was created"
+    restart = f"Run {restart_of(pod)}"
+    if not webhook.served:
+        fix = edited(f"Set {variable} in the template", pod)
+        return f"{text}, since the operator serves no webhook (webhook.enabled=false). {fix}"
     if _is_older(pod, rosproxy):
-        reason = f"the pod is older than RosProxy {rosproxy.id.name}"
-    return f"{text}, since {reason}. Run {restart_of(pod)}"
+        return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
+    reason = "the API server reached no operator (port 9443) when the pod was created"
+    if is_late(pod, rosproxy, webhook.since):
+        return (
+            f"{text}, since {reason}, although an operator was ready. Allow connections from the "
+            f"API server to port 9443 of the operator's pods (NetworkPolicy, firewall). {restart}"
+        )
+    return f"{text}, since {reason}. {restart}"
 
 
 def _leads_to_proxy(uri: str, rosproxy_id: Name, cluster_ip: str) -> bool:

@@ -11,10 +11,12 @@ from collections.abc import Iterator
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.ros2 import is_dds
 from rosproxy_operator.kubernetes.planner.pods.injection import (
+    UNKNOWN,
     has_peers,
     missing_variable_text,
     restart_of,
 )
+from rosproxy_operator.kubernetes.resources.cluster import WebhookState
 from rosproxy_operator.kubernetes.resources.model import (
     VALUE_AT_RUNTIME,
     ClusterFinding,
@@ -32,14 +34,16 @@ _RANGES_WITHOUT_PEERS = ("OFF", "SYSTEM_DEFAULT")
 """Values of ROS_AUTOMATIC_DISCOVERY_RANGE with which static peers are not used."""
 
 
-def ros2_findings(pod: Pod, rosproxy: RosProxy, address: str) -> Iterator[ClusterFinding]:
+def ros2_findings(
+    pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState = UNKNOWN
+) -> Iterator[ClusterFinding]:
     """What is wrong with a pod's variables; ``address`` is that of the RosProxy's Service."""
     if rosproxy.spec.ros2 is None:
         return
     problems = dict.fromkeys(
         p for c in pod.containers for p in _problems(c, pod, rosproxy, address)
     )
-    if (text := _peers_problem(pod, rosproxy, address)) and not any(
+    if (text := _peers_problem(pod, rosproxy, address, webhook)) and not any(
         r == "NotWired" for r, _ in problems
     ):
         problems["NotWired", text] = None
@@ -47,7 +51,7 @@ def ros2_findings(pod: Pod, rosproxy: RosProxy, address: str) -> Iterator[Cluste
         yield pod_finding(pod, rosproxy, reason, text, fatal=False)
 
 
-def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str) -> str:
+def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str, webhook: WebhookState) -> str:
     """What is wrong with what the webhook has set, or has not."""
     if pod.static_peers and pod.static_peers != address:
         return (
@@ -56,7 +60,7 @@ def _peers_problem(pod: Pod, rosproxy: RosProxy, address: str) -> str:
         )
     if pod.static_peers or any(map(has_peers, pod.containers)):
         return ""
-    return missing_variable_text("ROS_STATIC_PEERS", pod, rosproxy)
+    return missing_variable_text("ROS_STATIC_PEERS", pod, rosproxy, webhook)
 
 
 def _problems(

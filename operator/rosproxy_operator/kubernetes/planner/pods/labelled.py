@@ -1,0 +1,49 @@
+"""What is wrong with labelled pods that no operator is needed to see, for the doctor."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from rosproxy.admin.doctor_finding import DoctorFinding, error
+from rosproxy.telemetry.text import listed, plural
+from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
+from rosproxy_operator.kubernetes.planner.pods.injection import (
+    has_come_unwired,
+    is_late,
+    restart_of,
+)
+from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, wants_proxy
+from rosproxy_operator.kubernetes.resources.model import Pod, RosProxy
+from rosproxy_operator.kubernetes.resources.names import INJECT
+
+MOST_COMMANDS = 5
+"""Commands in a fix."""
+
+
+def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Iterator[DoctorFinding]:
+    """An error for each namespace that has labelled pods, but no RosProxy."""
+    lonely = (p for p in pods if wants_proxy(p) and p.id.namespace not in with_rosproxy)
+    for namespace, group in sorted(group_by_key((p.id.namespace, p) for p in lonely).items()):
+        names = listed(sorted(p.id.name for p in group))
+        text = (
+            f"the namespace has no RosProxy, but {plural(len(group), 'pod')} with the label "
+            f"{INJECT} ({names}), so outside can't reach the ROS nodes of these pods"
+        )
+        restarts = sorted({restart_of(pod) for pod in group})[:MOST_COMMANDS]
+        fix = f"create a RosProxy in the namespace, then run {'; '.join(restarts)}"
+        yield error("pods", f"namespace {namespace}", text, fix)
+
+
+def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:
+    """The pods that no operator has wired, though an operator was ready when they were created.
+
+    ``ready_since`` is the time since when an operator is ready, in RFC 3339; empty if none is.
+    """
+    chosen = [(pod, select_rosproxy(pod, rosproxies)) for pod in pods]
+    return sorted(
+        str(pod.id)
+        for pod, rosproxy in chosen
+        if isinstance(rosproxy, RosProxy)
+        and rosproxy.cluster_ip
+        and not (pod.wired_master_uri or pod.static_peers)
+        and has_come_unwired(pod, rosproxy, rosproxy.cluster_ip)
+        and is_late(pod, rosproxy, ready_since)
+    )
