@@ -40,20 +40,23 @@ class RecentEvent(msgspec.Struct, frozen=True):
 
 
 def recent_events(
-    events: Iterable[Json], rosproxies: Iterable[Json], pods: Iterable[Json], now: float
+    events: Iterable[Json], rosproxies: Collection[Json], pods: Iterable[Json], now: float
 ) -> list[RecentEvent]:
     """The Events about these RosProxies, the operator's pods, and users' pods, the newest first.
 
-    Of users' pods those of the operator alone. Of several that are alike it is the last one;
+    Of users' pods those of the operator alone, and only beside a RosProxy: where there is none, the
+    doctor reports the pods that are there now. Of several that are alike it is the last one;
     without those that a condition tells. ``now`` is in seconds of Unix time.
     """
     uids = {text_at(submap(obj, "metadata"), "uid") for obj in rosproxies}
+    namespaces = {text_at(submap(obj, "metadata"), "namespace") for obj in rosproxies}
     pod_uids = {text_at(submap(obj, "metadata"), "uid") for obj in pods}
     told = [*_messages(rosproxies)]
     newest: dict[tuple[str, str, str], RecentEvent] = {}
     for event in sorted((_read(e, now) for e in events), key=lambda e: e.age):
         ours = uids if event.kind == KIND else pod_uids
-        matters = event.uid in ours or (event.kind == "Pod" and event.own)
+        is_users = event.kind == "Pod" and event.own and event.id.namespace in namespaces
+        matters = event.uid in ours or is_users
         if matters and not (event.own and _is_told(event, told)):
             message = event.message if event.own else ""
             newest.setdefault((event.uid, event.reason, message), event)

@@ -319,6 +319,12 @@ def test_what_a_condition_says_is_not_told_twice() -> None:
     assert found([event(pod_obj(), "NotWired", "has no ROS_MASTER_URI", **OWN)], of) == []
 
 
+def test_where_there_is_no_rosproxy_an_event_is_not_over() -> None:
+    lonely = pod_obj()
+    lonely["metadata"]["namespace"] = "elsewhere"
+    assert found([event(lonely, "NotWired", "namespace elsewhere has no RosProxy", **OWN)]) == []
+
+
 def test_events_are_bounded_and_harmless() -> None:
     proxy = proxy_obj()
     events = [event(proxy, f"R{n}", "x" * 9000 + "\x1b", float(n)) for n in range(MOST + 5)]
