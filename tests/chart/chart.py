@@ -70,6 +70,14 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "image": {"repository": "mine/operator", "digest": f"sha256:{'0' * 64}"},
             "proxy": {
                 "image": {"repository": "mine/proxy", "tag": "9", "pullPolicy": "Always"},
+                "pod": {
+                    "imagePullSecrets": [{"name": "registry"}],
+                    "nodeSelector": {"e": "f"},
+                    "tolerations": [{"operator": "Exists"}],
+                    "priorityClassName": "high",
+                    "labels": {"a.example/c": "d"},
+                    "annotations": {"a": "<b> & 'c' \"d\""},
+                },
                 "slaveControl": "Master",
                 "bounds": {"maxBuffered": 16, "maxConnectionsPerLease": 1000000},
                 "networkPolicy": {"metricsFrom": [{"podSelector": {"matchLabels": {"a": "b"}}}]},

@@ -14,6 +14,7 @@ from rosproxy.access.layers import PolicyMode
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.proxy_bounds import ProxyBounds
+from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import (
     Bounds,
@@ -129,6 +130,15 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
     assert len(tested) == bool(allow)
     expected = ProxyBounds(max_buffered=16, max_connections_per_lease=1_000_000)
     assert settings.plan.proxy_bounds == (expected if allow else ProxyBounds())
+    defaults = PodDefaults(
+        image_pull_secrets=({"name": "registry"},),
+        node_selector={"e": "f"},
+        tolerations=({"operator": "Exists"},),
+        priority_class="high",
+        labels={"a.example/c": "d"},
+        annotations={"a": "<b> & 'c' \"d\""},
+    )
+    assert settings.plan.pod == (defaults if allow else PodDefaults())
     policy = [(str(rule), layer.mode) for layer in settings.plan.policy for rule in layer.rules]
     assert policy == [("deny publish /camera/* by /driver", PolicyMode.AUDIT)] * bool(allow)
     assert settings.plan.bounds == Bounds(

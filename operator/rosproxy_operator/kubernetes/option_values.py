@@ -4,7 +4,9 @@ import msgspec
 
 from rosproxy.setting_kinds import Number, Text
 from rosproxy_operator.kubernetes.resources.checks import is_label, is_subdomain
+from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults, pod_defaults
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 
 
@@ -53,6 +55,16 @@ def read_peers(text: str) -> tuple[Json, ...] | None:
         raise ValueError(f"not a JSON list of NetworkPolicyPeers: {error}") from None
 
 
+def read_pod_defaults(text: str) -> PodDefaults | None:
+    """The chart value ``proxy.pod`` as JSON; None for no text. Raises ValueError."""
+    try:
+        return pod_defaults(msgspec.json.decode(text)) if text else None
+    except msgspec.DecodeError as error:
+        raise ValueError(f"not JSON: {error}") from None
+    except InvalidField as error:
+        raise ValueError(str(error)) from None
+
+
 class _Requirement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     key: str
     operator: str
@@ -82,5 +94,6 @@ NAMESPACE = Text("NAME", read_namespace)
 OBJECT_NAME = Text("NAME", read_object_name)
 NAME = Text("NAMESPACE/NAME", read_name)
 GLOB = Text("GLOB", read_glob)
+POD_DEFAULTS = Text("JSON", read_pod_defaults, separable=False)
 NETWORK_PEERS = Text("JSON", read_peers)
 DIRECTORY = Text("DIR", str)

@@ -26,6 +26,7 @@ from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
 from rosproxy_operator.kubernetes import option_values
 from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
@@ -140,6 +141,17 @@ class ClusterSettings(msgspec.Struct, frozen=True):
             default="Kubernetes' own",
         ),
     ] = ""
+    pod: Annotated[
+        PodDefaults,
+        Option(
+            "What the pods of all proxies have: `imagePullSecrets`, `nodeSelector`, "
+            "`tolerations`, `resources`, `priorityClassName`, `labels` and `annotations`, as a "
+            "JSON object. A RosProxy's field of the same name replaces the first four.",
+            option_values.POD_DEFAULTS,
+            name="--proxy-pod",
+            default="the resources in the chart's values",
+        ),
+    ] = PodDefaults()
     node_ports: Annotated[
         PortRange,
         Option(

@@ -145,17 +145,17 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
         PORT_RANGE: str(site.ports),
         ADVERTISE_HOST: site.advertise_host,
     }
-    meta = metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations)
+    meta = pod_metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations, settings)
     # A running proxy is told a new policy, so that makes no pod anew. A proxy that is started
     # again while the operator is away begins with the policy of its pod's creation.
     # The same holds for peers, which come and go with the nodes.
     live_variables = {*POLICY_VARIABLES, PEERS_VARIABLE}
     env = [v for v in container["env"] if v["name"] not in live_variables]
-    spec = {**_spec(site), "containers": [{**container, "image": "", "env": env}]}
+    spec = {**_spec(site, settings), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     identity = _digest(f"{site.master.uri}{_domain(rosproxy)} {site.advertise_host}")[:8]
-    # `meta` holds this map: the fingerprint is worked out without itself, and is on the pod then.
-    annotations[FINGERPRINT] = f"{_fingerprint(body)}-{identity}"
+    # The fingerprint is worked out without itself, and is on the pod then.
+    meta["annotations"][FINGERPRINT] = f"{_fingerprint(body)}-{identity}"
     return {**body, "spec": {**spec, "containers": [container]}}
 
 
@@ -265,7 +265,20 @@ def metadata(
     }
 
 
-def _spec(site: ProxySite) -> dict[str, Any]:
+def pod_metadata(
+    rosproxy: RosProxy,
+    id: Name,
+    annotations: dict[str, str],
+    settings: ClusterSettings,
+    component: str = PROXY,
+) -> dict[str, Any]:
+    """The metadata of a pod of a RosProxy, with the administrator's labels and annotations."""
+    defaults = settings.pod
+    meta = metadata(rosproxy, id, {**defaults.annotations, **annotations}, component)
+    return {**meta, "labels": {**defaults.labels, **meta["labels"]}}
+
+
+def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     """The spec of a proxy's pod but for its container.
 
     The pod is bound to its node through the scheduler, as a DaemonSet's: it checks the ports.
@@ -275,14 +288,14 @@ def _spec(site: ProxySite) -> dict[str, Any]:
     # No kubelet has to allow it: k8s.io/kubernetes, pkg/kubelet/sysctl/safe_sysctls.go.
     sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}]
     return {
-        **bound_to(site.node.name, spec),
+        **bound_to(site.node.name, spec, settings),
         "terminationGracePeriodSeconds": STOPS_WITHIN,
         "securityContext": {**POD_SECURITY_CONTEXT, "sysctls": sysctls},
         **({"hostAliases": aliases} if aliases else {}),
     }
 
 
-def bound_to(node: str, spec: RosProxySpec) -> dict[str, Any]:
+def bound_to(node: str, spec: RosProxySpec, settings: ClusterSettings) -> dict[str, Any]:
     """What the specs of all pods have in common that the operator makes for a node."""
     field = {"key": "metadata.name", "operator": "In", "values": [node]}
     terms = {"nodeSelectorTerms": [{"matchFields": [field]}]}
@@ -290,15 +303,17 @@ def bound_to(node: str, spec: RosProxySpec) -> dict[str, Any]:
         {"key": f"node.kubernetes.io/{taint}", "operator": "Exists", "effect": effect}
         for taint, effect in _TAINTS
     ]
-    secrets = [dict(secret) for secret in spec.image_pull_secrets]
+    secrets = [dict(secret) for secret in spec.image_pull_secrets or ()]
+    priority = settings.pod.priority_class
     return {
         "affinity": {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": terms}},
-        "tolerations": [*tolerations, *map(dict, spec.tolerations)],
+        "tolerations": [*tolerations, *map(dict, spec.tolerations or ())],
         "restartPolicy": "Always",
         "automountServiceAccountToken": False,
         # Services called rosproxy-… would otherwise set variables that are the proxy's options.
         "enableServiceLinks": False,
         **({"imagePullSecrets": secrets} if secrets else {}),
+        **({"priorityClassName": priority} if priority else {}),
     }
 
 
@@ -335,7 +350,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
             for protocol, ports in host_ports
             for port in ports
         ],
-        "resources": dict(spec.resources),
+        "resources": dict(spec.resources or {}),
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
         "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGERS)]}}},

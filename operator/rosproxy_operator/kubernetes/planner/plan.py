@@ -24,6 +24,7 @@ from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.cluster_view import view
 from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
 from rosproxy_operator.kubernetes.planner.misspellings import misspellings
+from rosproxy_operator.kubernetes.planner.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.pods.unselected import (
@@ -113,7 +114,7 @@ def plan(
     clock that goes on as long as the state does; ``stamp`` is the time of day in RFC 3339.
     """
     full_snapshot = observed
-    observed = within_bounds(observed, settings)
+    observed = with_pod_defaults(within_bounds(observed, settings), settings.pod)
     cluster_view = view(observed)
     learned = learn(cluster_view, state, now)
     ranges = allocate(cluster_view, settings, learned)
@@ -180,7 +181,8 @@ def stand_by(
     addresses pods had. Everything else is learnt from the cluster by the first plan.
     """
     departed = departures.find_departures(observed, state, now).state
-    former = remember(view(within_bounds(observed, settings)), state.former)
+    observed = with_pod_defaults(within_bounds(observed, settings), settings.pod)
+    former = remember(view(observed), state.former)
     return ClusterState(former=former, addresses=departed.addresses, strange=departed.strange)
 
 

@@ -103,16 +103,18 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
     RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. ``image`` empty means the
     operator's default. ``policy`` is one layer or none. ``resources``, ``tolerations``,
-    ``host_aliases`` and ``image_pull_secrets`` go into the pods as they are. It is for ROS 1 if
-    ``ros1`` is set (``master`` says nothing otherwise), for ROS 2 if ``ros2`` is there.
+    ``host_aliases`` and ``image_pull_secrets`` go into the pods as they are. ``node_selector``,
+    ``tolerations``, ``image_pull_secrets`` and ``resources`` None mean the administrator's
+    defaults (`pod_defaults`). It is for ROS 1 if ``ros1`` is set (``master`` says nothing
+    otherwise), for ROS 2 if ``ros2`` is there.
     """
 
     master: MasterSpec
     ports: int
     window: PortRange
     pod_selector: Selector | None = None
-    node_selector: Mapping[str, str] = {}
-    tolerations: tuple[Json, ...] = ()
+    node_selector: Mapping[str, str] | None = None
+    tolerations: tuple[Json, ...] | None = None
     advertise: Advertise = Advertise.INTERNAL_IP
     cleanup_after: float = 30.0
     grace: float = 60.0
@@ -125,8 +127,8 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     udp: bool = False
     image: str = ""
     image_pull_policy: str = ""
-    image_pull_secrets: tuple[Json, ...] = ()
-    resources: Json = {}
+    image_pull_secrets: tuple[Json, ...] | None = None
+    resources: Json | None = None
     host_aliases: tuple[Json, ...] = ()
     ros1: bool = True
     ros2: Ros2Spec | None = None

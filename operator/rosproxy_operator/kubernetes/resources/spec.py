@@ -6,7 +6,8 @@ pod is admitted) is checked here again. Names, types, bounds and defaults are th
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
 from urllib.parse import urlsplit
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
@@ -49,10 +50,6 @@ from rosproxy_operator.kubernetes.resources.ros2_spec import check_ports, ros2_s
 MOST_PORTS = 500
 MOST_NAME = 46
 """Characters of a RosProxy's name, so that a proxy's still fits into a pod's host name."""
-RESOURCES: Json = {
-    "requests": {"cpu": "50m", "memory": "64Mi"},
-    "limits": {"memory": "512Mi"},
-}
 _SLAVE_CONTROL = {"Any": "any", "Master": "master"}
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
@@ -82,6 +79,7 @@ _EXAMPLE = "http://robot.example:11311"
 _HIGH = (1024, 65535)
 """Ports that a proxy may listen on."""
 _DAY = 86400
+_Value = TypeVar("_Value")
 
 
 def rosproxies(
@@ -148,8 +146,8 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         ports=ports,
         window=_window(field["portWindow"], ports),
         pod_selector=_selector(field["podSelector"]),
-        node_selector=field["nodeSelector"].texts(),
-        tolerations=tuple(toleration.map() for toleration in field["tolerations"].items()),
+        node_selector=_given(field["nodeSelector"], Field.texts),
+        tolerations=_given(field["tolerations"], _maps),
         advertise=field["advertise"].one_of(_ADVERTISE, Advertise.INTERNAL_IP.value),
         cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY),
         grace=field["graceSeconds"].number(60.0, 0, _DAY),
@@ -162,10 +160,19 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         udp=_udp(field),
         image=field["image"].text(),
         image_pull_policy=field["imagePullPolicy"].one_of(_PULL_POLICY, ""),
-        image_pull_secrets=tuple(secret.map() for secret in field["imagePullSecrets"].items()),
-        resources=field["resources"].map(RESOURCES),
+        image_pull_secrets=_given(field["imagePullSecrets"], _maps),
+        resources=_given(field["resources"], Field.map),
         host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].items()),
     )
+
+
+def _given(field: Field, read: Callable[[Field], _Value]) -> _Value | None:
+    """What a field says; None without the field, which then has the administrator's default."""
+    return None if field.value is None else read(field)
+
+
+def _maps(field: Field) -> tuple[Json, ...]:
+    return tuple(item.map() for item in field.items())
 
 
 def _max_unavailable(field: Field) -> MaxUnavailable:

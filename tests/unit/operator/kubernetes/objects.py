@@ -11,6 +11,7 @@ from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.planner.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import (
@@ -72,7 +73,9 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
 
 
 def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> ProxySite:
+    """A place for a proxy, of a RosProxy as the planner completes it."""
     host = on.advertise_host or on.addresses["InternalIP"]
+    (of,) = with_pod_defaults(ClusterSnapshot(rosproxies=(of,)), SETTINGS.pod).rosproxies
     return ProxySite(of, on, host, ports, replace(of.spec.master, publish=publish))
 
 

@@ -8,6 +8,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator import cli
 from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
 from rosproxy_operator.kubernetes.settings import Bounds, KubernetesSettings
 
 HOOK = ["--webhook-bind=0.0.0.0:9443"]
@@ -36,6 +37,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         "--namespace=two",
         "--proxy-image=rosproxy:1",
         "--proxy-image-pull-policy=Never",
+        '--proxy-pod={"priorityClassName":"high"}',
         "--node-port-range=31000-31999",
         "--ephemeral-range=40000-50000",
         "--resync=5",
@@ -69,6 +71,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         *("deny publish /camera/*", "deny call *", "deny serve *")
     ]
     assert settings.plan.image_pull_policy == "Never"
+    assert settings.plan.pod == PodDefaults(priority_class="high", resources={})
     assert settings.plan.node_ports == PortRange(31000, 31999)
     assert settings.plan.ephemeral == PortRange(40000, 50000)
     assert settings.plan.bounds == Bounds(
@@ -123,6 +126,11 @@ def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
         (["--allow-data-plane=Kernel"], "--allow-data-plane: "),
         (["--admin-from=all"], "--admin-from: not a JSON list of NetworkPolicyPeers"),
         (['--admin-from=[{"pods":{}}]'], "--admin-from: not a JSON list of NetworkPolicyPeers"),
+        (["--proxy-pod=x"], "--proxy-pod: not JSON: "),
+        (
+            ['--proxy-pod={"labels":{"rosproxy.io/x":""}}'],
+            "--proxy-pod: proxy.pod.labels: 'rosproxy.io/x' has a prefix that the operator uses",
+        ),
         (["--key-secret=key"], "--key-secret: 'key' is not of the form NAMESPACE/NAME"),
         (HOOK, "--webhook-service: is needed to create"),
         ([*HOOK, "--webhook-service=wh"], "--webhook-service: 'wh' is not of the form NAMESPACE/"),

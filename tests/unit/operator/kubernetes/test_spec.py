@@ -11,7 +11,7 @@ from rosproxy.access.rules import RuleKind, format_rules, parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import Advertise, MasterSpec, Name, Selector
-from rosproxy_operator.kubernetes.resources.spec import RESOURCES, invalid, rosproxy
+from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, rosproxy_obj
 
 
@@ -22,10 +22,10 @@ def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
     spec = parsed.spec
     assert spec.master == MasterSpec(uri="http://robot:11311")
     assert (spec.ports, spec.window) == (32, PortRange(11412, 29999))
-    assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, {}, ())
+    assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, None, None)
     assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
     assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
-    assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", RESOURCES)
+    assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", None)
     assert (parsed.former_ranges, parsed.cluster_ip, parsed.deleting) == ({}, "", False)
 
 

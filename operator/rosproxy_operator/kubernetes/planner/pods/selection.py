@@ -100,7 +100,7 @@ def wants_proxy(pod: Pod) -> bool:
 
 def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
     """Whether the RosProxy's nodeSelector fits a node."""
-    return matches(Selector(rosproxy.spec.node_selector), node.labels)
+    return matches(Selector(rosproxy.spec.node_selector or {}), node.labels)
 
 
 def selects(rosproxy: RosProxy, pod: Pod) -> bool:

@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.planner.manifests import (
     fingerprint_of,
     fingerprinted,
     image_of,
-    metadata,
+    pod_metadata,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
@@ -44,7 +44,8 @@ def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     """The pod that tries the image of a proxy."""
     rosproxy = site.rosproxy
     annotations = {NODE: site.node.name}
-    meta = metadata(rosproxy, image_check_id(rosproxy.id, site.node.name), annotations, IMAGE_CHECK)
+    id = image_check_id(rosproxy.id, site.node.name)
+    meta = pod_metadata(rosproxy, id, annotations, settings, IMAGE_CHECK)
     policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
     container: dict[str, Any] = {
         "name": IMAGE_CHECK,
@@ -60,7 +61,7 @@ def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
         },
     }
     spec = {
-        **bound_to(site.node.name, rosproxy.spec),
+        **bound_to(site.node.name, rosproxy.spec, settings),
         "restartPolicy": "Never",
         "terminationGracePeriodSeconds": 1,
         "securityContext": dict(POD_SECURITY_CONTEXT),

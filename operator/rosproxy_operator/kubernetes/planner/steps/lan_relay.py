@@ -19,7 +19,7 @@ from rosproxy_operator.kubernetes.planner.manifests import (
     bound_to,
     fingerprint_of,
     fingerprinted,
-    metadata,
+    pod_metadata,
     proxy_fingerprint,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
@@ -44,7 +44,8 @@ def lan_relay_pod(
     rosproxy = site.rosproxy
     ros2 = site.rosproxy.spec.ros2
     annotations = {NODE: site.node.name}
-    meta = metadata(rosproxy, lan_relay_id(rosproxy.id, site.node.name), annotations, LAN_RELAY)
+    id = lan_relay_id(rosproxy.id, site.node.name)
+    meta = pod_metadata(rosproxy, id, annotations, settings, LAN_RELAY)
     target = HostPort(proxy.pod.ip, site.ports.first)
     number = ros2.number if ros2 else 0
     variables = lan_relay_variables(number, lan_relay.host, lan_relay, target, site.relay_secret)
@@ -66,7 +67,7 @@ def lan_relay_pod(
         },
     }
     spec = {
-        **bound_to(site.node.name, rosproxy.spec),
+        **bound_to(site.node.name, rosproxy.spec, settings),
         "hostNetwork": True,
         "terminationGracePeriodSeconds": 1,
         "securityContext": dict(POD_SECURITY_CONTEXT),
