@@ -77,6 +77,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
                     "priorityClassName": "high",
                     "labels": {"a.example/c": "d"},
                     "annotations": {"a": "<b> & 'c' \"d\""},
+                    "runAsUser": None,
                 },
                 "slaveControl": "Master",
                 "bounds": {"maxBuffered": 16, "maxConnectionsPerLease": 1000000},

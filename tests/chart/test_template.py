@@ -137,6 +137,7 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
         priority_class="high",
         labels={"a.example/c": "d"},
         annotations={"a": "<b> & 'c' \"d\""},
+        run_as_user=None,
     )
     assert settings.plan.pod == (defaults if allow else PodDefaults())
     policy = [(str(rule), layer.mode) for layer in settings.plan.policy for rule in layer.rules]
@@ -207,6 +208,20 @@ def test_pods_are_restricted(combination: str) -> None:
                 "capabilities": {"drop": ["ALL"]},
             }
             assert not [port for port in container.get("ports", []) if "hostPort" in port]
+
+
+def test_null_leaves_the_user_to_openshift() -> None:
+    unset = {"runAsUser": None, "runAsGroup": None, "fsGroup": None}
+    manifests = objects({"podSecurityContext": unset, "proxy": {"pod": {"runAsUser": None}}})
+    pods = [
+        deployment["spec"]["template"]["spec"] for deployment in of_kind(manifests, "Deployment")
+    ]
+    pods += [pod["spec"] for pod in of_kind(manifests, "Pod")]
+    restricted = {"runAsNonRoot": True, "seccompProfile": {"type": "RuntimeDefault"}}
+    assert [pod["securityContext"] for pod in pods] == [restricted] * 4
+    (pod,) = operator(manifests)
+    (text,) = [arg for arg in pod["containers"][0]["args"] if arg.startswith("--proxy-pod=")]
+    assert "runAsUser" not in text
 
 
 def test_two_operators() -> None:

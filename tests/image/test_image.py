@@ -37,6 +37,12 @@ def test_becomes_healthy_without_any_privilege(proxy_image: str, container_name:
     assert status["NoNewPrivs"] == "1"
 
 
+def test_any_user_may_run_it(proxy_image: str, container_name: str) -> None:
+    """As on OpenShift: a user without an entry in passwd, in the group 0."""
+    start(proxy_image, container_name, "--user", "1000680000:0")
+    wait_until(lambda: health(container_name) == "healthy", 30, lambda: logs(container_name))
+
+
 RULES = "add table inet test; add chain inet test c { type nat hook prerouting priority 0; }"
 KERNEL = {
     "NET_ADMIN": (("--cap-add", "NET_ADMIN"), True),

@@ -145,11 +145,12 @@ class ClusterSettings(msgspec.Struct, frozen=True):
         PodDefaults,
         Option(
             "What the pods of all proxies have: `imagePullSecrets`, `nodeSelector`, "
-            "`tolerations`, `resources`, `priorityClassName`, `labels` and `annotations`, as a "
-            "JSON object. A RosProxy's field of the same name replaces the first four.",
+            "`tolerations`, `resources`, `priorityClassName`, `labels`, `annotations` and "
+            "`runAsUser`, as a JSON object. A RosProxy's field of the same name replaces the "
+            "first four.",
             option_values.POD_DEFAULTS,
             name="--proxy-pod",
-            default="the resources in the chart's values",
+            default="the resources and the user in the chart's values",
         ),
     ] = PodDefaults()
     node_ports: Annotated[

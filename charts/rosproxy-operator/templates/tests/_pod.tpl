@@ -30,7 +30,7 @@ app.kubernetes.io/component: {{ .component }}
 
 {{/*
 A pod's spec, from a dict: root, args, env, restart, and whom to keep away from (apart, labels).
-It meets the standard "restricted".
+With the default security contexts it meets the standard "restricted".
 */}}
 {{- define "rosproxy.test.pod" -}}
 automountServiceAccountToken: false
@@ -40,13 +40,10 @@ terminationGracePeriodSeconds: 1
 imagePullSecrets:
   {{- toYaml . | nindent 2 }}
 {{- end }}
+{{- with .root.Values.podSecurityContext }}
 securityContext:
-  runAsNonRoot: true
-  runAsUser: 10001
-  runAsGroup: 10001
-  fsGroup: 10001
-  seccompProfile:
-    type: RuntimeDefault
+  {{- toYaml . | nindent 2 }}
+{{- end }}
 containers:
   - name: ros
     {{- with .root.Values.tests }}
@@ -81,11 +78,10 @@ containers:
         memory: 64Mi
       limits:
         memory: 512Mi
+    {{- with .root.Values.securityContext }}
     securityContext:
-      allowPrivilegeEscalation: false
-      readOnlyRootFilesystem: true
-      capabilities:
-        drop: [ALL]
+      {{- toYaml . | nindent 6 }}
+    {{- end }}
     volumeMounts:
       - name: scripts
         mountPath: /test

@@ -38,17 +38,9 @@ from rosproxy_operator.kubernetes.resources.names import (
     proxy_id,
     service_id,
 )
+from rosproxy_operator.kubernetes.resources.pod_defaults import USER
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
-USER = 10001
-"""The image's own user."""
-POD_SECURITY_CONTEXT: Json = {
-    "runAsNonRoot": True,
-    "runAsUser": USER,
-    "runAsGroup": USER,
-    "seccompProfile": {"type": "RuntimeDefault"},
-}
-"""The ``securityContext`` of pods of that image."""
 PEERS_VARIABLE = "ROSPROXY_ROS2_PEERS"
 STOPS_WITHIN = 5
 """Seconds that a proxy has to end before it is killed, `_LINGERS` included."""
@@ -290,8 +282,22 @@ def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     return {
         **bound_to(site.node.name, spec, settings),
         "terminationGracePeriodSeconds": STOPS_WITHIN,
-        "securityContext": {**POD_SECURITY_CONTEXT, "sysctls": sysctls},
+        "securityContext": {**pod_security_context(settings), "sysctls": sysctls},
         **({"hostAliases": aliases} if aliases else {}),
+    }
+
+
+def pod_security_context(settings: ClusterSettings) -> dict[str, Any]:
+    """The ``securityContext`` of pods of the proxies' image.
+
+    The group is that of the image in any case: the programs for the kernel plane belong to it.
+    """
+    user = settings.pod.run_as_user
+    return {
+        "runAsNonRoot": True,
+        **({"runAsUser": user} if user else {}),
+        "runAsGroup": USER,
+        "seccompProfile": {"type": "RuntimeDefault"},
     }
 
 

@@ -18,6 +18,8 @@ RESOURCES: Json = {
     "requests": {"cpu": "50m", "memory": "64Mi"},
     "limits": {"memory": "512Mi"},
 }
+USER = 10001
+"""The user and the group of the proxy's image."""
 _RESERVED = (GROUP, NAME_LABEL.partition("/")[0])
 """Prefixes of the labels and annotations that the operator writes itself."""
 _QUANTITY = re.compile(r"[0-9]+(\.[0-9]*)?([KMGTPE]i|[numkMGTPE]|[eE][+-]?[0-9]+)?", re.ASCII)
@@ -30,6 +32,7 @@ class PodDefaults(msgspec.Struct, frozen=True):
 
     A RosProxy's field of the same name replaces ``image_pull_secrets``, ``node_selector``,
     ``tolerations`` or ``resources``. LAN relays and image checks have resources of their own.
+    With ``run_as_user`` None, the cluster or else the image chooses the user.
     """
 
     image_pull_secrets: tuple[Json, ...] = ()
@@ -39,6 +42,7 @@ class PodDefaults(msgspec.Struct, frozen=True):
     priority_class: str = ""
     labels: Mapping[str, str] = {}
     annotations: Mapping[str, str] = {}
+    run_as_user: int | None = USER
 
 
 def pod_defaults(value: Any) -> PodDefaults:
@@ -47,7 +51,7 @@ def pod_defaults(value: Any) -> PodDefaults:
     _check_names(
         field,
         *("imagePullSecrets", "nodeSelector", "tolerations", "resources", "priorityClassName"),
-        *("labels", "annotations"),
+        *("labels", "annotations", "runAsUser"),
     )
     for map_field in (field["labels"], field["annotations"]):
         _check_prefixes(map_field)
@@ -59,6 +63,7 @@ def pod_defaults(value: Any) -> PodDefaults:
         priority_class=_object_name(field["priorityClassName"]),
         labels=_labels(field["labels"]),
         annotations=_keyed(field["annotations"]),
+        run_as_user=field["runAsUser"].number(0, 1, 2**31 - 1) or None,
     )
 
 

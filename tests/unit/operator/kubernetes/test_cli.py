@@ -71,7 +71,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         *("deny publish /camera/*", "deny call *", "deny serve *")
     ]
     assert settings.plan.image_pull_policy == "Never"
-    assert settings.plan.pod == PodDefaults(priority_class="high", resources={})
+    assert settings.plan.pod == PodDefaults(priority_class="high", resources={}, run_as_user=None)
     assert settings.plan.node_ports == PortRange(31000, 31999)
     assert settings.plan.ephemeral == PortRange(40000, 50000)
     assert settings.plan.bounds == Bounds(

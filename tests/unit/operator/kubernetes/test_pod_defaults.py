@@ -44,6 +44,7 @@ DEFAULTS = PodDefaults(
     priority_class="high",
     labels={"team": "arms"},
     annotations={"note": "x"},
+    run_as_user=10002,
 )
 WITH_DEFAULTS = replace(SETTINGS, pod=DEFAULTS)
 VALUES = {
@@ -54,6 +55,7 @@ VALUES = {
     "priorityClassName": "high",
     "labels": {"team": "arms"},
     "annotations": {"note": "x"},
+    "runAsUser": 10002,
 }
 
 
@@ -65,7 +67,7 @@ def completed(**changes: Any) -> RosProxySpec:
 
 def test_all_values_are_read() -> None:
     assert pod_defaults(VALUES) == DEFAULTS
-    assert pod_defaults({}) == PodDefaults(resources={})
+    assert pod_defaults({}) == PodDefaults(resources={}, run_as_user=None)
 
 
 @pytest.mark.parametrize(
@@ -90,6 +92,7 @@ def test_all_values_are_read() -> None:
             "proxy.pod.resources.limits.memory: '1 GB' is not a quantity. Write a quantity such",
         ),
         ({"priorityClassName": "High"}, "proxy.pod.priorityClassName: 'High' can't be the name"),
+        ({"runAsUser": 0}, "proxy.pod.runAsUser: 0 is not valid. Write an integer from 1 to"),
         ({"labels": {"a": "b c"}}, "proxy.pod.labels.a: 'b c' can't be the value of a label"),
         (
             {"labels": {names.PROXY_OF: "x"}},
@@ -147,6 +150,7 @@ def test_every_pod_has_the_defaults(kind: str) -> None:
     labels = body["metadata"]["labels"]
     assert labels == {"team": "arms", **names.own_labels("robot", kind)}
     assert body["metadata"]["annotations"]["note"] == "x"
+    assert body["spec"]["securityContext"]["runAsUser"] == 10002
     (container,) = body["spec"]["containers"]
     own = container["resources"] == DEFAULTS.resources
     assert own is (kind == names.PROXY)
@@ -154,6 +158,15 @@ def test_every_pod_has_the_defaults(kind: str) -> None:
 
 def test_the_service_selects_by_the_operators_own_labels() -> None:
     assert manifests.service(rosproxy())["spec"]["selector"] == names.own_labels("robot")
+
+
+def test_without_a_user_the_cluster_chooses_one() -> None:
+    settings = replace(SETTINGS, pod=PodDefaults(run_as_user=None))
+    place = site(rosproxy(), node())
+    for body in (manifests.proxy_pod(place, settings), image_check_pod(place, settings)):
+        context = body["spec"]["securityContext"]
+        assert "runAsUser" not in context
+        assert (context["runAsNonRoot"], context["runAsGroup"]) == (True, 10001)
 
 
 def test_without_the_option_a_proxy_has_resources() -> None:

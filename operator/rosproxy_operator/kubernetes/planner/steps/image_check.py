@@ -12,13 +12,13 @@ from typing import Any
 
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper
 from rosproxy_operator.kubernetes.planner.manifests import (
-    POD_SECURITY_CONTEXT,
     ProxySite,
     bound_to,
     fingerprint_of,
     fingerprinted,
     image_of,
     pod_metadata,
+    pod_security_context,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
@@ -64,7 +64,7 @@ def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
         **bound_to(site.node.name, rosproxy.spec, settings),
         "restartPolicy": "Never",
         "terminationGracePeriodSeconds": 1,
-        "securityContext": dict(POD_SECURITY_CONTEXT),
+        "securityContext": pod_security_context(settings),
         "containers": [container],
     }
     return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})

@@ -14,12 +14,12 @@ from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND, lan_relay_variables
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.manifests import (
-    POD_SECURITY_CONTEXT,
     ProxySite,
     bound_to,
     fingerprint_of,
     fingerprinted,
     pod_metadata,
+    pod_security_context,
     proxy_fingerprint,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
@@ -70,7 +70,7 @@ def lan_relay_pod(
         **bound_to(site.node.name, rosproxy.spec, settings),
         "hostNetwork": True,
         "terminationGracePeriodSeconds": 1,
-        "securityContext": dict(POD_SECURITY_CONTEXT),
+        "securityContext": pod_security_context(settings),
         "containers": [container],
     }
     return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
