@@ -24,6 +24,15 @@ OPTIONS: dict[str, dict[str, Values]] = {
     "webhook": {
         "self-signed": {},
         "off": {"webhook": {"enabled": False}},
+        "strict": {
+            "webhook": {
+                "failurePolicy": "Fail",
+                "objectSelector": {"matchLabels": {"a": "b"}},
+                "namespaceSelector": {"matchExpressions": [{"key": "c", "operator": "Exists"}]},
+                "annotations": {"d": "e"},
+                "port": 9444,
+            }
+        },
         "cert-manager": {"webhook": {"certificate": {"source": "cert-manager"}}},
         "own-issuer": {
             "webhook": {

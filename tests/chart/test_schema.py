@@ -49,7 +49,10 @@ BAD: list[tuple[Json, str]] = [
     ({"ports": {"nodePortRange": "30000"}}, "ports/nodePortRange"),
     ({"ports": {"ephemeralRange": "32768 60999"}}, "ports/ephemeralRange"),
     ({"webhook": {"timeoutSeconds": 31}}, "webhook/timeoutSeconds"),
-    ({"webhook": {"failurePolicy": "Fail"}}, "failurePolicy"),
+    ({"webhook": {"failurePolicy": "fail"}}, "webhook/failurePolicy"),
+    ({"webhook": {"objectSelector": {"app": "ros"}}}, "app"),
+    ({"webhook": {"port": 443}}, "webhook/port"),
+    ({"hostNetwork": "yes"}, "hostNetwork"),
     ({"webhook": {"certificate": {"source": "self"}}}, "webhook/certificate/source"),
     (
         {"webhook": {"certificate": {"certManager": {"issuerRef": {"kind": "Issuer"}}}}},

@@ -292,6 +292,59 @@ def test_webhook_of_some_namespaces() -> None:
     ]
 
 
+def test_webhooks_selectors_are_added() -> None:
+    more = {
+        "matchLabels": {"a": "b"},
+        "matchExpressions": [{"key": "c", "operator": "Exists"}],
+    }
+    values = {
+        "failurePolicy": "Fail",
+        "objectSelector": more,
+        "namespaceSelector": more,
+        "annotations": {"d": "e"},
+        "certificate": {"source": "cert-manager"},
+    }
+    (configuration,) = of_kind(objects({"webhook": values}), "MutatingWebhookConfiguration")
+    (webhook,) = configuration["webhooks"]
+    assert webhook["failurePolicy"] == "Fail"
+    for selector in (webhook["objectSelector"], webhook["namespaceSelector"]):
+        assert selector["matchLabels"] == {"a": "b"}
+        assert selector["matchExpressions"][-1] == {"key": "c", "operator": "Exists"}
+    assert len(webhook["objectSelector"]["matchExpressions"]) == 3
+    assert len(webhook["namespaceSelector"]["matchExpressions"]) == 2
+    annotations = configuration["metadata"]["annotations"]
+    assert sorted(annotations) == ["cert-manager.io/inject-ca-from", "d"]
+
+
+def test_the_operator_in_the_network_of_its_node() -> None:
+    values = {
+        "hostNetwork": True,
+        "webhook": {"port": 10260},
+        "metricsPort": 10261,
+        "livenessPort": 10262,
+    }
+    manifests = objects(values)
+    (pod,) = operator(manifests)
+    assert (pod["hostNetwork"], pod["dnsPolicy"]) == (True, "ClusterFirstWithHostNet")
+    ports = {port["name"]: port["containerPort"] for port in pod["containers"][0]["ports"]}
+    assert ports == {"webhook": 10260, "metrics": 10261, "liveness": 10262}
+    bound = [arg.rpartition("=")[2] for arg in pod["containers"][0]["args"] if "-bind=" in arg]
+    assert sorted(bound) == ["0.0.0.0:10260", "0.0.0.0:10261", "0.0.0.0:10262"]
+    deployment = next(
+        manifest
+        for manifest in of_kind(manifests, "Deployment")
+        if manifest["metadata"]["name"] == "rosproxy-operator"
+    )
+    rolling = deployment["spec"]["strategy"]["rollingUpdate"]
+    assert rolling == {"maxUnavailable": 1, "maxSurge": 0}  # the ports are taken
+
+
+def test_ports_that_collide_are_refused() -> None:
+    done = helm("template", "x", CHART, "--kube-version", "1.30.0", values={"metricsPort": 8080})
+    assert done.returncode != 0
+    assert "metricsPort, livenessPort: the ports [9443 8080 8080] are not different" in done.stderr
+
+
 def test_secrets_are_empty() -> None:
     """Helm leaves alone what it has never set: upgrades keep the certificate and the key."""
     secrets = of_kind(objects(), "Secret")

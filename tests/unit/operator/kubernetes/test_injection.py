@@ -350,7 +350,10 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
 @pytest.mark.parametrize(
     ("unwired", "said"),
     [
-        (pod(), "reached no operator (port 9443) when the pod was created. Run kubectl"),
+        (
+            pod(),
+            "reached no operator (webhook.port) when the pod was created. Run kubectl",
+        ),
         (pod(controller="Job"), f". Run kubectl -n {NAMESPACE} delete pod {pod().id.name}"),
         (pod(workload="daemonset/arm"), f"kubectl -n {NAMESPACE} rollout restart daemonset/arm"),
         (pod(created="2026-01-01T00:00:00Z"), "is older than RosProxy arm. Run kubectl"),
