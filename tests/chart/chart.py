@@ -60,8 +60,22 @@ OPTIONS: dict[str, dict[str, Values]] = {
     "extras": {
         "none": {},
         "all": {
-            "serviceMonitor": {"enabled": True, "labels": {"release": "p"}, "interval": "15s"},
-            "podMonitor": {"enabled": True, "labels": {"release": "p"}, "interval": "1m30s"},
+            "serviceMonitor": {
+                "enabled": True,
+                "namespace": "monitoring",
+                "labels": {"release": "p"},
+                "annotations": {"a": "b"},
+                "interval": "15s",
+                "scrapeTimeout": "5s",
+                "relabelings": [{"targetLabel": "cluster", "replacement": "c"}],
+            },
+            "podMonitor": {
+                "enabled": True,
+                "labels": {"release": "p"},
+                "interval": "1m30s",
+                "honorLabels": True,
+                "metricRelabelings": [{"action": "labeldrop", "regex": "x"}],
+            },
             "prometheusRule": {"enabled": True, "runbook": "https://docs.example/alerts"},
             "dashboard": {"enabled": True, "annotations": {"grafana_folder": "Robots"}},
             "podDisruptionBudget": {"enabled": False},
@@ -119,6 +133,10 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "priorityClassName": "high",
             "extraEnv": [{"name": "HTTPS_PROXY", "value": "http://proxy:3128"}],
             "extraArgs": ["--resync=10"],
+            "extraVolumes": [{"name": "ca", "configMap": {"name": "ca"}}],
+            "extraVolumeMounts": [{"name": "ca", "mountPath": "/ca", "readOnly": True}],
+            "deploymentAnnotations": {"a": "b"},
+            "serviceAnnotations": {"a": "b"},
             "log": {"level": "debug", "format": "json"},
             "tests": {
                 "ros": 2,

@@ -414,6 +414,62 @@ def test_definition_is_kept() -> None:
     assert "annotations" not in ordinary["metadata"]
 
 
+@pytest.mark.parametrize("ros", [1, 2])
+def test_global_registry_and_secrets(ros: int) -> None:
+    values = {
+        "global": {"imageRegistry": "mirror.example/", "imagePullSecrets": [{"name": "all"}]},
+        "image": {"repository": "registry.example:5000/ros/rosproxy-operator", "tag": "1"},
+        "imagePullSecrets": [{"name": "own"}, {"name": "all"}],
+        "proxy": {"image": {"tag": "1"}, "pod": {"imagePullSecrets": [{"name": "proxies"}]}},
+        "tests": {"ros": ros},
+    }
+    manifests = objects(values)
+    (pod,) = operator(manifests)
+    (container,) = pod["containers"]
+    assert container["image"] == "mirror.example/ros/rosproxy-operator:1"
+    assert "--proxy-image=mirror.example/rosproxy:1" in container["args"]
+    assert pod["imagePullSecrets"] == [{"name": "all"}, {"name": "own"}]
+    (text,) = [arg for arg in container["args"] if arg.startswith("--proxy-pod=")]
+    secrets = json.loads(text.removeprefix("--proxy-pod="))["imagePullSecrets"]
+    assert secrets == [{"name": "all"}, {"name": "proxies"}]
+    (test,) = of_kind(manifests, "Pod")
+    image = "ros:jazzy-ros-core" if ros == 2 else "ros:noetic-ros-core-focal"
+    assert test["spec"]["containers"][0]["image"] == f"mirror.example/{image}"
+    assert test["spec"]["imagePullSecrets"] == [{"name": "all"}]
+
+
+def test_namespace_override() -> None:
+    manifests = objects({"namespaceOverride": "elsewhere"})
+    namespaces = {manifest["metadata"].get("namespace", "elsewhere") for manifest in manifests}
+    assert namespaces == {"elsewhere"}
+    assert NAMESPACE not in json.dumps(manifests)
+
+
+def test_extra_objects_may_be_templates() -> None:
+    extra = [
+        {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "{{ .Release.Name }}-a"}},
+        "apiVersion: v1\nkind: ConfigMap\nmetadata: {name: '{{ .Chart.Name }}-b'}",
+    ]
+    maps = of_kind(objects({"extraObjects": extra}), "ConfigMap")
+    assert [m["metadata"]["name"] for m in maps if "namespace" not in m["metadata"]] == [
+        "rosproxy-a",
+        "rosproxy-operator-b",
+    ]
+
+
+def test_annotations_and_volumes_of_the_operator() -> None:
+    values = merged(OPTIONS["pod"]["dressed"], OPTIONS["webhook"]["cert-manager"])
+    manifests = objects(values)
+    (pod,) = operator(manifests)
+    assert [volume["name"] for volume in pod["volumes"]] == ["certificate", "ca"]
+    mounts = pod["containers"][0]["volumeMounts"]
+    assert [mount["name"] for mount in mounts] == ["certificate", "ca"]
+    for kind in ("Deployment", "Service"):
+        own = next(m for m in of_kind(manifests, kind)
+                   if m["metadata"]["name"] == "rosproxy-proxies")  # fmt: skip
+        assert own["metadata"]["annotations"] == {"a": "b"}
+
+
 @pytest.mark.parametrize(
     ("release", "values", "name"),
     [

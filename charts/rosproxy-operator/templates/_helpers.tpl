@@ -17,6 +17,11 @@ release's name before it. 40 characters leave room for suffixes.
 {{- end -}}
 {{- end -}}
 
+{{/* The namespace of the operator. */}}
+{{- define "rosproxy.namespace" -}}
+{{- default .Release.Namespace .Values.namespaceOverride -}}
+{{- end -}}
+
 {{/* What the operator's pod is selected by. Never to be changed: a Deployment's selector can't be. */}}
 {{- define "rosproxy.selectorLabels" -}}
 app.kubernetes.io/name: {{ default .Chart.Name .Values.nameOverride | trunc 63 | trimSuffix "-" }}
@@ -47,13 +52,35 @@ app.kubernetes.io/part-of: rosproxy
 {{- end -}}
 {{- end -}}
 
-{{/* An image's full name, from a dict: image (the value), default (the tag, if none is given). */}}
-{{- define "rosproxy.image" -}}
-{{- if .image.digest -}}
-{{- printf "%s@%s" .image.repository .image.digest -}}
+{{/* An image's name with global.imageRegistry in the place of its registry, from a dict: root, name. */}}
+{{- define "rosproxy.mirrored" -}}
+{{- with .root.Values.global.imageRegistry -}}
+{{ trimSuffix "/" . }}/{{ regexReplaceAll "^(localhost|[^/]*[.:][^/]*)/" $.name "" }}
 {{- else -}}
-{{- printf "%s:%s" .image.repository (default .default .image.tag) -}}
+{{ .name }}
 {{- end -}}
+{{- end -}}
+
+{{/* An image's full name, from a dict: root, image (the value). */}}
+{{- define "rosproxy.image" -}}
+{{- $repository := include "rosproxy.mirrored" (dict "root" .root "name" .image.repository) -}}
+{{- if .image.digest -}}
+{{- printf "%s@%s" $repository .image.digest -}}
+{{- else -}}
+{{- printf "%s:%s" $repository (default .root.Chart.AppVersion .image.tag) -}}
+{{- end -}}
+{{- end -}}
+
+{{/* Secrets for pulling an image, as JSON, from a dict: root, secrets (the value). */}}
+{{- define "rosproxy.pullSecrets" -}}
+{{ concat .root.Values.global.imagePullSecrets .secrets | uniq | toJson }}
+{{- end -}}
+
+{{/* The defaults for the pods of proxies, as JSON. */}}
+{{- define "rosproxy.proxyPod" -}}
+{{- $secrets := dict "root" . "secrets" .Values.proxy.pod.imagePullSecrets -}}
+{{- $secrets = include "rosproxy.pullSecrets" $secrets | fromJsonArray -}}
+{{- merge (dict "imagePullSecrets" $secrets) .Values.proxy.pod | toJson -}}
 {{- end -}}
 
 {{/* The Secret with the webhook's certificate. */}}
@@ -68,7 +95,7 @@ app.kubernetes.io/part-of: rosproxy
 
 {{/* Who may reach the proxies' admin port, as JSON: the operator's pod, and whom the values name. */}}
 {{- define "rosproxy.adminFrom" -}}
-{{- $namespace := dict "matchLabels" (dict "kubernetes.io/metadata.name" .Release.Namespace) -}}
+{{- $namespace := dict "matchLabels" (dict "kubernetes.io/metadata.name" (include "rosproxy.namespace" .)) -}}
 {{- $pod := dict "matchLabels" (include "rosproxy.selectorLabels" . | fromYaml) -}}
 {{- $operator := dict "namespaceSelector" $namespace "podSelector" $pod -}}
 {{- concat (list $operator) .Values.proxy.networkPolicy.metricsFrom | toJson -}}
@@ -92,5 +119,20 @@ true
 {{- define "rosproxy.subjects" -}}
 - kind: ServiceAccount
   name: {{ include "rosproxy.serviceAccountName" . }}
-  namespace: {{ .Release.Namespace }}
+  namespace: {{ include "rosproxy.namespace" . }}
+{{- end -}}
+
+{{/* How a monitor's endpoint is scraped, from the monitor's values. */}}
+{{- define "rosproxy.scrape" -}}
+honorLabels: {{ .honorLabels }}
+{{- with .interval }}
+interval: {{ . }}
+{{- end }}
+{{- with .scrapeTimeout }}
+scrapeTimeout: {{ . }}
+{{- end }}
+{{- with .metricRelabelings }}
+metricRelabelings:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
 {{- end -}}

@@ -4,7 +4,7 @@
 {{- end -}}
 
 {{- define "rosproxy.test.namespace" -}}
-{{- .Values.tests.namespace | default (first .Values.namespaces) | default .Release.Namespace -}}
+{{- .Values.tests.namespace | default (first .Values.namespaces) | default (include "rosproxy.namespace" .) -}}
 {{- end -}}
 
 {{/* Everything that the test makes is gone after it, passed or not. */}}
@@ -36,7 +36,8 @@ With the default security contexts it meets the standard "restricted".
 automountServiceAccountToken: false
 restartPolicy: {{ .restart }}
 terminationGracePeriodSeconds: 1
-{{- with .root.Values.tests.imagePullSecrets }}
+{{- $secrets := dict "root" .root "secrets" .root.Values.tests.imagePullSecrets }}
+{{- with include "rosproxy.pullSecrets" $secrets | fromJsonArray }}
 imagePullSecrets:
   {{- toYaml . | nindent 2 }}
 {{- end }}
@@ -46,9 +47,9 @@ securityContext:
 {{- end }}
 containers:
   - name: ros
-    {{- with .root.Values.tests }}
-    image: {{ ternary .ros2Image .image (eq (int .ros) 2) | quote }}
-    {{- end }}
+    {{- $tests := .root.Values.tests }}
+    {{- $image := ternary $tests.ros2Image $tests.image (eq (int $tests.ros) 2) }}
+    image: {{ include "rosproxy.mirrored" (dict "root" .root "name" $image) | quote }}
     {{- with .root.Values.tests.imagePullPolicy }}
     imagePullPolicy: {{ . }}
     {{- end }}
