@@ -30,6 +30,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
@@ -228,6 +229,9 @@ def check_chart(release: Release) -> None:
         run(helm, "lint", "--strict", "--kube-version", "1.30.0", chart)
         run(helm, "package", chart, "--destination", DIST)
     package = DIST / f"rosproxy-operator-{release.version}.tgz"
+    with tarfile.open(package) as archive:
+        if f"{CHART.name}/LICENSE" not in archive.getnames():
+            raise Wrong(f"{package.name} has no LICENSE")
     rules = ("--set", "prometheusRule.enabled=true")
     made = run(helm, "template", "r", package, "--kube-version", "1.30.0", *rules)
     text = (ROOT / "manifests/install.yaml").read_text()
@@ -248,7 +252,8 @@ def check_chart(release: Release) -> None:
 
 
 def adapt(chart: Path, release: Release) -> None:
-    """Write into a chart where its images and its pages are."""
+    """Write into a chart where its images and its pages are, its licence and what has changed."""
+    shutil.copy(ROOT / "LICENSE", chart)
     values = chart / "values.yaml"
     about = chart / "Chart.yaml"
     text = values.read_text()
@@ -257,9 +262,40 @@ def adapt(chart: Path, release: Release) -> None:
         text = re.sub(r"(?m)^( +repository: )(rosproxy.*)$", to, text)
     if release.repository:
         text = text.replace('  runbook: ""', f"  runbook: {release.runbook}")
-        links = f"home: {release.repository}\nsources: [{release.repository}]\n"
-        about.write_text(about.read_text() + links)
+    described = describe(yaml.safe_load(about.read_text()), release)
+    about.write_text(yaml.safe_dump(described, sort_keys=False, allow_unicode=True))
     values.write_text(text)
+
+
+def describe(about: dict[str, Any], release: Release) -> dict[str, Any]:
+    """Chart.yaml as it is published: with links, icon, and what Artifact Hub shows.
+
+    There is no ``artifacthub.io/signKey``: Artifact Hub finds keyless signatures by itself.
+    """
+    images = [{"name": program, "image": release.image(program)} for program in PROGRAMS]
+    changes = chart_changes((ROOT / "CHANGELOG.md").read_text(), release.version)
+    annotations = {
+        **about["annotations"],
+        "artifacthub.io/images": yaml.safe_dump(images, sort_keys=False),
+        "artifacthub.io/changes": yaml.safe_dump(changes, allow_unicode=True, width=1000),
+    }
+    links: dict[str, Any] = {}
+    if release.repository:
+        links = {
+            "home": release.repository,
+            "sources": [release.repository],
+            "icon": f"{release.repository}/raw/v{release.version}/docs/icon.svg",
+        }
+    return {**about, **links, "annotations": annotations}
+
+
+def chart_changes(changelog: str, version: str) -> list[str]:
+    """The changes of a version under the heading Kubernetes, without Markdown's links."""
+    entry = changelog.partition(f"## [{version}]")[2].partition("\n## ")[0]
+    section = entry.partition("### Kubernetes\n")[2].partition("\n### ")[0]
+    items = re.findall(r"^- (.*(?:\n  .*)*)", section, re.M)
+    plain = (re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item) for item in items)
+    return [" ".join(item.split()) for item in plain]
 
 
 def cluster_program(name: str) -> Path:

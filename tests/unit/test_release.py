@@ -4,7 +4,17 @@ import re
 from pathlib import Path
 
 import pytest
-from scripts.release_check import Release, Wrong, check_versions, newest, project_version
+import yaml  # type: ignore[import-untyped]
+from scripts.release_check import (
+    CHART,
+    Release,
+    Wrong,
+    adapt,
+    chart_changes,
+    check_versions,
+    newest,
+    project_version,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKFLOWS = ROOT / ".github/workflows"
@@ -31,6 +41,36 @@ def test_a_release_has_its_entry_in_the_changelog(tmp_path: Path) -> None:
     changelog.write_text("# Changelog\n\n## [Unreleased]\n\n- new\n\n## [1.2.3] - 2030-01-31\n")
     with pytest.raises(Wrong, match="Unreleased"):
         newest(changelog)
+
+
+def test_the_published_chart_is_described(tmp_path: Path) -> None:
+    (tmp_path / "Chart.yaml").write_text((CHART / "Chart.yaml").read_text())
+    (tmp_path / "values.yaml").write_text((CHART / "values.yaml").read_text())
+    version = project_version()
+    adapt(tmp_path, Release(version, "", "", "ghcr.io/me", "https://github.com/me/rosproxy"))
+    about = yaml.safe_load((tmp_path / "Chart.yaml").read_text())
+    assert about["home"] == "https://github.com/me/rosproxy"
+    icon = f"https://github.com/me/rosproxy/raw/v{version}/"
+    assert about["icon"].startswith(icon)
+    assert (ROOT / about["icon"].removeprefix(icon)).exists()
+    annotations = about["annotations"]
+    assert yaml.safe_load(annotations["artifacthub.io/images"]) == [
+        {"name": "rosproxy", "image": f"ghcr.io/me/rosproxy:{version}"},
+        {"name": "rosproxy-operator", "image": f"ghcr.io/me/rosproxy-operator:{version}"},
+    ]
+    assert yaml.safe_load(annotations["artifacthub.io/changes"])
+    assert annotations["artifacthub.io/license"] == "Apache-2.0"
+    assert (tmp_path / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    assert "repository: ghcr.io/me/rosproxy-operator\n" in (tmp_path / "values.yaml").read_text()
+
+
+def test_changes_of_the_chart_are_those_of_kubernetes() -> None:
+    changelog = (
+        "# Changelog\n\n## [1.2.3] - 2030-01-31\n\n### Docker\n\n- x\n\n### Kubernetes\n\n"
+        "- One `a`\n  ([guide](docs/guide/kubernetes.md)).\n- Two.\n\n### To try\n\n- y\n\n"
+        "## [1.2.2] - 2029-01-31\n\n### Kubernetes\n\n- z\n"
+    )
+    assert chart_changes(changelog, "1.2.3") == ["One `a` (guide).", "Two."]
 
 
 def test_workflows_have_the_tests_helm() -> None:
