@@ -16,7 +16,7 @@ namespace=rosproxy-system
   echo "# Made from charts/rosproxy-operator by scripts/manifests.sh: don't change it here."
   printf -- '---\napiVersion: v1\nkind: Namespace\nmetadata:\n  name: %s\n' "$namespace"
   # A helm that was not built by its own makefile takes the cluster for an ancient one.
-  helm template rosproxy charts/rosproxy-operator --namespace "$namespace" --kube-version 1.30.0 --no-hooks |
+  helm template rosproxy charts/rosproxy-operator --namespace "$namespace" --kube-version 1.30.0 --no-hooks --set crds.keep=false |
     sed -e '/^# Source: /d' -e 's/app.kubernetes.io\/managed-by: Helm/app.kubernetes.io\/managed-by: kubectl/' \
       -e '/helm.sh\/chart: /d'
 } >"$manifests/install.yaml"

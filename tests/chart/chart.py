@@ -46,7 +46,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
     "namespaces": {"all": {}, "two": {"namespaces": ["robots", "arms"]}},
     "crds": {
         "installed": {},
-        "kept": {"crds": {"keep": True}},
+        "deleted": {"crds": {"keep": False}},
         "elsewhere": {"crds": {"install": False}},
     },
     "rbac": {

@@ -408,10 +408,10 @@ def test_own_issuer() -> None:
 
 def test_definition_is_kept() -> None:
     annotation = {"helm.sh/resource-policy": "keep"}
-    (kept,) = of_kind(objects({"crds": {"keep": True}}), "CustomResourceDefinition")
-    (ordinary,) = of_kind(objects(), "CustomResourceDefinition")
+    (kept,) = of_kind(objects(), "CustomResourceDefinition")
+    (deleted,) = of_kind(objects({"crds": {"keep": False}}), "CustomResourceDefinition")
     assert kept["metadata"]["annotations"] == annotation
-    assert "annotations" not in ordinary["metadata"]
+    assert "annotations" not in deleted["metadata"]
 
 
 @pytest.mark.parametrize("ros", [1, 2])
@@ -562,4 +562,5 @@ def test_notes(option: str, choice: str, chart_with_notes: Path) -> None:
     assert "rosproxy.io/inject" in text
     assert ("webhook.enabled" in text) == (choice == "off")
     assert ("crds.install" in text) == (option == "crds" and choice == "elsewhere")
+    assert ("kubectl delete crd" in text) == (option != "crds" or choice == "installed")
     assert ("-n robots apply" in text) == (choice == "two")

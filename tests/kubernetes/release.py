@@ -25,6 +25,7 @@ _IMAGES: Json = {
     "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},
     "proxy": {"image": {"repository": "rosproxy", "tag": "test", "pullPolicy": "Never"}},
     "allow": {"dataPlanes": ["Auto", "Kernel", "Splice", "Copy"], "images": ["rosproxy:*"]},
+    "crds": {"keep": False},
     "tests": {
         "image": "rosproxy-test-ros:latest",
         "ros2Image": "rosproxy-test-ros2:latest",
@@ -45,6 +46,11 @@ def install() -> None:
     api.create({"apiVersion": "v1", "kind": "Namespace",
                 "metadata": {"name": NAMESPACE, "labels": restricted}})  # fmt: skip
     _apply("install")
+
+
+def install_again(**values: Any) -> None:
+    """Install the chart where `uninstall` has removed it, with these values besides."""
+    _apply("install", **values)
 
 
 def upgrade(**values: Any) -> None:

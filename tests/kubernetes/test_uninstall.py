@@ -1,11 +1,11 @@
-"""helm uninstall leaves nothing behind."""
+"""helm uninstall leaves nothing behind, or by default the RosProxies alone."""
 
 from tests.docker.engine import wait_until
 from tests.kubernetes import api, release
 from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.pods import INJECT, Namespace
 from tests.kubernetes.robot import Robot
-from tests.kubernetes.rosproxies import all_proxies, rosproxy
+from tests.kubernetes.rosproxies import NOWHERE, all_proxies, rosproxy
 from tests.kubernetes.traffic import START, wait_for_service
 
 NAMES = ("rosproxy", "rosproxy-operator")
@@ -43,3 +43,22 @@ def test_nothing_is_left(net: Namespace, robot: Robot) -> None:
     assert not all_proxies()
     assert [body["metadata"]["name"] for body in net.pods(INJECT)] == [pod.name]
     assert "rosproxy.io" not in kubectl("api-resources", "-o", "name")
+
+
+def test_rosproxies_stay_until_their_definition_is_deleted(net: Namespace) -> None:
+    """What `crds.keep` promises, which is on by default. The release is not there any more."""
+    release.install_again(crds={"keep": True})
+    release.wait_operator()
+    made = rosproxy(net.name, master=NOWHERE, ports=4)
+    net.idle()
+    wait_until(lambda: bool(made.proxies), 60, made.tell)
+    (before,) = made.proxies
+
+    release.uninstall()
+
+    assert api.get("rosproxies", net.name, "robot")
+    assert [proxy.name for proxy in made.proxies] == [before.name]
+
+    kubectl("delete", "crd", "rosproxies.rosproxy.io")
+
+    wait_until(lambda: not left(), 60, lambda: f"left: {left()}")
