@@ -564,3 +564,21 @@ def test_notes(option: str, choice: str, chart_with_notes: Path) -> None:
     assert ("crds.install" in text) == (option == "crds" and choice == "elsewhere")
     assert ("kubectl delete crd" in text) == (option != "crds" or choice == "installed")
     assert ("-n robots apply" in text) == (choice == "two")
+    assert 'write "ros: 2" instead' in text
+
+
+@pytest.mark.parametrize(
+    ("masters", "uri"),
+    [
+        ([], "http://robot:11311"),
+        (["http://192.0.2.7:11311", "http://*:11311"], "http://192.0.2.7:11311"),
+        (["http://192.0.2.*:11311"], "MASTER_URI"),
+    ],
+)
+def test_notes_name_an_allowed_master(masters: list[str], uri: str, chart_with_notes: Path) -> None:
+    values = {"allow": {"masters": masters}}
+    (notes,) = objects(values, "--show-only", "templates/notes.yaml", chart=chart_with_notes)
+    assert f"      uri: {uri}\n" in notes["notes"]
+    assert all(master in notes["notes"] for master in masters)
+    assert ("allow.masters" in notes["notes"]) == bool(masters)
+    assert ("Replace MASTER_URI" in notes["notes"]) == (uri == "MASTER_URI")
