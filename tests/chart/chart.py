@@ -51,7 +51,10 @@ OPTIONS: dict[str, dict[str, Values]] = {
     },
     "rbac": {
         "made": {},
-        "aggregated": {"rbac": {"aggregate": True}},
+        "aggregated": {
+            "rbac": {"aggregate": True},
+            "serviceAccount": {"annotations": {"a.example/role": "x"}},
+        },
         "elsewhere": {
             "rbac": {"create": False},
             "serviceAccount": {"create": False, "name": "mine"},
@@ -115,7 +118,6 @@ OPTIONS: dict[str, dict[str, Values]] = {
             },
             "policy": {"rules": ["deny publish /camera/* by /driver"], "mode": "Audit"},
             "imagePullSecrets": [{"name": "registry"}],
-            "serviceAccount": {"annotations": {"a.example/role": "x"}},
             "podAnnotations": {"a": "b"},
             "podLabels": {"c": "d"},
             "nodeSelector": {"e": "f"},

@@ -71,6 +71,12 @@ BAD: list[tuple[Json, str]] = [
     ({"replicas": -1}, "replicas"),
     ({"podDisruptionBudget": {"maxUnavailable": -1}}, "podDisruptionBudget/maxUnavailable"),
     ({"topologySpreadConstraints": {}}, "topologySpreadConstraints"),
+    ({"affinity": {"nodeAffinty": {}}}, "nodeAffinty"),
+    ({"tolerations": [{"keys": "a"}]}, "keys"),
+    ({"podSecurityContext": {"seccompProfile": {"type": "Runtime"}}}, "seccompProfile/type"),
+    ({"extraVolumeMounts": [{"name": "a"}]}, "mountPath"),
+    ({"serviceMonitor": {"relabelings": [{"target": "a"}]}}, "target"),
+    ({"webhook": {"objectSelector": {"matchExpressions": [{"key": "a"}]}}}, "operator"),
     ({"networkPolicy": {"metricsFrom": [{}]}}, "networkPolicy/metricsFrom/0"),
     ({"serviceMonitor": {"interval": "often"}}, "serviceMonitor/interval"),
     ({"serviceMonitor": {"scrapeTimeout": "5"}}, "serviceMonitor/scrapeTimeout"),
@@ -91,6 +97,36 @@ def test_refused(values: Json, named: str) -> None:
     assert done.returncode != 0
     assert named.rpartition("/")[2] in done.stderr
     assert "values don't meet the specifications of the schema" in done.stderr
+
+
+NO_EFFECT: list[tuple[Json, str]] = [
+    ({"metricsPort": 8080}, "livenessPort: the ports [9443 8080 8080] are not different. Choose"),
+    (
+        {"networkPolicy": {"metricsFrom": [{"podSelector": {}}]}},
+        "networkPolicy.metricsFrom: no NetworkPolicy has these peers. Set networkPolicy.enabled:",
+    ),
+    (
+        {"proxy": {"networkPolicy": {"enabled": False, "metricsFrom": [{"podSelector": {}}]}}},
+        "proxy.networkPolicy.metricsFrom: no NetworkPolicy has these peers. Set",
+    ),
+    (
+        {"webhook": {"certificate": {"certManager": {"issuerRef": {"name": "ca"}}}}},
+        "issuerRef: the operator creates the certificate itself. Set webhook.certificate.source:",
+    ),
+    ({"serviceAccount": {"create": False}}, "serviceAccount.name: is empty, and the chart"),
+    (
+        {"serviceAccount": {"create": False, "name": "a", "annotations": {"b": "c"}}},
+        "serviceAccount.annotations: the chart creates no ServiceAccount. Annotate",
+    ),
+    ({"rbac": {"create": False, "aggregate": True}}, "rbac.aggregate: the chart creates no roles"),
+]
+
+
+@pytest.mark.parametrize(("values", "told"), NO_EFFECT)
+def test_values_without_effect_are_refused(values: Json, told: str) -> None:
+    done = helm("template", "x", CHART, "--kube-version", "1.30.0", values=values)
+    assert done.returncode != 0
+    assert told in done.stderr
 
 
 def test_every_value_is_in_the_schema() -> None:

@@ -339,12 +339,6 @@ def test_the_operator_in_the_network_of_its_node() -> None:
     assert rolling == {"maxUnavailable": 1, "maxSurge": 0}  # the ports are taken
 
 
-def test_ports_that_collide_are_refused() -> None:
-    done = helm("template", "x", CHART, "--kube-version", "1.30.0", values={"metricsPort": 8080})
-    assert done.returncode != 0
-    assert "metricsPort, livenessPort: the ports [9443 8080 8080] are not different" in done.stderr
-
-
 def test_secrets_are_empty() -> None:
     """Helm leaves alone what it has never set: upgrades keep the certificate and the key."""
     secrets = of_kind(objects(), "Secret")

@@ -48,7 +48,7 @@ app.kubernetes.io/part-of: rosproxy
 {{- if .Values.serviceAccount.create -}}
 {{- default (include "rosproxy.fullname" .) .Values.serviceAccount.name -}}
 {{- else -}}
-{{- default "default" .Values.serviceAccount.name -}}
+{{- .Values.serviceAccount.name -}}
 {{- end -}}
 {{- end -}}
 
