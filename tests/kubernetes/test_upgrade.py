@@ -67,6 +67,25 @@ def test_a_wrong_image_of_the_proxies(net: Namespace, robot: Robot) -> None:
     wait_until(lambda: not api.objects("pods", net.name, release.IMAGE_CHECKS), 60, made.tell)
 
 
+def test_other_defaults_of_the_proxies(net: Namespace, robot: Robot) -> None:
+    """Proxies are made anew with the defaults, on their ports, and ROS nodes go on."""
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    with flow(net, robot, "roscpp") as traffic:
+        before = made.the_proxy()
+        release.upgrade(proxy={"pod": {"labels": {"team": "arms"}, "runAsUser": None}})
+        wait_until(
+            lambda: before.uid_then not in [proxy.uid_then for proxy in made.proxies],
+            60,
+            made.tell,
+        )
+        after = made.the_proxy()
+        assert after.ports == before.ports
+        assert after.body["metadata"]["labels"]["team"] == "arms"
+        assert "runAsUser" not in after.body["spec"]["securityContext"]
+        traffic.wait(since=time.time(), seconds=60)
+    release.upgrade()
+
+
 def test_another_key_of_the_tokens(net: Namespace, robot: Robot) -> None:
     """Proxies are made anew on their ports, one after the other, and ROS nodes go on."""
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
