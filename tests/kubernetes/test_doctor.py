@@ -108,7 +108,7 @@ def test_a_webhook_whose_configuration_is_gone_is_told(net: Namespace) -> None:
 
 @contextmanager
 def webhook_cut_off() -> Iterator[None]:
-    """Let no packet get to port 9443 of the operators' pods, as a firewall does."""
+    """Let no packet get to the webhook port of the operators' pods, as a firewall does."""
     rule = ("FORWARD", "-p", "tcp", "--dport", "9443", "-j", "DROP")
     for node in NODES:
         inside(node, "iptables", "-w", "-I", *rule)
@@ -131,7 +131,7 @@ def test_a_webhook_that_the_api_server_does_not_reach_is_told(net: Namespace) ->
     code, findings = doctor(net.name)
     assert code == 1
     (found,) = [f for f in findings if f["check"] == "webhook" and f["severity"] == "error"]
-    assert found["text"].startswith("the API server reached no operator (port 9443)")
+    assert found["text"].startswith("the API server reached no operator (chart value webhook.port)")
     assert f"{net.name}/{pod.name}" in found["text"]
 
 

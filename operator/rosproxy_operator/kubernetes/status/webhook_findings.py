@@ -108,11 +108,13 @@ def _findings_of(configuration: Json, facts: WebhookFacts) -> Iterator[DoctorFin
 
 def _cut_off(subject: str, service: Name, pods: Sequence[str]) -> DoctorFinding:
     text = (
-        "the API server reached no operator (port 9443) when these pods were created, although an "
+        "the API server reached no operator (chart value webhook.port) when these pods were "
+        "created, although an "
         f"operator was ready: {listed(pods)}"
     )
     fix = (
-        "allow connections from the API server to port 9443 of the operator's pods in namespace "
+        "allow connections from the API server to the webhook port of the operator's pods in "
+        "namespace "
         f"{service.namespace} (NetworkPolicy, firewall of the control plane); the API server's log "
         f'has failed calling webhook "{NAME}"; {_ANEW}'
     )

@@ -107,10 +107,11 @@ async def test_a_webhook_that_the_api_server_does_not_reach(server: ApiServer, a
     (finding,) = await about_webhook(api, ("robots/talker",))
     assert finding.severity is Severity.ERROR
     assert finding.text == (
-        "the API server reached no operator (port 9443) when these pods were created, although an "
+        "the API server reached no operator (chart value webhook.port) when these pods were "
+        "created, although an "
         "operator was ready: robots/talker"
     )
-    assert "port 9443 of the operator's pods in namespace system" in finding.fix
+    assert "the webhook port of the operator's pods in namespace system" in finding.fix
 
 
 def test_which_pods_show_that_the_api_server_reached_no_operator() -> None:

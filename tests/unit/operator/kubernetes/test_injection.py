@@ -352,7 +352,7 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
     [
         (
             pod(),
-            "reached no operator (webhook.port) when the pod was created. Run kubectl",
+            "reached no operator (chart value webhook.port) when the pod was created. Run kubectl",
         ),
         (pod(controller="Job"), f". Run kubectl -n {NAMESPACE} delete pod {pod().id.name}"),
         (pod(workload="daemonset/arm"), f"kubectl -n {NAMESPACE} rollout restart daemonset/arm"),

@@ -239,11 +239,14 @@ def missing_variable_text(
         return f"{text}, since the operator serves no webhook (webhook.enabled=false). {fix}"
     if _is_older(pod, rosproxy):
         return f"{text}, since the pod is older than RosProxy {rosproxy.id.name}. {restart}"
-    reason = "the API server reached no operator (webhook.port) when the pod was created"
+    reason = (
+        "the API server reached no operator (chart value webhook.port) when the pod was created"
+    )
     if is_late(pod, rosproxy, webhook.since):
         return (
             f"{text}, since {reason}, although an operator was ready. Allow connections from the "
-            f"API server to webhook.port of the operator's pods (NetworkPolicy, firewall). {restart}"
+            "API server to the webhook port of the operator's pods (NetworkPolicy, firewall). "
+            f"{restart}"
         )
     return f"{text}, since {reason}. {restart}"
 
