@@ -5,7 +5,7 @@ import errno
 import logging
 from collections.abc import Collection, Iterator, Sequence
 
-from rosproxy.leases.leases import RANGE_OPTION
+from rosproxy.leases.leases import PORTS, RANGE_OPTION
 from rosproxy.net import proxy_signs
 from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
@@ -50,8 +50,8 @@ def report_taken_ports(
         show = f"ss -l{letter}np 'sport >= :{ports.first} and sport <= :{ports.last}'"
         cause = f"held by {holders}: {fix}" if proxies else f"all are taken: {show} shows by whom"
         raise SettingError(RANGE_OPTION, f"no port of {ports} can be bound; {cause}")
-    text = f"{port_kind} of {RANGE_OPTION} {ports} held by other programs: {list(taken)}"
+    text = f"{port_kind} of the range {ports} held by other programs: {list(taken)}"
     if proxies:
         text += f"; held by {holders}: {fix}"
     log.warning("%s", text)
-    problems.add(RANGE_OPTION, text, holds=True)
+    problems.add(PORTS, text, holds=True)

@@ -125,7 +125,7 @@ def test_another_domain(lab: Lab) -> None:
     told = doctor_of_networks(lab)
     for role, domain in (("c1", 5), ("c2", 7)):
         assert f"at {lab.place(role).address} (Fast DDS, inside): is in domain {domain}," in told
-    assert "set ROS_DOMAIN_ID=0 for the participant, or add --ros2-domain 5" in told
+    assert "set ROS_DOMAIN_ID=0 for the participant, or set --ros2-domain 5" in told
 
 
 def test_tcp(lab: Lab) -> None:

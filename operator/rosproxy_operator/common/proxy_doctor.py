@@ -23,11 +23,11 @@ def command(names: Sequence[str]) -> tuple[str, ...]:
     return ("rosproxy", "doctor", "--json", "--", *names)
 
 
-def read_findings(proxy: str, output: bytes, fixes: Mapping[str, str]) -> list[DoctorFinding]:
-    """The findings in what a proxy's doctor has printed; ``fixes`` by checks stand for its own."""
+def read_findings(proxy: str, output: bytes) -> list[DoctorFinding]:
+    """The findings in what a proxy's doctor has printed."""
     try:
         rows = json.loads(output)["findings"]
-        return [_finding(proxy, row, fixes) for row in rows[:MOST_FINDINGS]]
+        return [_finding(proxy, row) for row in rows[:MOST_FINDINGS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         text = (
             "the output of rosproxy doctor in the proxy's container can't be read. The image may "
@@ -63,11 +63,9 @@ def _words(finding: DoctorFinding) -> set[str]:
     return {*finding.subject.split()}
 
 
-def _finding(proxy: str, row: Mapping[str, Any], fixes: Mapping[str, str]) -> DoctorFinding:
+def _finding(proxy: str, row: Mapping[str, Any]) -> DoctorFinding:
     severity = _SEVERITIES[row["severity"]]
     check, subject, text, fix = (
         brief(str(row[key]), LONGEST_TEXT) for key in ("check", "subject", "text", "fix")
     )
-    if severity >= Severity.WARNING:
-        fix = fixes.get(check, fix)
     return DoctorFinding(severity, check, f"{proxy}: {subject}" if subject else proxy, text, fix)

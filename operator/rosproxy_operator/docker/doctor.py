@@ -2,7 +2,7 @@
 
 First comes what the operator sees: images, networks, masters, labels, and what is yet to be done.
 Then each proxy is asked by the doctor of its own container (``docker exec``), which looks from
-where the proxy is. What mends a proxy is said in labels and options of the operator, which made it.
+where the proxy is.
 """
 
 import asyncio
@@ -24,17 +24,6 @@ _CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
 """What may follow from what: the kinds of subjects, first causes first."""
 _BEING_MADE = ("absent", "created")
 """States of a proxy's container while an operator makes the proxy."""
-_ADDRESS = (
-    "add the label rosproxy.advertise-host=ADDRESS to the containers of this proxy, or start the "
-    "operator with --advertise-host ADDRESS"
-)
-FIXES = {
-    "advertised host": _ADDRESS,
-    "published range": f"open the ports in the firewall of this host; or {_ADDRESS}",
-    "ports": "add the label rosproxy.ports=N to a container of this proxy, or start the operator "
-    "with --ports N",
-}
-"""What mends what proxies find about themselves, by their checks."""
 
 
 def examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding]:
@@ -54,7 +43,7 @@ async def _examine(host: HostStatus, names: Sequence[str]) -> list[DoctorFinding
             except EngineError as failure:
                 text = f"rosproxy doctor could not run in the proxy's container: {failure}"
                 return [warning("proxy", f"proxy {name}", text, f"read docker logs {name}")]
-        return read_findings(f"proxy {name}", output, FIXES)
+        return read_findings(f"proxy {name}", output)
 
     told = {problem["subject"] for problem in status["problems"]}
     running = [proxy for proxy in status["proxies"] if proxy["state"] == "running"]

@@ -31,19 +31,12 @@ from rosproxy_operator.kubernetes.resources.spec import rosproxies as read_rospr
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 from rosproxy_operator.kubernetes.status.event_findings import event_findings
 from rosproxy_operator.kubernetes.status.operator_findings import operator_findings
-from rosproxy_operator.kubernetes.status.range_texts import ADDRESS_FIX, PORTS_FIX
 from rosproxy_operator.kubernetes.status.webhook_findings import webhook_findings
 
 AT_ONCE = 4
 """Proxies that are asked at the same time: each doctor is a Python of its own."""
 WITHIN = 60
 """Seconds that a doctor has: it tries what may not answer."""
-FIXES = {
-    "advertised host": ADDRESS_FIX,
-    "published range": PORTS_FIX,
-    "ports": "set a larger spec.ports",
-}
-"""The fixes of findings that proxies report about themselves, by the checks."""
 
 
 def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFinding]:
@@ -102,7 +95,7 @@ def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
         fix = "check that you may create pods/exec: kubectl auth can-i create pods/exec -n "
         yield warning("proxy", subject, text, fix + namespace)
         return
-    yield from read_findings(subject, output, FIXES)
+    yield from read_findings(subject, output)
 
 
 def _run(namespace: str, pod: str, arguments: Sequence[str]) -> bytes:

@@ -9,6 +9,7 @@ import json
 import os
 from typing import TYPE_CHECKING, Any
 
+from rosproxy.fixes import how_to_in_a_sentence
 from rosproxy.net.addresses import HostPort, parse_host_port
 
 if TYPE_CHECKING:
@@ -86,9 +87,8 @@ class AdminClient:
         except (OSError, http.client.HTTPException) as error:
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise AdminError(
-                f"no rosproxy answers at {self.url} ({reason.lower()}). Run this where the proxy "
-                "runs (docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
-                "http://HOST:PORT or ROSPROXY_ADMIN"
+                f"no rosproxy answers at {self.url} ({reason.lower()}). "
+                + how_to_in_a_sentence("ask the proxy")
             ) from None
         finally:
             connection.close()

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
 from rosproxy.admin.requests import PortProbe, RangeProbe
 from rosproxy.admin.status_document import PortsStatus, RangeProbeStatus
+from rosproxy.fixes import how_to
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import listed, plural, quoted
 
@@ -20,13 +21,6 @@ FEW_FREE = 0.1
 
 HOST = "advertised host"
 RANGE = "published range"
-BY_ADDRESS = (
-    "set an address instead of the name: --advertise-host ADDRESS (ROSPROXY_ADVERTISE_HOST)"
-)
-_OF_THIS_HOST = (
-    "set the address of this host in the network of the robots: --advertise-host ADDRESS "
-    "(ROSPROXY_ADVERTISE_HOST)"
-)
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
 """How the proxy's own try may end although outside gets through: NAT has no hairpin."""
 TEXT_BY_OUTCOME = {
@@ -44,6 +38,16 @@ TEXT_BY_OUTCOME = {
 }
 
 
+def by_address() -> str:
+    """The fix for an advertised host that can't be resolved."""
+    return f"give an address instead of the name: {how_to('advertised host')}"
+
+
+def _of_this_host() -> str:
+    address = how_to("advertised host")
+    return f"give the address of this host in the network of the robots: {address}"
+
+
 def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iterator[DoctorFinding]:
     """What is wrong with an advertised host that leads to these addresses here.
 
@@ -52,16 +56,16 @@ def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iter
     loopback = [address for address in addresses if is_loopback(address)]
     if is_loopback(host) and not all_here:
         text = f"{host} is a loopback address. {LOOPBACK_MEANING}"
-        yield error(HOST, HOST, text, _OF_THIS_HOST)
+        yield error(HOST, HOST, text, _of_this_host())
     elif not addresses:
-        yield error(HOST, HOST, f"the host name {host} can't be resolved here", BY_ADDRESS)
+        yield error(HOST, HOST, f"the host name {host} can't be resolved here", by_address())
     elif len(loopback) == len(addresses) and not all_here:
         text = (
             f"{host} leads to {listed(loopback)} here, a loopback address (in /etc/hosts, many "
             "systems give their own name such an address). Outside must resolve the name to "
             "another address"
         )
-        yield warning(HOST, HOST, text, BY_ADDRESS)
+        yield warning(HOST, HOST, text, by_address())
 
 
 def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterator[DoctorFinding]:
@@ -109,21 +113,18 @@ def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
     free = ports.free
     blocked = ports.blocked
     larger_range = (
-        "set a larger --port-range (ROSPROXY_PORT_RANGE), and publish the new range. rosproxy "
-        "status names the nodes and participants that got no port"
+        f"{how_to('larger range')}. To see which nodes and participants got no port, "
+        f"{how_to('status')}"
     )
     if blocked:
         first, _, last = ports.listen.partition("-")
         text = f"other programs hold {plural(blocked, 'port')} of the range {ports.listen}"
         if ports.held_by:
             text += f": {'; '.join(ports.held_by)}"
-            fix = (
-                "set another --port-range (ROSPROXY_PORT_RANGE) for one of the proxies, and "
-                "publish the new range"
-            )
+            fix = f"for one of the proxies, {how_to('other range')}"
         else:
             sockets = quoted(f"sport >= :{first} and sport <= :{last}")
-            fix = f"find the programs: ss -ltnp {sockets}; or set another --port-range"
+            fix = f"find the programs: ss -ltnp {sockets}; or {how_to('other range')}"
         yield warning("ports", "ports", text, fix)
     if not free:
         text = f"no port is free, {used} used. Further nodes get no port"
@@ -149,8 +150,8 @@ def _reached(host: str, from_proxy: str, from_master: str, target: str) -> Docto
         "another address, or the name leads to another machine, or a firewall blocks the connection"
     )
     fix = (
-        "set the address of this host as the master's machine sees it: --advertise-host ADDRESS "
-        "(ROSPROXY_ADVERTISE_HOST). Test on the master's machine: nc -vz"
+        "give the address of this host as the master's machine sees it: "
+        f"{how_to('advertised host')}. Test on the master's machine: nc -vz"
     )
     # `target` ends with the last port that was tried.
     return error(RANGE, RANGE, text, f"{fix} {quoted(host)} {target.rpartition(' ')[2]}")
@@ -160,16 +161,15 @@ def _not_reached(
     host: str, ports: PortsStatus, from_proxy: str, from_master: str, target: str, is_uniform: bool
 ) -> DoctorFinding:
     published = quoted(f"{ports.advertise}:{ports.listen}")
-    publish = f"docker run -p {published}"
+    ports_name = "range" if is_uniform else "whole range"
+    publish = how_to("publish", ports=ports_name, published=published)
     if from_proxy == "unresolvable":
-        fix = BY_ADDRESS
+        fix = by_address()
     elif is_uniform:
-        fix = (
-            f"publish the range: {publish}, and let the firewall accept it; or correct "
-            f"--advertise-host, now {quoted(host)}"
-        )
+        address = how_to("advertised host")
+        fix = f"{publish}; or correct the advertised host, now {quoted(host)}: {address}"
     else:
-        fix = f"publish the whole range: {publish}"
+        fix = publish
     text = f"{target}: {TEXT_BY_OUTCOME.get(from_proxy, from_proxy)}"
     if from_master == "missed":
         return error(RANGE, RANGE, f"{text}. A call from the master does not arrive either", fix)
@@ -194,8 +194,9 @@ def _by_udp(host: str, ports: PortsStatus, from_proxy: str, target: str) -> Doct
         "can't reach its own published ports, as with some NAT"
     )
     published = quoted(f"{ports.advertise}:{ports.listen}/udp")
+    publish = how_to("publish", ports="range", published=published)
     fix = (
-        f"if no participant outside is heard, publish the range: docker run -p {published}, and "
-        f"check that --advertise-host {quoted(host)} is this host"
+        f"if no participant outside is heard, {publish}; and check that the advertised host "
+        f"{quoted(host)} is this host"
     )
     return note(RANGE, RANGE, text, fix)

@@ -3,11 +3,12 @@
 Commands import what they need when they run, so that a health check starts fast.
 """
 
+import os
 from typing import Any
 
 import click
 
-from rosproxy import __version__
+from rosproxy import __version__, fixes
 from rosproxy import setting_kinds as kinds
 from rosproxy.cli import options, questions
 from rosproxy.settings import Settings
@@ -17,6 +18,7 @@ from rosproxy.settings import Settings
 @click.version_option(__version__, prog_name="rosproxy")
 def main() -> None:
     """Transparent proxy for ROS: nodes behind it and nodes outside talk both ways."""
+    fixes.speak_for(os.environ.get(fixes.VARIABLE, ""))
 
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})

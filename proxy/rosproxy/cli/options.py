@@ -19,6 +19,7 @@ from rosproxy import setting_kinds as kinds
 from rosproxy.cli import variables
 from rosproxy.cli.config_file import read_config
 from rosproxy.cli.variables import UnknownVariable
+from rosproxy.fixes import VARIABLE
 from rosproxy.setting_kinds import Setting, SettingError, declared
 
 Command = Callable[..., Any]
@@ -219,6 +220,7 @@ def _use_config(context: click.Context, option: click.Parameter, path: str | Non
 def unknown_variables(*groups: click.Command, log: bool = True) -> list[UnknownVariable]:
     """The variables of this environment that no option of some programs reads; may log them."""
     known_names = {name for group in groups for name in _variable_names(group, None)}
+    known_names.add(VARIABLE)
     unknown = variables.unknown(os.environ, known_names)
     for variable in unknown if log else ():
         logging.getLogger(__name__).warning("%s %s", variable.name, variable.text)

@@ -25,6 +25,8 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 RANGE_OPTION = "--port-range"
+PORTS = "ports"
+"""The subject of problems with the range."""
 _H = TypeVar("_H", bound=LeaseHolder)
 _H_contra = TypeVar("_H_contra", bound=LeaseHolder, contravariant=True)
 
@@ -116,7 +118,7 @@ class Leases(Generic[_H]):
             pool.unblock(port)
             log.info("port %d of the range is free now", port)
         if blocked and not pool.blocked:
-            self._problems.solved(RANGE_OPTION)
+            self._problems.solved(PORTS)
 
     def is_open(self, endpoint: _H) -> bool:
         """Whether an endpoint's port listens."""

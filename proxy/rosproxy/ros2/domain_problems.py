@@ -10,6 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
+from rosproxy.fixes import how_to
 from rosproxy.ros2.protocol.rtps import CYCLONE_DDS, FAST_DDS
 from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault, ShortageKind
 from rosproxy.telemetry.text import plural
@@ -54,7 +55,6 @@ _LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
         "where the participant runs: add the transport UDPv4 to the profile",
     ),
 }
-_LONGER_RANGE = "set a larger --port-range, and publish the new range"
 _SHORTAGE_FIXES = {
     ShortageKind.BOUND.value: (
         "where the participant runs: use fewer addresses (interface list of the profile, or "
@@ -91,7 +91,7 @@ def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
         # The number changes with each look, and the watch reports each change of a text.
         text = "some pairs of a reader and a writer are not compared: the domain has too many"
         fix = (
-            "`rosproxy status --json` lists the readers and writers of each address. Stop programs "
+            f"to see the readers and writers of each address, {how_to('status')}. Stop programs "
             "that have thousands. A domain of hundreds of nodes may have so many without a fault"
         )
         yield DomainProblem("qos", f"domain {domain.domain}", text, fix, grave=False)
@@ -139,7 +139,7 @@ def _problems(
         )
         fix = (
             f"set ROS_DOMAIN_ID={domain.domain} for the participant, or "
-            f"--ros2-domain {participant.domain} for the proxy"
+            f"{how_to('domain', domain=participant.domain)}"
         )
         yield DomainProblem("domain", participant.guid_prefix, text, fix)
     fault = _LOCATOR_FAULTS.get(participant.locator_fault)
@@ -149,7 +149,7 @@ def _problems(
     if is_inside or domain.direction == "both":
         yield from _security(participant, label, is_inside)
     if participant.problem:
-        fix = _SHORTAGE_FIXES.get(participant.shortage, _LONGER_RANGE)
+        fix = _SHORTAGE_FIXES.get(participant.shortage) or how_to("larger range")
         yield DomainProblem(
             "ports", participant.guid_prefix, f"{label}: {participant.problem}", fix
         )
@@ -157,7 +157,7 @@ def _problems(
     if domain.inside and not participant.proven:
         text = f"{label}: no datagram from this participant has arrived at the ports of the range"
         fix = (
-            "publish the range for UDP, and let firewalls accept UDP from the participant to "
+            f"{how_to('publish for UDP')}, and let firewalls accept UDP from the participant to "
             f"{domain.discovery.rpartition(':')[0]}"
         )
         yield DomainProblem("reached", participant.guid_prefix, text, fix, grave=False)
@@ -179,7 +179,7 @@ def _security(
     fix = "set discovery_protection_kind and rtps_protection_kind to NONE in the governance; or "
     fix += "set ROS_SECURITY_ENABLE=false"
     if not is_inside:
-        fix += "; or give participants inside a route outwards, and set --direction out"
+        fix += f"; or give participants inside a route outwards, and {how_to('direction out')}"
     # Other vendors need not repeat their addresses, as Fast DDS does: then nothing is lost.
     yield DomainProblem(
         "security", participant.guid_prefix, text, fix, grave=participant.vendor == _FAST_DDS_NAME

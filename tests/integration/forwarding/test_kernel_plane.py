@@ -342,7 +342,7 @@ async def test_what_is_missing_is_said(
     assert caplog.records[-1].levelname == level
     assert "not permitted" in caplog.text
     reported = bench.context.problems.all()
-    assert [problem.subject for problem in reported] == ["--data-plane"] * problems
+    assert [problem.subject for problem in reported] == ["data plane"] * problems
     endpoint = bench.node()
     bench.plane.recovered([endpoint])
     assert endpoint.fast_port == 45002

@@ -222,6 +222,6 @@ async def test_a_plane_that_is_lost_is_told_apart_from_that_for_topics(bench: Be
     bench.lend()
     await until(lambda: not bench.plane.syncer.usable, "the plane is lost")
     (problem,) = bench.runtime.problems.all()
-    assert problem.subject == "--data-plane for UDP"
+    assert problem.subject == "data plane for UDP"
     assert bench.plane.status()["plane"] == "copy"
     assert bench.plane.forwards == {}

@@ -253,7 +253,7 @@ def test_loopback_is_fine_where_all_is_on_one_machine() -> None:
 def test_cleaning_up_is_no_advice_while_the_proxy_is_down() -> None:
     facts = without_proxy(nodes=by_name(talker(attempt=REFUSED)))
     finding = only(check(facts))
-    assert "run rosproxy doctor on robot-host" in finding.fix
+    assert "run the doctor on robot-host" in finding.fix
     assert "cleanup" not in finding.fix
 
 

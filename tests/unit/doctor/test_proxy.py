@@ -56,7 +56,9 @@ def test_a_look_from_outside_does_not_ask_for_a_proxy() -> None:
 def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
     facts = without_proxy(master=None, advertise_host="", advertised_addresses=())
     notes = [f for f in check(facts) if f.severity is Severity.INFO]
-    assert [f.fix.split(" ")[1] for f in notes] == ["--master-uri", "--advertise-host"]
+    master, host = notes
+    assert "--master-uri http://HOST:11311" in master.fix
+    assert "--advertise-host ADDRESS" in host.fix
 
 
 @pytest.mark.parametrize(
@@ -166,7 +168,7 @@ def test_an_advertised_name_that_is_unknown_here() -> None:
             ("unresolvable", "missed"),
             Severity.ERROR,
             "the host name can't be resolved here",
-            "set an address instead of the name: --advertise-host ADDRESS",
+            "give an address instead of the name: set --advertise-host ADDRESS",
         ),
     ],
 )
@@ -184,7 +186,10 @@ def test_a_range_that_is_published_in_part() -> None:
     facts = make_facts(probe=probes(("ok", "ok"), ("refused", "missed")))
     finding = only(of("published range", facts))
     assert finding.text.startswith("robot-host, port 45099: connection refused")
-    assert finding.fix == "publish the whole range: docker run -p 45000-45099:45000-45099"
+    assert finding.fix == (
+        "publish the whole range: docker run -p 45000-45099:45000-45099, and let the firewall "
+        "accept it"
+    )
 
 
 def test_a_range_that_could_not_be_tried() -> None:

@@ -19,25 +19,22 @@ from rosproxy.admin.doctor_finding import (
 from rosproxy.doctor.presentation import as_json
 from rosproxy_operator.common.proxy_doctor import read_findings, without_names_of_others
 from rosproxy_operator.docker import doctor as docker_doctor
-from rosproxy_operator.docker.doctor import FIXES, host_findings
+from rosproxy_operator.docker.doctor import host_findings
 from rosproxy_operator.docker.host_status import HostStatus
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
 
 
-def test_findings_carry_the_proxys_name_and_the_operators_fix() -> None:
+def test_findings_carry_the_proxys_name() -> None:
     said = [
         ok("admin", "proxy", "rosproxy 1"),
-        error("advertised host", "advertised host", "leads nowhere", "--advertise-host ADDRESS"),
         error("node", "/talker", "is gone", "restart it"),
     ]
-    findings = read_findings("proxy a", json.dumps(as_json(said)).encode(), FIXES)
+    findings = read_findings("proxy a", json.dumps(as_json(said)).encode())
     assert [finding.subject for finding in findings] == [
         "proxy a: proxy",
-        "proxy a: advertised host",
         "proxy a: /talker",
     ]
-    assert "label rosproxy.advertise-host=ADDRESS" in findings[1].fix
-    assert (findings[2].severity, findings[2].fix) == (Severity.ERROR, "restart it")
+    assert (findings[1].severity, findings[1].fix) == (Severity.ERROR, "restart it")
 
 
 @pytest.mark.parametrize(
@@ -48,14 +45,14 @@ def test_findings_carry_the_proxys_name_and_the_operators_fix() -> None:
     ],
 )
 def test_what_is_no_findings_is_told(said: bytes) -> None:
-    (finding,) = read_findings("proxy a", said, {})
+    (finding,) = read_findings("proxy a", said)
     assert finding.severity is Severity.WARNING
     assert "can't be read" in finding.text
 
 
 @given(st.binary() | st.recursive(st.none() | st.text(), st.lists).map(json.dumps).map(str.encode))
 def test_nothing_that_a_proxy_prints_makes_it_fail(said: bytes) -> None:
-    assert all(isinstance(finding, DoctorFinding) for finding in read_findings("a", said, {}))
+    assert all(isinstance(finding, DoctorFinding) for finding in read_findings("a", said))
 
 
 def test_causes_of_a_host_come_before_what_follows_from_them() -> None:

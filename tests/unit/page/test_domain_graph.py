@@ -167,4 +167,4 @@ def test_what_goes_outwards_by_itself_is_carried_directly(
 
 def test_what_concerns_nobody_alone_is_a_finding() -> None:
     (finding,) = made(peers=())["findings"]
-    assert finding["fix"] == "set --ros2-peer, or run rosproxy lan-relay and set --ros2-lan-relay"
+    assert finding["fix"].startswith("set --ros2-peer ADDRESS; or run rosproxy lan-relay and set ")

@@ -129,11 +129,11 @@ def test_only_ports_of_the_masters_host_need_a_port() -> None:
 def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
     own = settings(publish_master=11411, admin=HostPort("0.0.0.0", 11312))
     assert {port: book.obstacle(port, own) for port in (45000, 45009, 11311, 11411, 11312)} == {
-        45000: "lies in --port-range 45000-45009",
-        45009: "lies in --port-range 45000-45009",
-        11311: "is taken by --master-port",
-        11411: "is taken by --publish-master",
-        11312: "is taken by --admin-bind",
+        45000: "lies in the range 45000-45009 of the proxy",
+        45009: "lies in the range 45000-45009 of the proxy",
+        11311: "is taken by the proxy's master API",
+        11411: "is taken by the published master",
+        11312: "is taken by the admin endpoint",
     }
     assert book.obstacle(45010, own) is None
     assert book.obstacle(40001, settings()) is None
@@ -141,9 +141,9 @@ def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
 
 def test_advice_says_what_to_do() -> None:
     address = HostPort(ROBOT, 45000)
-    reason = "lies in --port-range 45000-45009"
+    reason = "lies in the range 45000-45009 of the proxy"
     text = make_stand_ins().advice(address, reason, ADDRESS)
-    assert "port 45000 lies in --port-range 45000-45009" in text
+    assert "port 45000 lies in the range 45000-45009 of the proxy" in text
     assert "ROS_IP=192.0.2.7" in text
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from rosproxy import fixes
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -288,8 +289,10 @@ def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, sec
     """
     # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
     # is started again while the operator is away begins with the policy of its creation.
+    # VARIABLE came later: it only words the proxy's fixes, and is no reason to make a proxy anew.
     body = container_config(replace(action, sandbox="", fingerprint=""), settings, secret, "")
-    env = [v for v in body["Env"] if v.partition("=")[0] not in POLICY_VARIABLES]
+    left_out = {*POLICY_VARIABLES, fixes.VARIABLE}
+    env = [v for v in body["Env"] if v.partition("=")[0] not in left_out]
     return digest({**body, "Image": image_id, "Env": env})
 
 
@@ -380,6 +383,7 @@ def _variables(
     """What a proxy is told; what is empty is left out. In another order it would be made anew."""
     key = action.key
     return {
+        fixes.VARIABLE: "docker",
         "ROS_MASTER_URI": key.master_uri,
         "ROSPROXY_ADVERTISE_HOST": key.advertise_host,
         "ROSPROXY_PORT_RANGE": str(own_range(key, action.range)),

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from rosproxy import fixes
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
@@ -374,6 +375,7 @@ def _environment(site: ProxySite, settings: ClusterSettings) -> Mapping[str, str
     spec = site.rosproxy.spec
     policy = policy_of(site.rosproxy, settings)
     variables = {
+        fixes.VARIABLE: "kubernetes",
         "ROS_MASTER_URI": site.master.uri,
         "ROSPROXY_MASTER_ADDRESS": site.master.address,
         "ROSPROXY_ADVERTISE_HOST": site.advertise_host,

@@ -193,7 +193,7 @@ def _answered(
 def _own_problems(answer: ProxyReport) -> list[str]:
     """The problems that a proxy tells, but those of its master and its range.
 
-    They would say the same again, and with the fixes of Docker.
+    The findings of the operator report these, too.
     """
     told = ["master: "] if not answer.master_up else []
     told += [f"{RANGE}: "] if answer.range_probe else []

@@ -6,13 +6,13 @@ outside (`range_probe`).
 """
 
 from rosproxy.admin.status_document import RangeProbeStatus
+from rosproxy.fixes import FIXES
 from rosproxy_operator.kubernetes.resources.cluster import RosProxyOnNode
-from rosproxy_operator.kubernetes.resources.names import ADVERTISE_HOST
 
-ADDRESS_FIX = f"set spec.advertise, or the annotation {ADVERTISE_HOST}=ADDRESS on the node"
+ADDRESS_FIX = FIXES["advertised host"].kubernetes
 _FIREWALL = "open the proxy's hostPorts in the node's firewall and in NetworkPolicies"
 _PLUGIN = "enable hostPorts in the nodes' network plug-in (CNI: the plug-in portmap)"
-PORTS_FIX = f"{_PLUGIN}; {_FIREWALL}; or {ADDRESS_FIX}"
+PORTS_FIX = f"{FIXES['publish'].kubernetes}; or {ADDRESS_FIX}"
 """The fix where the outcome of the test is not known."""
 _NO_ANSWER = ("there is no answer", f"{_FIREWALL}; or {ADDRESS_FIX}")
 _STRANGER = (

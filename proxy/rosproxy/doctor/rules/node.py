@@ -11,6 +11,7 @@ from rosproxy.admin.setup_rules import LOOPBACK_MEANING
 from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.proxy import local_master
+from rosproxy.fixes import how_to
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 from rosproxy.telemetry.text import plural, quoted
@@ -163,9 +164,8 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
             "the other"
         )
         fix = (
-            "stop one of the two proxies; or set another --port-range (ROSPROXY_PORT_RANGE) for "
-            "one, and publish the new range. Do not run rosnode cleanup: it unregisters nodes that "
-            "are alive"
+            f"stop one of the two proxies; or, for one of them, {how_to('other range')}. Do not "
+            "run rosnode cleanup: it unregisters nodes that are alive"
         )
         yield error(TWO_PROXIES, node.name, text, fix)
     elif lease is None:
@@ -225,9 +225,8 @@ def _unresolvable(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> Docto
         text += ". It looks like a container that uses the real master instead of the proxy"
         return error(OUTSIDE, node.name, text, _start_inside(facts))
     host = quoted(slave.host)
-    fix = (
-        f"where the node runs: set ROS_IP=ADDRESS, then restart the node; or make {host} known to "
-        f"the proxy and to all inside nodes: docker run --add-host {host}:ADDRESS"
+    fix = "where the node runs: set ROS_IP=ADDRESS, then restart the node; or " + how_to(
+        "node's name", host=host
     )
     return error(OUTSIDE, node.name, text, fix)
 
@@ -236,17 +235,18 @@ def _fix_proxied(facts: DoctorFacts, node: NodeFacts, slave: HostPort) -> str:
     """Cleaning up would lose nodes that a proxy takes back when it starts again."""
     host = quoted(slave.host)
     if node.attempt.reach is ReachOutcome.UNRESOLVABLE:
-        return f"start the node's proxy with --advertise-host ADDRESS instead of the name {host}"
+        address = how_to("advertised host")
+        return f"give the node's proxy an address instead of the name {host}: {address}"
     if facts.status is None:
         return (
-            f"run rosproxy doctor on {host}. Check that the proxy runs there, and that the "
+            f"run the doctor on {host}. Check that the proxy runs there, and that the "
             "firewall accepts its ports. A proxy that starts again with the same ports takes its "
             "nodes back"
         )
     return (
-        f"if this proxy had {quoted(str(slave))} before, start the proxy with its old "
-        "--advertise-host and --port-range, or restart the node. If the node belongs to another "
-        f"proxy, check that proxy. Else {CLEANUP}"
+        f"if this proxy had {quoted(str(slave))} before, give the proxy its old advertised host "
+        "and range again, or restart the node. If the node belongs to another proxy, check that "
+        f"proxy. Else {CLEANUP}"
     )
 
 
@@ -261,8 +261,7 @@ def _past_the_proxy(facts: DoctorFacts, node: NodeFacts) -> bool:
 
 
 def _start_inside(facts: DoctorFacts, nodes: str = "the node") -> str:
-    uri = f"http://PROXY:{facts.proxy.settings.master_port}"
-    return f"start {nodes} with ROS_MASTER_URI={uri} (PROXY: the proxy's address inside)"
+    return how_to("nodes inside", nodes=nodes, port=facts.proxy.settings.master_port)
 
 
 def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:

@@ -7,6 +7,7 @@ from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, no
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, ReachOutcome
 from rosproxy.doctor.rules.node import CLEANUP
 from rosproxy.doctor.rules.proxy import local_master
+from rosproxy.fixes import how_to
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, quoted, size
 
@@ -179,8 +180,7 @@ def _why_not_from_inside(
         text = f"{text} the proxy's port for {publisher.uri}, {differ}"
         fix = f"{log} and of the proxy; restart {quoted(subscriber.name)}"
         if not facts.proxy.settings.udp:
-            fix += ". If the subscriber accepts UDPROS only, set --udp (label rosproxy.udp=true, "
-            fix += "spec.udp: true)"
+            fix += f". If the subscriber accepts UDPROS only, {how_to('UDPROS')}"
         return text, fix
     target = parse_host_port(address)
     test = f"a connection to {quoted(publisher.uri)}"
@@ -188,9 +188,8 @@ def _why_not_from_inside(
         test = f"nc -vz {quoted(target.host)} {target.port}"
     return (
         f"{text} {address or publisher.uri} directly, {differ}",
-        f"test where {quoted(subscriber.name)} runs: {test}. If there is no route outwards, set "
-        "--direction both (label rosproxy.direction=both, spec.direction: Both). "
-        f"Else {log}",
+        f"test where {quoted(subscriber.name)} runs: {test}. If there is no route outwards, "
+        f"{how_to('direction both')}. Else {log}",
     )
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok, warning
 from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
 from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.fixes import how_to
 from rosproxy.net.addresses import parse_host_port
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, participant_label
 from rosproxy.telemetry.text import listed, plural
@@ -30,18 +31,14 @@ _REFUSED = {
         "participant is behind NAT; for (missing) add the transport UDPv4 to the profile"
     ),
     "refused: not a peer": (
-        "set --ros2-peer ADDRESS if participants at this address shall meet participants inside"
+        "if participants at this address shall meet participants inside, {peer}"
     ),
-    HIDDEN: (
-        "rootless Docker: set DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for the service "
-        "of the engine; Docker Desktop: use an engine on Linux; Docker before 23.0: run "
-        "conntrack -D -p udp as root on the host. See docs/guide/troubleshooting.md"
-    ),
+    HIDDEN: "{hidden source}",
     "refused: participants": (
-        "rosproxy status lists the participants; docs/reference/limits.md lists the bounds"
+        "to see the participants, {status}; docs/reference/limits.md lists the bounds"
     ),
 }
-"""What mends what the proxy has refused, by the subject of the problem."""
+"""The fix for what the proxy has refused, by the subject of the problem, with keys of `how_to`."""
 
 
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
@@ -55,7 +52,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
         ]
     findings += [
         (error if problem.subject == HIDDEN else warning)(
-            "refused", problem.subject, problem.text, _REFUSED[problem.subject]
+            "refused", problem.subject, problem.text, _refused_fix(problem.subject)
         )
         for problem in facts.proxy.problems
         if domains and problem.subject in _REFUSED and problem.age < RECENT
@@ -65,12 +62,17 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
     return findings
 
 
+def _refused_fix(subject: str) -> str:
+    keys = ("peer", "hidden source", "status")
+    return _REFUSED[subject].format_map({key: how_to(key) for key in keys})
+
+
 def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
     subject = f"domain {domain.domain}"
     if not domain.peers and not domain.lan_relay:
         text = "no peer and no LAN relay is set, so the proxy announces participants inside to no "
         text += "host outside"
-        fix = "set --ros2-peer, or run rosproxy lan-relay and set --ros2-lan-relay"
+        fix = f"{how_to('peer')}; or {how_to('LAN relay')}"
         yield error("announcing", subject, text, fix)
     if not domain.inside and not is_settled:
         text = "no participant inside has been heard yet; the proxy has just started"
@@ -78,7 +80,7 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
     elif not domain.inside:
         text = "no participant inside has been heard"
         fix = (
-            "connect the nodes to an inside network of the proxy, and set "
+            f"{how_to('participants inside')}, and set "
             f"ROS_DOMAIN_ID={domain.domain} and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET. If the "
             "network has no multicast, set ROS_STATIC_PEERS to the proxy's address there. The "
             "proxy can't carry RMW_IMPLEMENTATION=rmw_zenoh_cpp, which does not use DDS"
@@ -95,9 +97,9 @@ def _domain(domain: DomainStatus, is_settled: bool) -> Iterator[DoctorFinding]:
 def _silence(domain: DomainStatus) -> Iterator[DoctorFinding]:
     """The places outside where no participant has been heard: a peer, or all."""
     fix = (
-        "start a participant there with the same ROS_DOMAIN_ID, and publish the range for UDP. "
-        "Cyclone DDS with multicast takes ports that the proxy does not know: run rosproxy "
-        f'lan-relay (--ros2-lan-relay), or add <Peer address="{domain.discovery}"/> to the '
+        "start a participant there with the same ROS_DOMAIN_ID, and "
+        f"{how_to('publish for UDP')}. Cyclone DDS with multicast takes ports that the proxy does "
+        f'not know: {how_to("LAN relay")}, or add <Peer address="{domain.discovery}"/> to the '
         "CYCLONEDDS_URI of the participant"
     )
     if not domain.outside:
@@ -131,8 +133,8 @@ def _heard(
         text = f"{label}: is in domain {participant.domain}, but this proxy serves "
         text += f"{'domain' if len(served) == 1 else 'domains'} {listed(map(str, served))}"
         fix = (
-            f"set ROS_DOMAIN_ID={served[0]} for the participant, or add "
-            f"--ros2-domain {participant.domain} to the options of the proxy"
+            f"set ROS_DOMAIN_ID={served[0]} for the participant, or "
+            f"{how_to('domain', domain=participant.domain)}"
         )
         yield warning(OTHER_DOMAIN, participant.guid_prefix, text, fix)
     elif participant.guid_prefix not in prefixes:
@@ -148,7 +150,9 @@ def _name_in_domains(name: str, domains: tuple[DomainStatus, ...]) -> Iterator[D
     participants = [p for domain in domains for side in _sides(domain) for p in side]
     if not any(name in (*p.publishes, *p.subscribes, *p.services) for p in participants):
         text = "no participant has a topic or service of this name"
-        yield error(UNKNOWN_NAME, name, text, "compare with the names that rosproxy status lists")
+        yield error(
+            UNKNOWN_NAME, name, text, f"compare with the names in the status: {how_to('status')}"
+        )
     for domain in domains:
         yield from _name_in_domain(domain, name)
 

@@ -7,10 +7,13 @@ from rosproxy.admin.doctor_finding import DoctorFinding, Severity, error, note, 
 from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, published_range
 from rosproxy.admin.status_bounds import left_out
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, ReachOutcome
+from rosproxy.fixes import how_to
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import duration, quoted
 
-_OTHER_URI = "set the address of the real master: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
+
+def _other_uri() -> str:
+    return f"give the address of the real master: {how_to('master', uri='http://HOST:11311')}"
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
@@ -42,23 +45,21 @@ def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         if missing := left_out(facts.status):
             text = f"the bounded status leaves out {missing} names and entries. The doctor does "
             text += "not check these"
-            fix = "run rosproxy status to see which container has so many"
+            fix = f"{how_to('status')} to see which container has so many"
             yield note("admin", "proxy", text, fix)
     elif facts.admin_error:
         text = f"{facts.admin_error}. All other findings are made without the proxy"
-        fix = "check that the proxy runs: docker ps; docker logs CONTAINER. Then run "
-        fix += "docker exec CONTAINER rosproxy doctor"
-        yield error("admin", "proxy", text, fix)
+        yield error("admin", "proxy", text, how_to("proxy runs"))
 
 
 def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     master = facts.master
     if master is None:
         text = "not checked: the address of the master is unknown"
-        yield note("master", "master", text, "set --master-uri (ROS_MASTER_URI)")
+        yield note("master", "master", text, _other_uri())
     elif master.is_this_proxy:
         text = f"{master.uri} leads back to this proxy itself"
-        yield error("master", "master", text, _OTHER_URI)
+        yield error("master", "master", text, _other_uri())
     elif master.attempt.reach is not ReachOutcome.ANSWERED:
         yield error("master", "master", *_unanswered(master))
     else:
@@ -80,27 +81,26 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
     split_uri = urlsplit(master.uri)
     host = split_uri.hostname or ""
     port = split_uri.port
-    by_address = f"--master-uri http://ADDRESS:{port}"
     match master.attempt.reach:
         case ReachOutcome.UNRESOLVABLE:
             text = f"{uri}: the host name {host} can't be resolved here"
-            add_host = f"docker run --add-host {quoted(host)}:ADDRESS, in Kubernetes hostAliases"
-            return text, f"add the name: {add_host}; or set the address: {by_address}"
+            return text, how_to("master's name", host=quoted(host), port=port)
         case ReachOutcome.STRANGER if master.at_root:
             text = f"a ROS master answers at this port, but not at the path {split_uri.path}"
             return (
                 f"{uri}: {text}. A ROS master answers only / and /RPC2",
-                f"set --master-uri {quoted(f'http://{split_uri.netloc}/')}",
+                how_to("master", uri=quoted(f"http://{split_uri.netloc}/")),
             )
         case ReachOutcome.STRANGER:
             text = f"{uri}: the program that answers is no ROS master ({master.attempt.reason})"
-            return text, _OTHER_URI
+            return text, _other_uri()
         case ReachOutcome.REFUSED if is_loopback(host):
             text = f"{uri} refuses connections. In a container, {host} is the container itself"
-            return text, f"set the address of the master's machine: {by_address}"
+            by_address = how_to("master", uri=f"http://ADDRESS:{port}")
+            return text, f"give the address of the master's machine: {by_address}"
         case ReachOutcome.REFUSED:
             text = f"{uri} refuses connections: no roscore runs there"
-            return text, f"start roscore on {quoted(host)}: roscore -p {port}; or {_OTHER_URI}"
+            return text, f"start roscore on {quoted(host)}: roscore -p {port}; or {_other_uri()}"
     text = "the machine is off or cut off, a firewall drops the packets, or the address is wrong"
     fix = f"test from here: nc -vz {quoted(host)} {port}; test on {quoted(host)}: rosnode list"
     return f"{uri} does not answer: {text}", fix
@@ -110,8 +110,8 @@ def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     host = facts.advertise_host
     if not host:
         if facts.admin_error:
-            fix = "set --advertise-host (ROSPROXY_ADVERTISE_HOST)"
-            yield note(HOST, HOST, "not checked: the advertised host is unknown", fix)
+            text = "not checked: the advertised host is unknown"
+            yield note(HOST, HOST, text, how_to("advertised host"))
         return
     probes = facts.probe.probes if facts.probe else ()
     if not is_loopback(host) and any(probe.from_master == "ok" for probe in probes):
@@ -155,13 +155,13 @@ def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     check = "published master"
     attempt = facts.published_master
     text = f"http://{facts.advertise_host}:{port} for nodes outside: {attempt.reach.value}"
+    fix = how_to("publish", ports="port", published=f"{port}:{port}")
     if not attempt.failed:
         yield ok(check, check, text)
     elif facts.probe and any(probe.from_proxy == "ok" for probe in facts.probe.probes):
-        yield error(check, check, text, f"publish the port: docker run -p {port}:{port}")
+        yield error(check, check, text, fix)
     else:
         text += ". This proves little, since no port of this host was reached from here"
         host = quoted(facts.advertise_host)
-        fix = f"publish the port: docker run -p {port}:{port}; "
-        fix += f"test from outside: nc -vz {host} {port}"
+        fix += f"; test from outside: nc -vz {host} {port}"
         yield warning(check, check, text, fix)

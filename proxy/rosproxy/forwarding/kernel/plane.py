@@ -20,7 +20,7 @@ from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Counts, Near
 from rosproxy.forwarding.kernel.preflight import find_obstacle
-from rosproxy.forwarding.kernel.syncer import OPTION, Clock, ForwardSyncer
+from rosproxy.forwarding.kernel.syncer import SUBJECT, Clock, ForwardSyncer
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
@@ -79,7 +79,7 @@ class KernelPlane:
         mode = self._settings.data_plane
         self.syncer.look_around()
         if not self._is_wanted:
-            self.syncer.why_not = f"{OPTION} {mode}"
+            self.syncer.why_not = f"{SUBJECT} {mode}"
             return
         if why := await find_obstacle(mode, self._table.tools):
             self.syncer.why_not = why
@@ -187,7 +187,7 @@ class KernelPlane:
                 self._problems.add(self.syncer.subject, self._table.weakness)
         elif self._settings.data_plane == "kernel":
             text = f"the proxy forwards {traffic} ({plane}), not the kernel: {reason}"
-            log.error("%s kernel: %s", OPTION, text)
+            log.error("%s kernel: %s", SUBJECT, text)
             self._problems.add(self.syncer.subject, text)
         else:
             log.info("the proxy forwards %s (%s), not the kernel: %s", traffic, plane, reason)

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 Clock = Callable[[], float]
 """Seconds of the monotonic clock."""
-OPTION = "--data-plane"
+SUBJECT = "data plane"
 RETRY_LOST = 30.0
 """Seconds between attempts to get a kernel plane back that was lost."""
 
@@ -82,7 +82,7 @@ class ForwardSyncer:
         self._routes_until = 0.0
         self._logged: dict[LeaseHolder, str] = {}
         self.traffic = "topics" if table.has_connections else "datagrams"
-        self.subject = OPTION if table.has_connections else f"{OPTION} for UDP"
+        self.subject = SUBJECT if table.has_connections else f"{SUBJECT} for UDP"
         self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
 

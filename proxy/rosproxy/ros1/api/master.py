@@ -109,9 +109,8 @@ class MasterApi:
             if call.loop_id == self._context.instance:
                 uri = self._context.settings.master_uri
                 text = (
-                    f"--master-uri {uri} leads back to the proxy itself. Set the URI of the real "
+                    f"master {uri} leads back to the proxy itself. Set the URI of the real master"
                 )
-                text += "master"
             raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, text)
 
     async def _answer(self, request: Request, call: IncomingCall) -> bytes | LongReply:

@@ -37,7 +37,7 @@ _Answer = TypeVar("_Answer")
 NO_CALLER_ID = (
     "the proxy can't read the caller_id of this call, and needs the caller_id to apply the policy"
 )
-NOT_THE_MASTER = "only the master's host may call this method (--slave-control master)"
+NOT_THE_MASTER = "only the master's host may call this method (slave control: master)"
 
 
 class SlaveApi:

@@ -10,6 +10,7 @@ serves whomever it served.
 from collections.abc import Collection, Sequence
 from enum import Enum
 
+from rosproxy.fixes import how_to_in_a_sentence
 from rosproxy.net.addresses import Network, is_inside
 
 
@@ -36,13 +37,12 @@ def refusal(address: str, kind: ClientKind, networks: Sequence[Network]) -> str:
     """What somebody is told, in one line, who may not use the proxy as its master."""
     if kind is ClientKind.UNSELECTED:
         return (
-            f"rosproxy: {address} is not selected to use this proxy as its master. Label the "
-            "container rosproxy.enable=true (Docker) or the pod rosproxy.io/inject=true "
-            "(Kubernetes). The container or pod must use the master of this proxy"
+            f"rosproxy: {address} is not selected to use this proxy as its master. "
+            + how_to_in_a_sentence("selected")
         )
     inside = ", ".join(map(str, networks)) or "none"
     return (
         f"rosproxy: {address} is not in an inside network ({inside}). Only inside nodes may use "
-        "this proxy as their master. Set --inside-network (ROSPROXY_INSIDE_NETWORKS) to the "
-        "network of this address, or use the real master"
+        f"this proxy as their master. {how_to_in_a_sentence('inside network')}, or use the real "
+        "master"
     )

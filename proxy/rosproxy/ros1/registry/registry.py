@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
+from rosproxy.fixes import how_to_in_a_sentence
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -83,8 +84,8 @@ class Registry:
             if port is None:
                 raise RangeExhausted(
                     f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} "
-                    f"leases held, {len(self.pool.blocked)} taken by other programs). Set a larger "
-                    "--port-range (ROSPROXY_PORT_RANGE)"
+                    f"leases held, {len(self.pool.blocked)} taken by other programs). "
+                    + how_to_in_a_sentence("larger range")
                 )
             endpoint = self._add(uri, node, location, port, source)
         elif location.confirmed or not endpoint.location.confirmed:

@@ -275,13 +275,13 @@ def aliased_host(master_uri: str) -> str | None:
 def obstacle(port: int, settings: Settings) -> str | None:
     """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
     if port in settings.ports.listen:
-        return f"lies in --port-range {settings.ports.listen}"
-    option_by_port = {
-        settings.master_port: "--master-port",
-        settings.publish_master: "--publish-master",
-        settings.admin.port: "--admin-bind",
+        return f"lies in the range {settings.ports.listen} of the proxy"
+    use_by_port = {
+        settings.master_port: "the proxy's master API",
+        settings.publish_master: "the published master",
+        settings.admin.port: "the admin endpoint",
     }
-    return f"is taken by {option_by_port[port]}" if port in option_by_port else None
+    return f"is taken by {use_by_port[port]}" if port in use_by_port else None
 
 
 def _number(text: str) -> int:

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from rosproxy.fixes import how_to_in_a_sentence
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
@@ -31,10 +32,7 @@ log = logging.getLogger(__name__)
 
 SHUTDOWN_TIMEOUT = 2.0
 """Seconds in which the master must say where a node is that is to be shut down."""
-NO_PORT = (
-    "registered directly at the master, and can't be adopted: no port of the range is left. Set a "
-    "larger --port-range (ROSPROXY_PORT_RANGE)"
-)
+NO_PORT = "registered directly at the master, and can't be adopted: no port of the range is left"
 
 
 @dataclass(slots=True, eq=False)
@@ -158,7 +156,8 @@ class Adopter:
                 endpoint = await self._make_endpoint(slave, nodes, infos[slave])
                 if endpoint is None:
                     for node in nodes:
-                        self._report(node.caller_id, NO_PORT)
+                        fix = how_to_in_a_sentence("larger range")
+                        self._report(node.caller_id, f"{NO_PORT}. {fix}")
                     continue
                 endpoints[endpoint] = infos[slave]
                 former |= {node.caller_id: (endpoint, node.uri) for node in nodes}

@@ -10,6 +10,7 @@ import asyncio
 import logging
 from urllib.parse import urlsplit
 
+from rosproxy.fixes import how_to_in_a_sentence
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.node_health import ProbeResult
@@ -78,9 +79,8 @@ class MasterMonitor:
         uri = urlsplit(self._context.settings.master_uri)
         if uri.path in MASTER_PATHS or "HTTP status 404" not in str(error):
             return ""
-        return (
-            ". A ROS master answers only at the paths / and /RPC2. Set --master-uri "
-            f"http://{uri.netloc} (ROSPROXY_MASTER_URI)"
+        return ". A ROS master answers only at the paths / and /RPC2. " + how_to_in_a_sentence(
+            "master", uri=f"http://{uri.netloc}"
         )
 
     def _mark(self, up: bool, error: str = "") -> None:

@@ -246,6 +246,7 @@ def test_what_a_proxy_for_ros_2_is_made_of() -> None:
     env.pop("ROSPROXY_ADMIN_TOKEN_HASH")
     env.pop("ROSPROXY_ROS2_LAN_RELAY_SECRET")
     assert env == {
+        "ROSPROXY_OPERATOR": "docker",
         "ROSPROXY_ROS": "2",
         "ROSPROXY_ADVERTISE_HOST": HERE,
         "ROSPROXY_PORT_RANGE": "11400-11430",

@@ -59,6 +59,7 @@ def test_a_proxy_is_in_its_sandbox_and_has_nothing_of_its_own() -> None:
     assert not {"ExposedPorts", "NetworkingConfig"} & body.keys()
     assert not {"PortBindings", "Sysctls"} & body["HostConfig"].keys()
     assert body["Env"] == [
+        "ROSPROXY_OPERATOR=docker",
         "ROS_MASTER_URI=http://robot:11311",
         "ROSPROXY_ADVERTISE_HOST=192.0.2.10",
         "ROSPROXY_PORT_RANGE=11400-11401",

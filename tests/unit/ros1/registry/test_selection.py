@@ -35,6 +35,6 @@ def test_a_refusal_is_one_line_that_says_what_to_do() -> None:
     for text in ("10.0.1.5", "10.0.0.0/24, fd00::/64", "--inside-network"):
         assert text in outside
     unselected = refusal("10.0.0.5", UNSELECTED, NETWORKS)
-    for text in ("10.0.0.5", "rosproxy.enable=true", "rosproxy.io/inject"):
+    for text in ("10.0.0.5", "is not selected", "POST /containers"):
         assert text in unselected
     assert "\n" not in outside + unselected

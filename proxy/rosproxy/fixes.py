@@ -1,0 +1,198 @@
+"""What users set to correct a fault: options of a proxy, or what an operator reads in their place.
+
+A proxy and its doctor speak for the program that has started the proxy. The operators name
+themselves in the variable VARIABLE of their proxies. Without this variable, the proxy was started
+by hand.
+"""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+VARIABLE = "ROSPROXY_OPERATOR"
+
+
+class Operator(IntEnum):
+    """What has started a proxy; the value is the column of `Fix`."""
+
+    NONE = 0
+    DOCKER = 1
+    KUBERNETES = 2
+
+
+class Fix(NamedTuple):
+    """An imperative for each operator, without a full stop, with fields of `str.format`."""
+
+    by_hand: str
+    docker: str
+    kubernetes: str
+
+
+_OPEN_HOSTPORTS = (
+    "enable hostPorts in the nodes' network plug-in (CNI: the plug-in portmap); open the proxy's "
+    "hostPorts in the node's firewall and in NetworkPolicies"
+)
+_LABELLED = "start {nodes} in a container with the label rosproxy.enable=true"
+_INJECTED = "start {nodes} in a pod with the label rosproxy.io/inject=true"
+FIXES = {
+    "advertised host": Fix(
+        "set --advertise-host ADDRESS (ROSPROXY_ADVERTISE_HOST)",
+        "add the label rosproxy.advertise-host=ADDRESS to the containers of this proxy, or start "
+        "the operator with --advertise-host ADDRESS",
+        "set spec.advertise, or the annotation rosproxy.io/advertise-host=ADDRESS on the node",
+    ),
+    "larger range": Fix(
+        "set a larger --port-range (ROSPROXY_PORT_RANGE), and publish the new range",
+        "add the label rosproxy.ports=N to a container of this proxy, or start the operator with "
+        "--ports N",
+        "set a larger spec.ports",
+    ),
+    "other range": Fix(
+        "set another --port-range (ROSPROXY_PORT_RANGE), and publish the new range",
+        "start the operator with a --port-window without these ports",
+        "set a spec.portWindow without these ports",
+    ),
+    "publish": Fix(
+        "publish the {ports}: docker run -p {published}, and let the firewall accept it",
+        "open the ports in the firewall of this host",
+        _OPEN_HOSTPORTS,
+    ),
+    "publish for UDP": Fix(
+        "publish the range for UDP",
+        "open the ports for UDP in the firewall of this host",
+        _OPEN_HOSTPORTS,
+    ),
+    "master": Fix(
+        "set --master-uri {uri} (ROS_MASTER_URI)",
+        "set ROS_MASTER_URI={uri} or the label rosproxy.master-uri={uri} in the containers of this "
+        "proxy",
+        "set spec.master.uri: {uri} or spec.master.service",
+    ),
+    "master's name": Fix(
+        "add the name: docker run --add-host {host}:ADDRESS; or set the address: --master-uri "
+        "http://ADDRESS:{port}",
+        "add the line 'ADDRESS {host}' to /etc/hosts of this host; if the operator runs in a "
+        "container, start that container with docker run --add-host {host}:ADDRESS",
+        "set spec.master.address",
+    ),
+    "node's name": Fix(
+        "make {host} known to the proxy and to all inside nodes: docker run --add-host "
+        "{host}:ADDRESS",
+        "make {host} known to the name server of this host",
+        "add {host} to spec.hostAliases and to the hostAliases of the pods",
+    ),
+    "inside network": Fix(
+        "set --inside-network (ROSPROXY_INSIDE_NETWORKS) to the network of this address",
+        _LABELLED.format(nodes="the node"),
+        _INJECTED.format(nodes="the node"),
+    ),
+    "selected": Fix(
+        "select the address (POST /containers of the admin endpoint)",
+        "label the container rosproxy.enable=true. The container must use the master of this proxy",
+        "label the pod rosproxy.io/inject=true. The pod must use the master of this proxy",
+    ),
+    "nodes inside": Fix(
+        "start {nodes} with ROS_MASTER_URI=http://PROXY:{port} (PROXY: the proxy's address inside)",
+        _LABELLED,
+        _INJECTED,
+    ),
+    "participants inside": Fix(
+        "connect the nodes to an inside network of the proxy",
+        _LABELLED.format(nodes="the nodes"),
+        _INJECTED.format(nodes="the nodes"),
+    ),
+    "domain": Fix(
+        "set --ros2-domain {domain} for the proxy",
+        "add the label rosproxy.domain={domain} to its container",
+        "select its pod with a RosProxy that has spec.domain: {domain}",
+    ),
+    "peer": Fix(
+        "set --ros2-peer ADDRESS",
+        "add the label rosproxy.peers=ADDRESS to the containers of this proxy, or start the "
+        "operator with --ros2-peer ADDRESS",
+        "add ADDRESS to spec.peers",
+    ),
+    "LAN relay": Fix(
+        "run rosproxy lan-relay and set --ros2-lan-relay",
+        "start the operator with --ros2-lan and this host's address on the LAN",
+        "set spec.multicast: true",
+    ),
+    "hidden source": Fix(
+        "rootless Docker: set DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for the service "
+        "of the engine; Docker Desktop: use an engine on Linux; Docker before 23.0: run conntrack "
+        "-D -p udp as root on the host. See docs/guide/troubleshooting.md",
+        "rootless Docker: set DOCKERD_ROOTLESS_ROOTLESSKIT_PORT_DRIVER=slirp4netns for the service "
+        "of the engine; Docker Desktop: use an engine on Linux; Docker before 23.0: run conntrack "
+        "-D -p udp as root on the host. See docs/guide/troubleshooting.md",
+        "use a network plug-in that keeps the source of datagrams to hostPorts (CNI: the plug-in "
+        "portmap)",
+    ),
+    "direction both": Fix(
+        "set --direction both",
+        "add the label rosproxy.direction=both to the containers of this proxy",
+        "set spec.direction: Both",
+    ),
+    "direction out": Fix(
+        "set --direction out",
+        "add the label rosproxy.direction=out to the containers of this proxy",
+        "set spec.direction: Out",
+    ),
+    "UDPROS": Fix(
+        "set --udp",
+        "add the label rosproxy.udp=true to a container of this proxy",
+        "set spec.udp: true",
+    ),
+    "connections of a source": Fix(
+        "set a larger --max-connections-per-source",
+        "start the operator with a larger --proxy-max-connections-per-source",
+        "set a larger proxy.bounds.maxConnectionsPerSource in the chart's values",
+    ),
+    "connections to a port": Fix(
+        "set a larger --max-connections-per-lease",
+        "start the operator with a larger --proxy-max-connections-per-lease",
+        "set a larger proxy.bounds.maxConnectionsPerLease in the chart's values",
+    ),
+    "open files": Fix(
+        "raise the limit of open files (docker run --ulimit nofile=N)",
+        'raise the limit of open files ("default-ulimits" in /etc/docker/daemon.json)',
+        "raise the limit of open files in the container runtime of the node",
+    ),
+    "proxy runs": Fix(
+        "check that the proxy runs: docker ps; docker logs CONTAINER. Then run docker exec "
+        "CONTAINER rosproxy doctor",
+        "check that the proxy runs: docker ps; docker logs CONTAINER. Then run rosproxy-operator "
+        "docker doctor",
+        "check that the proxy's pod runs: kubectl get pods -l rosproxy.io/proxy-of; kubectl logs "
+        "POD. Then run rosproxy-operator kubernetes doctor",
+    ),
+    "ask the proxy": Fix(
+        "run this where the proxy runs (docker exec CONTAINER rosproxy COMMAND), or name its admin "
+        "endpoint: --admin http://HOST:PORT or ROSPROXY_ADMIN",
+        "run this in the proxy's container: docker exec CONTAINER rosproxy COMMAND",
+        "run this in the proxy's pod: kubectl exec POD -- rosproxy COMMAND",
+    ),
+    "status": Fix(
+        "run rosproxy status --json",
+        "run docker exec CONTAINER rosproxy status --json",
+        "run kubectl exec POD -- rosproxy status --json",
+    ),
+}
+"""The fixes by what is to be set or run."""
+
+_speaks_for = [Operator.NONE]
+
+
+def speak_for(operator: str) -> None:
+    """Have this process give the fixes of an operator, by its name in VARIABLE."""
+    names = {o.name.lower(): o for o in (Operator.DOCKER, Operator.KUBERNETES)}
+    _speaks_for[0] = names.get(operator, Operator.NONE)
+
+
+def how_to(key: str, **fields: object) -> str:
+    """What to do, an imperative in lower case without a full stop; ``key`` is that of FIXES."""
+    return FIXES[key][_speaks_for[0]].format(**fields)
+
+
+def how_to_in_a_sentence(key: str, **fields: object) -> str:
+    """The same with a capital."""
+    text = how_to(key, **fields)
+    return text[:1].upper() + text[1:]
