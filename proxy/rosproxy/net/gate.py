@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 
+from rosproxy.fixes import how_to_in_a_sentence
+
 MOST_WAITING = 512
 """Connections of a source that have not said anything yet. In ROS clients speak first, at once."""
 LEAST_PER_SOURCE = 64
@@ -28,6 +30,7 @@ class Gate:
 
     def __init__(self, per_source: int, per_port: int, note_refusal: NoteRefusal) -> None:
         self.per_source = per_source
+        self._few_files = 0
         self._per_port = per_port
         self._note_refusal = note_refusal
         self._by_source: Counter[str] = Counter()
@@ -37,20 +40,26 @@ class Gate:
 
     def bound(self, files: int) -> None:
         """Never let one source have so many that so many open files run out."""
-        self.per_source = min(self.per_source, max(files // SHARE, LEAST_PER_SOURCE))
+        most = max(files // SHARE, LEAST_PER_SOURCE)
+        if most < self.per_source:
+            self.per_source = most
+            self._few_files = files
 
     def admits(self, source: str, port: int) -> bool:
         """Whether another connection may come in; makes room if one of the source waits."""
         if self._by_port[port] >= self._per_port:
-            text = f"port {port} already has {self._per_port} connections"
-            text += " (--max-connections-per-lease)"
+            text = f"port {port} already has {self._per_port} connections. "
+            text += how_to_in_a_sentence("connections to a port")
             self._note_refusal("connections_per_lease", source, text)
             return False
         if self._by_source[source] < self.per_source:
             return True
-        text = (
-            f"the source already has {self.per_source} connections (--max-connections-per-source)"
-        )
+        text = f"the source already has {self.per_source} connections"
+        if self._few_files:
+            text += f", as many as the {self._few_files} open files of the proxy allow. "
+            text += how_to_in_a_sentence("open files")
+        else:
+            text += f". {how_to_in_a_sentence('connections of a source')}"
         self._note_refusal("connections_per_source", source, text)
         return self._end_oldest(source)
 

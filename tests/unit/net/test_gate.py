@@ -81,3 +81,16 @@ def test_nothing_is_kept_of_who_has_gone() -> None:
     assert not connection_gate._by_source
     assert not connection_gate._by_port
     assert not connection_gate._waiting
+
+
+def test_the_fix_names_what_bounds_a_source() -> None:
+    texts: list[str] = []
+    for files, fix in ((100_000, "--max-connections-per-source"), (4 * 100, "open files")):
+        connection_gate = Gate(300, 10_000, lambda _reason, _source, text: texts.append(text))
+        connection_gate.bound(files)
+        enter(connection_gate, "a", 1, connection_gate.per_source)
+        assert not connection_gate.admits("a", 1)
+        assert fix in texts[-1]
+    assert texts[0].startswith("the source already has 300 connections. Set a larger --max-")
+    assert texts[1].startswith("the source already has 100 connections, as many as the 400 open ")
+    assert "--max-connections" not in texts[1]
