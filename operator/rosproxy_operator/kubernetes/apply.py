@@ -49,7 +49,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.status.events import count_patch, event_body
-from rosproxy_operator.kubernetes.status.findings import OF_ANOTHER
+from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
 log = logging.getLogger(__name__)
 

@@ -25,6 +25,11 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, KIND
 from rosproxy_operator.kubernetes.status.range_texts import no_way_in
+from rosproxy_operator.kubernetes.status.refusal_fixes import (
+    admission_fix,
+    image_fix,
+    scheduling_fix,
+)
 
 NOT_ADMITTED = "ProxyNotAdmitted"
 CONFLICT = "PortConflict"
@@ -36,11 +41,8 @@ NO_WAY_IN = "PortsUnreachable"
 WARNS = "ProxyWarns"
 REFUSES = "PolicyRefused"
 _LONGEST = 600
-_ENFORCE = "pod-security.kubernetes.io/enforce"
 _UNRESOLVED = "can't be resolved"
 """Part of a proxy's error about a host name (rosproxy.net.http_client)."""
-OF_ANOTHER = "the operator did not create"
-"""Part of the error about an object that has the name already and is not the operator's."""
 
 
 def findings(
@@ -116,9 +118,9 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, cause: PodFailure) -> ClusterFin
         "operator tries other ports. Set a spec.portWindow without the ports that other programs "
         "use",
         PodFailure.SCHEDULING: f"the scheduler or the kubelet does not admit the pod ({error}). "
-        f"Make room on the node, or set spec.tolerations or spec.resources. Read {command}",
-        PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}). Load the image "
-        "on the node, or set spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
+        f"{scheduling_fix(error)}. Read {command}",
+        PodFailure.IMAGE: f"the node can't get the image {proxy.image} ({error}). "
+        + image_fix(error),
         PodFailure.CRASHING: f"the proxy's container ends again and again ({error}). "
         f"Read kubectl -n {id.namespace} logs --previous {id.name}",
         PodFailure.SANDBOX: f"the node can't start the pod ({error}). Read {command}",
@@ -132,10 +134,7 @@ def _unusable(rosproxy: RosProxy, check: HelperPod, proxy: ProxyPod) -> ClusterF
     id = check.pod.id
     if check.stuck is PodFailure.IMAGE:
         text = f"the node can't get the image {check.image} ({check.message})"
-        fix = (
-            "Correct spec.image or the chart's proxy.image, or set spec.imagePullPolicy or "
-            "spec.imagePullSecrets"
-        )
+        fix = image_fix(check.message)
     elif check.pod.phase == "Failed":
         text = f"the image {check.image} does not run rosproxy ({check.message})"
         fix = (
@@ -218,41 +217,8 @@ def _master_remedy(rosproxy: RosProxy, error: str) -> str:
 
 def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
     message = clean(" ".join(text.split()))
-    remedy = _remedy(message, rosproxy)
+    remedy = admission_fix(message, rosproxy)
     problem = "the operator could not create, change or delete this object"
     message = message[: _LONGEST - len(f"{problem} (). {remedy}")]
     text = f"{problem} ({message}). {remedy}"
     return _finding(rosproxy, str(id), text, NOT_ADMITTED)
-
-
-def _remedy(message: str, rosproxy: RosProxy) -> str:
-    """What to do about a refusal.
-
-    The words are from k8s.io/pod-security-admission, admission/admission.go and policy/, and
-    k8s.io/apiserver, pkg/admission/plugin/resourcequota/controller.go.
-    """
-    low = message.lower()
-    if "violates podsecurity" in low or "net_admin" in low or "privilegeescalation" in low:
-        return _security_remedy(low, rosproxy)
-    if "exceeded quota" in low or "must specify" in low:
-        return "Raise the namespace's ResourceQuota, or set spec.resources"
-    if "is invalid" in low:
-        return "Correct the named field in the RosProxy's spec"
-    if "cannot" in low and "user" in low:
-        return "The operator lacks a right. Install the operator's chart or manifests again"
-    if OF_ANOTHER in low:
-        return "Delete that object, or use another name for the RosProxy"
-    return "The operator tries again"
-
-
-def _security_remedy(low: str, rosproxy: RosProxy) -> str:
-    if "hostport" not in low and ("net_admin" in low or "privilegeescalation" in low):
-        return "Allow NET_ADMIN for proxies in that namespace, or set spec.dataPlane: Auto"
-    kernel = rosproxy.spec.data_plane == "kernel"
-    takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
-    if rosproxy.spec.multicast:
-        takes += ", and the LAN relay of a proxy needs hostNetwork"
-    return (
-        f"A proxy needs {takes}. This requires Pod Security privileged. Run kubectl label namespace"
-        f" {rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"
-    )

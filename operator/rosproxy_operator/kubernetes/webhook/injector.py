@@ -31,7 +31,7 @@ from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import service_id
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.settings import ClusterSettings
-from rosproxy_operator.kubernetes.status.findings import OF_ANOTHER
+from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
 log = logging.getLogger(__name__)
 

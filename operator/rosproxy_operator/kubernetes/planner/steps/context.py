@@ -26,7 +26,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     token_of,
 )
 from rosproxy_operator.kubernetes.settings import ClusterSettings
-from rosproxy_operator.kubernetes.status.findings import OF_ANOTHER
+from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""
