@@ -119,7 +119,7 @@ def doctor(context: CommandContext, names: tuple[str, ...], as_json: bool) -> No
 
     The command checks images, networks, masters and labels, and runs the doctor of each proxy in
     the proxy's container. If names are given, the doctors of the proxies check only those nodes,
-    topics and services. Exits with 0 if nothing is wrong, else with 1.
+    topics and services. Exits with 0 if no error was found, else with 1.
     """
     from rosproxy.cli.questions import print_findings
     from rosproxy_operator.docker.doctor import examine

@@ -107,7 +107,8 @@ def _form(setting: Setting) -> dict[str, Any]:
     """What its kind, or its type alone, says of an option: one of several words, or a flag."""
     if setting.option.kind:
         return {"type": click_type(setting.option.kind)}
-    return {"type": click.Choice(setting.words)} if setting.words else {"is_flag": True}
+    words = [word for word in setting.words if word]  # an empty one only stands for the default
+    return {"type": click.Choice(words)} if words else {"is_flag": True}
 
 
 def plain(markdown: str) -> str:

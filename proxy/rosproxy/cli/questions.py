@@ -140,7 +140,7 @@ def health(admin: Any) -> None:
     "--master-address",
     type=options.click_type(kinds.ADDRESS),
     envvar="ROSPROXY_MASTER_ADDRESS",
-    help="IP address of the master's host if the proxy does not answer.",
+    help="IP address of the master's host if the proxy does not answer, or with --outside.",
 )
 @click.option(
     "--outside",

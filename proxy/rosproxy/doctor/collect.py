@@ -41,7 +41,7 @@ async def collect(
         advertise_host=advertise_host, advertised_addresses=tuple(addresses), names=names
     )
     if admin is None:
-        return await ask_graph(facts, master_uri)
+        return await ask_graph(facts, master_uri, master_address)
     try:
         return await _ask_proxy(facts, admin)
     except AdminError as error:

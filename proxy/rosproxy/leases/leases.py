@@ -124,10 +124,10 @@ class Leases(Generic[_H]):
         """Whether an endpoint's port listens."""
         return endpoint.port in self._acceptors
 
-    def open(self, endpoint: _H) -> None:
-        """Let an endpoint's ports listen, if it still holds the lease."""
+    def open(self, endpoint: _H) -> OSError | None:
+        """Let an endpoint's ports listen, if it still holds the lease; the error if it fails."""
         if self._closed or self._holders.by_port.get(endpoint.port) is not endpoint:
-            return
+            return None
         self._kernel.note_change(endpoint)
         if error := self._listen(endpoint, endpoint.port):
             text = f"port {endpoint.port} can't be opened: {error}"
@@ -135,6 +135,7 @@ class Leases(Generic[_H]):
             log.error("port %d of %s can't be opened: %s", endpoint.port, endpoint.label, error)
         elif endpoint.fast_port is not None and self._listen(endpoint, endpoint.fast_port):
             fast_ports.give_back(self._holders.pool, endpoint, blocked=True)
+        return error
 
     def close(self, endpoint: _H) -> None:
         """Let an endpoint's ports refuse, if it still holds the lease; open connections stay.
@@ -262,7 +263,7 @@ class Leases(Generic[_H]):
         self._acceptors[port] = Acceptor(self._tasks, sock, handler, self._gate)
 
     def _listen(self, endpoint: _H, port: int) -> OSError | None:
-        """Let a port listen for an endpoint; the error if another program has it."""
+        """Let a port listen for an endpoint; the error if that fails."""
         if port not in self._acceptors:
             try:
                 self._accept(port, lambda conn, peer: self.server.serve(endpoint, conn, peer))

@@ -313,6 +313,11 @@ async def test_the_command(proxy: Proxy, node: FakeNode, master: FakeMaster) -> 
     assert told["findings"][-1]["subject"] == "/chatter"
     outside = await run("doctor", "--outside", ROS_MASTER_URI=master.uri)
     assert outside.code == 0
+    named = f"http://robot.invalid:{master.uri.rstrip('/').rpartition(':')[2]}"
+    outside = await run("doctor", "--outside", ROS_MASTER_URI=named)
+    assert outside.code == 1
+    outside = await run("doctor", "--outside", "--master-address", MASTER, ROS_MASTER_URI=named)
+    assert outside.code == 0
 
 
 async def test_usage() -> None:

@@ -1,12 +1,15 @@
 """A node's port: slave API and TCPROS side by side, and which port a node gets."""
 
 import asyncio
+import errno
 import socket
 
 import pytest
 
 from examples.demo.fake_http import End, free_ports, ok, value
 from examples.demo.fake_node import FakeNode
+from rosproxy.leases import leases
+from rosproxy.net import sockets
 from rosproxy.ros1.clients.master_client import CALLER_ID
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import (
@@ -295,6 +298,30 @@ async def test_a_registration_never_gets_a_port_outside_the_range(make_proxy, ma
     assert (first, second, third[0][0]) == ([[1, "", 4711]], [[-1, text, 0]], 1)
     only = await rpc(proxy.master, "system.multicall", calls[1:2], source=NODE)
     assert only == [[[-1, text, 0]]]
+
+
+@pytest.mark.parametrize("code", [errno.EADDRINUSE, errno.EMFILE])
+async def test_a_port_that_can_not_be_opened(make_proxy, node, monkeypatch, code):
+    """Only the port that another program holds is left out of the range."""
+    proxy = await make_proxy(ports=2)
+    failures = [OSError(code, "the reason")]
+
+    def listen_on(sock):
+        if failures:
+            raise failures.pop()
+        sockets.listen_on(sock)
+
+    monkeypatch.setattr(leases, "listen_on", listen_on)
+    answer = await node.publish(proxy.master)
+    told = [(problem.subject, problem.text) for problem in proxy.app.runtime.problems.all()]
+    if code == errno.EADDRINUSE:
+        assert answer[0] == 1
+        assert [subject for subject, text in told if "another program has taken port" in text]
+    else:
+        assert answer[0] == -1
+        assert "can't be opened: the reason" in answer[1]
+        assert not [text for _, text in told if "another program" in text]
+        assert (await node.publish(proxy.master))[0] == 1
 
 
 async def test_the_same_uri_gets_the_same_port_again(make_proxy, make_node):

@@ -193,6 +193,13 @@ class _Allocation:
                     f"proxy {proxy_name(neighbour)} has {ports}. Stop the containers of that proxy "
                     "until the operator has removed that proxy (--grace), then start them again"
                 )
+        ephemeral = self.observed.ephemeral
+        if overlap(ephemeral, missing):
+            return (
+                f"ports {missing} lie in the kernel's range of ephemeral ports ({ephemeral}). Give "
+                "--port-window more room below that range, or begin that range later: sysctl "
+                "net.ipv4.ip_local_port_range"
+            )
         return f"ports {missing} are not all free. Stop the programs that hold them (see ss -ltnup)"
 
 

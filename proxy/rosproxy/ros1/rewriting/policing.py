@@ -106,9 +106,14 @@ def hidden_node(call: Call, caller: Caller, addressing: Addressing) -> LocalAnsw
     return LocalAnswer(1, "node api", uri)
 
 
+def denial(reason: str) -> str:
+    """The text that a policy denies something, with the fix; ``reason`` names the rule."""
+    return f"{reason}. Change that rule if the node may have this"
+
+
 def no_provider(reason: str) -> LocalAnswer:
     """The answer to lookupService for a service that the node is not to find."""
-    return LocalAnswer(-1, f"no provider (rosproxy: {reason})", "")
+    return LocalAnswer(-1, f"no provider (rosproxy: {denial(reason)})", "")
 
 
 def no_publisher(topic: str, reason: str) -> list[object]:

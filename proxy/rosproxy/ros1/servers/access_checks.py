@@ -181,8 +181,9 @@ class AccessChecks:
         if reason is None and not policing.offers_tcpros_alone(call):
             if self.may_bypass(endpoint) or self._is_inside(source):
                 return None
-            reason = "the proxy passes only TCPROS, as a policy may deny a topic of this node"
-        return None if reason is None else policing.no_publisher(topic, reason)
+            text = "a policy may deny topics of this node, so only TCPROS passes. Offer TCPROS"
+            return policing.no_publisher(topic, text)
+        return None if reason is None else policing.no_publisher(topic, policing.denial(reason))
 
     # What a node inside asks of outside
 
@@ -222,7 +223,7 @@ class AccessChecks:
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
         reason = self.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
-        return None if reason is None else policing.no_publisher(topic, reason)
+        return None if reason is None else policing.no_publisher(topic, policing.denial(reason))
 
     # What outside calls at a node inside
 

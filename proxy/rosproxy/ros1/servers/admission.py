@@ -18,10 +18,11 @@ registers again is taken for alive, whatever was believed of it.
 """
 
 import asyncio
+import errno
 import logging
 from typing import Protocol
 
-from rosproxy.leases.leases import RANGE_OPTION, Leases
+from rosproxy.leases.leases import PORTS, Leases
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
@@ -149,7 +150,6 @@ class NodeAdmission:
         Raises Unreachable.
         """
         registry = self._context.registry
-        leases = self._leases
         problems = self._context.problems
         slave = HostPort(location.address, node.port)
         source = caller.address
@@ -169,17 +169,23 @@ class NodeAdmission:
                 if room:
                     continue
                 return self._refuse(uri, caller, str(error))
-            if answers:
-                endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
-            leases.open(endpoint)
+            failure = self._open(endpoint, answers)
             # What the master has of a node leads to this port: such a node keeps it even if another
             # program has taken it.
-            if leases.is_open(endpoint) or endpoint.registrations:
+            if self._leases.is_open(endpoint) or endpoint.registrations:
                 return endpoint
             registry.remove(endpoint)
-            registry.pool.block(endpoint.port)
             problems.solved_at(endpoint.port)  # `open` has reported it as this node's
-            problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
+            if text := _fault_of_all_ports(endpoint.port, failure):
+                return self._refuse(uri, caller, text)
+            registry.pool.block(endpoint.port)
+            problems.add(PORTS, f"another program has taken port {endpoint.port}")
+
+    def _open(self, endpoint: Endpoint, answers: bool) -> OSError | None:
+        """Open the port of an endpoint whose node ``answers`` or not; the error if that fails."""
+        if answers:
+            endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
+        return self._leases.open(endpoint)
 
     async def _make_room(self, answers: bool) -> bool:
         """Free a port for a new node, if one can be had.
@@ -357,3 +363,10 @@ def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
         f"can't be reached by the proxy at {endpoint.slave} ({reason}). Check that the node "
         "listens on this address, and that no firewall or network policy blocks the proxy"
     )
+
+
+def _fault_of_all_ports(port: int, failure: OSError | None) -> str:
+    """Why no port can be opened, if that is so; empty if another program has this port alone."""
+    if failure is None or failure.errno == errno.EADDRINUSE:
+        return ""
+    return f"rosproxy: port {port} can't be opened: {failure.strerror}"

@@ -403,7 +403,19 @@ def test_the_network_of_another_container() -> None:
 def test_the_network_of_a_container_that_is_gone() -> None:
     talker = container(networks=(), mode="container:id-pod")
     assert "shares the network of container 'id-pod', which does not exist" in refusal(talker)
-    assert "does not exist" in refusal(replace(talker, network_mode="container:id-talker"))
+
+
+def test_containers_that_share_the_network_of_each_other() -> None:
+    talker = container("talker", networks=(), mode="container:id-two")
+    two = container("two", networks=(), mode="container:id-talker")
+    for guest, others in (
+        (talker, (two,)),
+        (replace(talker, network_mode="container:id-talker"), ()),
+    ):
+        _, (problem,) = read(guest, SETTINGS, *others)
+        text = problem.text
+        assert "which shares the network of this container. Create one of the two" in text
+        assert "does not exist" not in text
 
 
 # states

@@ -527,6 +527,14 @@ def test_more_ports_that_can_not_be_had() -> None:
     assert text in port_problem(plan)
 
 
+def test_more_ports_that_lie_in_the_kernels_range() -> None:
+    seen = observed(container(labels=ASKS_FOR_40), **both())
+    plan = look(replace(seen, ephemeral=PortRange(11432, 60999)))
+    text = "11432-11439 lie in the kernel's range of ephemeral ports (11432-60999). Give --port-"
+    assert text in port_problem(plan)
+    assert "Stop the programs" not in port_problem(plan)
+
+
 def test_more_ports_where_the_next_proxy_begins() -> None:
     neighbour: Any = both(key=ARM, ports=NEXT)
     own: Any = both()

@@ -31,6 +31,12 @@ def test_the_defaults(given: list[KubernetesSettings]) -> None:
     assert given == [KubernetesSettings()]
 
 
+def test_help_shows_no_empty_word() -> None:
+    text = run("--help").stdout
+    assert "[Always|IfNotPresent|Never]" in text
+    assert "[|" not in text
+
+
 def test_all_options(given: list[KubernetesSettings]) -> None:
     run(
         "--namespace=one",

@@ -167,3 +167,11 @@ def test_a_malformed_graph_is_left_as_it_is_or_completed(said: object) -> None:
     registry = make(("/a", Kind.PUBLISHER, "/t", True)).registry
     for method in ("getSystemState", "getTopicTypes", "getPublishedTopics"):
         with_hidden(Call(method, []), said, registry)
+
+
+def test_what_a_policy_denies_has_a_fix() -> None:
+    reason = "policy of --policy: deny call /add"
+    answer = policing.no_provider(reason)
+    assert answer.triple()[1] == (
+        f"no provider (rosproxy: {reason}. Change that rule if the node may have this)"
+    )

@@ -232,10 +232,15 @@ def network_owner(container: Container, observed: HostState) -> Container:
     visited = {container.id}
     while (target := container.network_container) is not None:
         sharer = next((c for c in observed.containers if target in (c.id, c.name)), None)
-        if sharer is None or sharer.id in visited:
+        if sharer is None:
             raise UnusableLabel(
                 f"shares the network of container {quoted(target)}, which does not exist. Start "
                 "that container, then create this container again"
+            )
+        if sharer.id in visited:
+            raise UnusableLabel(
+                f"shares the network of container {quoted(target)}, which shares the network of "
+                "this container. Create one of the two with a network of its own"
             )
         visited.add(sharer.id)
         container = sharer
