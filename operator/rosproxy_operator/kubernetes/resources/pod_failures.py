@@ -4,6 +4,7 @@ The texts are those of Kubernetes 1.36; the files named are in k8s.io/kubernetes
 """
 
 import re
+from datetime import datetime
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
@@ -54,6 +55,9 @@ _TAKEN = ("address already in use", "port is already allocated", "cannot open ho
 the CNI plugin portmap the port is silently taken over.
 """
 _LONGEST = 300
+_STABLE_AFTER_S = 60.0
+"""A container that ran this long and then ended does not end again and again: the liveness probe
+fails for the third time after half of it."""
 
 
 def pod_failure(status: Json) -> tuple[PodFailure | None, str]:
@@ -100,22 +104,36 @@ def _unscheduled(reason: str, message: str) -> tuple[PodFailure | None, str]:
 def _waiting(container: Json) -> tuple[PodFailure | None, str]:
     """What a container waits for. One that has ended for the second time waits as well.
 
-    The kubelet calls that CrashLoopBackOff only when it looks at the pod again.
+    The kubelet calls that CrashLoopBackOff only when it looks at the pod again. A proxy ends with
+    exit code 0 only if the kubelet stops it, as for another image.
     """
     ended = submap(container, "state", "terminated")
     waiting = submap(container, "state", "waiting")
     reason = text_at(waiting, "reason")
     message = text_at(waiting, "message")
     if int_at(ended, "exitCode") and int_at(container, "restartCount"):
-        return _crashing(ended)
+        return (None, "") if _was_stable(ended) else _crashing(ended)
     if reason == "CrashLoopBackOff":
-        return _crashing(submap(container, "lastState", "terminated"))
+        last = submap(container, "lastState", "terminated")
+        was_stopped = not int_at(last, "exitCode") and _was_stable(last)
+        return (None, "") if was_stopped else _crashing(last)
     if reason in _IMAGE:
         bare = _REASON.sub("", _BACK_OFF.sub("", message), count=1)
         return PodFailure.IMAGE, _text("", bare) or reason
     if reason in _SANDBOX:
         return PodFailure.SANDBOX, _text(reason, message)
     return None, ""
+
+
+def _was_stable(ended: Json) -> bool:
+    """Whether a container ran for a while before it ended."""
+    try:
+        started, finished = (
+            datetime.fromisoformat(text_at(ended, key)) for key in ("startedAt", "finishedAt")
+        )
+        return (finished - started).total_seconds() >= _STABLE_AFTER_S
+    except (ValueError, TypeError, OverflowError):
+        return False
 
 
 def _crashing(ended: Json) -> tuple[PodFailure, str]:
@@ -128,6 +146,8 @@ def _crashing(ended: Json) -> tuple[PodFailure, str]:
     if reason in _NOT_STARTED:
         return PodFailure.SANDBOX, _text("RunContainerError", message)
     ending = f"exit code {int_at(ended, 'exitCode')}"
+    if ended and not int_at(ended, "exitCode"):
+        ending += ": the kubelet stops the container, as after failed liveness probes"
     if reason not in ("", "Error", "Completed"):
         ending = f"{reason}, {ending}"
     lines = message.strip().splitlines() or [""]

@@ -160,6 +160,30 @@ def test_a_container_that_has_ended_again_and_is_not_yet_called_crashing(code, r
     assert stuck(obj) == (why, "exit code 2: bad" if why else "")
 
 
+LONG = {"startedAt": "2026-11-21T14:00:00Z", "finishedAt": "2026-11-21T14:01:00Z"}
+SHORT = {"startedAt": "2026-11-21T14:00:00Z", "finishedAt": "2026-11-21T14:00:40Z"}
+
+
+@pytest.mark.parametrize(
+    ("code", "ran", "why"),
+    [(0, LONG, None), (0, SHORT, PodFailure.CRASHING), (2, LONG, PodFailure.CRASHING)],
+)
+def test_a_container_that_the_kubelet_has_stopped_does_not_crash(code, ran, why):
+    """A proxy ends with exit code 0 when the kubelet stops it, as for another image."""
+    failure, text = stuck(waiting("CrashLoopBackOff", exitCode=code, reason="Completed", **ran))
+
+    assert failure is why
+    assert ("the kubelet stops the container" in text) == (code == 0 and why is not None)
+
+
+@pytest.mark.parametrize(("ran", "why"), [(LONG, None), (SHORT, PodFailure.CRASHING)])
+def test_a_container_that_is_killed_after_a_while_is_no_crash_yet(ran, why):
+    ended = {"exitCode": 137, "reason": "Error", **ran}
+    status = {"name": "proxy", "restartCount": 3, "state": {"terminated": ended}}
+
+    assert stuck({"status": {"containerStatuses": [status]}})[0] is why
+
+
 def test_a_program_that_can_not_be_started_is_told_in_the_same_words_between_tries():
     error = "failed to create containerd task: unable to start container process: exec: nosuch"
 
