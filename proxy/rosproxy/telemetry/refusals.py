@@ -66,10 +66,12 @@ class _Span:
         if len(self.sources) < MOST_SOURCES:
             self.sources.add(source)
 
-    def settle(self, source: str) -> None:
-        """Note that the participant of a source has been met."""
-        if len(self.sources) < MOST_SOURCES:
-            self.sources.discard(source)
+    def settle(self, source: str) -> bool:
+        """Note that the participant of a source has been met; whether it was the last such one."""
+        if len(self.sources) >= MOST_SOURCES or source not in self.sources:
+            return False
+        self.sources.discard(source)
+        return not self.sources
 
     @property
     def length(self) -> float:
@@ -123,10 +125,13 @@ class Refusals:
     def settle(self, source: str) -> None:
         """Note that a participant has been met: what its start has brought is over.
 
-        A node that crashes again and again starts each time.
+        A node that crashes again and again starts each time. Beside a running robot a proxy may
+        refuse datagrams for longer than `PATIENCE`, until the robot announces itself again. So the
+        status does not tell a refusal any more once all its sources have been met.
         """
         for reason in OF_STARTS & self._spans.keys():
-            self._spans[reason].settle(source)
+            if self._spans[reason].settle(source):
+                self._problems.solved(problem_subject(reason))
 
     def end_old(self) -> None:
         """End the problems that tell refusals which are over."""

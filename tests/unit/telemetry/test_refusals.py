@@ -130,6 +130,28 @@ def test_a_source_that_floods_is_told_though_it_is_met_again_and_again() -> None
     assert problems.all()
 
 
+@pytest.mark.parametrize("reason", sorted(OF_STARTS))
+def test_a_start_beside_a_running_robot_is_over_once_all_have_been_met(reason: str) -> None:
+    """The robot sends datagrams all the time, and announces itself late."""
+    problems = Problems()
+    clock = [0.0]
+    refusals = Refusals(Metrics(), problems, lambda: clock[0])
+    for second in range(15):
+        clock[0] = float(second)
+        refusals.note(reason, "10.0.0.5", "x")
+        refusals.note(reason, "10.0.0.6", "x")
+    assert problems.all()
+    refusals.settle("10.0.0.5")
+    assert problems.all(), "10.0.0.6 has not been met"
+    refusals.settle("10.0.0.6")
+    assert not problems.all()
+    clock[0] += QUIET
+    for _ in range(15):
+        clock[0] += 1.0
+        refusals.note(reason, "10.0.0.5", "x")
+    assert problems.all(), "what goes on again is told again"
+
+
 def test_another_source_that_settles_hides_nothing() -> None:
     problems = Problems()
     clock = [0.0]
