@@ -52,7 +52,7 @@ _REASON = re.compile(r"(ErrImagePull|RegistryUnavailable|SignatureValidationFail
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.,]+Z? *")
 _TAKEN = ("address already in use", "port is already allocated", "cannot open hostport")
 """What container runtimes say that look for listeners on a hostPort: CRI-O and cri-dockerd. With
-the CNI plugin portmap the port is silently taken over.
+the CNI plugin portmap the port is silently taken over: its DNAT rules come before the listener.
 """
 _LONGEST = 300
 _STABLE_AFTER_S = 60.0
