@@ -341,10 +341,10 @@ async def test_ports_that_the_proxy_needs_itself_are_a_problem(
     assert seen == uris
     assert stand_ins(proxy) == {}
     told = problems(proxy)
-    options = ("--port-range", "--master-port", "--admin-bind")
-    for uri, port, option in zip(uris, own, options, strict=True):
+    uses = ("the range ", "the proxy's master API", "the admin endpoint")
+    for uri, port, use in zip(uris, own, uses, strict=True):
         assert f"port {port} " in told[uri]
-        assert option in told[uri]
+        assert use in told[uri]
         assert f"ROS_IP={MASTER}" in told[uri]
 
 
