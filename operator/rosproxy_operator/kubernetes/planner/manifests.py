@@ -141,8 +141,9 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     meta = pod_metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations, settings)
     # A running proxy is told a new policy, so that makes no pod anew. A proxy that is started
     # again while the operator is away begins with the policy of its pod's creation.
-    # The same holds for peers, which come and go with the nodes.
-    live_variables = {*POLICY_VARIABLES, PEERS_VARIABLE}
+    # The same holds for peers, which come and go with the nodes. The operator's name only words
+    # the fixes of the proxy: proxies of former operators go on without it.
+    live_variables = {*POLICY_VARIABLES, PEERS_VARIABLE, fixes.VARIABLE}
     env = [v for v in container["env"] if v["name"] not in live_variables]
     spec = {**_spec(site, settings), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
