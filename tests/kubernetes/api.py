@@ -29,7 +29,7 @@ GROUPS = {
 """Where resources are that are not in the core group."""
 PLURALS = {
     "Pod": "pods", "Service": "services", "RosProxy": "rosproxies", "Namespace": "namespaces",
-    "Deployment": "deployments",
+    "Deployment": "deployments", "ResourceQuota": "resourcequotas", "LimitRange": "limitranges",
 }  # fmt: skip
 
 

@@ -1,0 +1,337 @@
+"""Mistakes that people make: each is told where they look, and the fix that is told works.
+
+Each mistake is made, the words are waited for, and the fix is followed to the letter. After that
+the RosProxy is ready, its proxy reaches the master, and the doctor finds no error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from tests.docker.engine import wait_until
+from tests.kubernetes import api
+from tests.kubernetes.api import Json
+from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.pods import INJECT, Namespace
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import RosProxy, events, rosproxy
+from tests.kubernetes.test_doctor import doctor
+
+APP = "app"
+TOLD_WITHIN = 100.0
+"""Seconds until a mistake must be told: a pod without a RosProxy is told after a minute."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """A namespace with a Deployment ``app`` and a RosProxy ``robot``, and the robot outside."""
+
+    net: Namespace
+    robot: Robot
+
+    @property
+    def rosproxy(self) -> RosProxy:
+        return RosProxy(self.net.name, "robot")
+
+    def create_rosproxy(self, **spec: Any) -> None:
+        ros2 = str(spec.get("ros")) == "2"
+        master = {} if ros2 else {"master": {"uri": self.robot.master_uri}}
+        rosproxy(self.net.name, **{**master, "ports": 8, **spec})
+
+    def create_app(self, **template: Any) -> None:
+        """Create the Deployment; ``template`` is what its pods have besides the label."""
+        labels = {"app": APP, **template.pop("labels", {INJECT: "true"})}
+        spec = self.net.pod_body("unused", "sleep", "infinity", **template)["spec"]
+        body = {
+            "apiVersion": "apps/v1", "kind": "Deployment",
+            "metadata": {"name": APP, "namespace": self.net.name},
+            "spec": {"replicas": 1, "selector": {"matchLabels": {"app": APP}},
+                     "template": {"metadata": {"labels": labels}, "spec": spec}},
+        }  # fmt: skip
+        api.create(body)
+
+    def edit_app(self, labels: Json | None = None, **spec: Any) -> None:
+        """Change the template of the pods; None takes a label or field out."""
+        template = {"metadata": {"labels": labels or {}}, "spec": spec}
+        api.patch("deployments", self.net.name, APP, {"spec": {"template": template}})
+
+    def restart_app(self) -> None:
+        kubectl("-n", self.net.name, "rollout", "restart", f"deployment/{APP}")
+
+    def create(self, kind: str, name: str, **spec: Any) -> None:
+        metadata = {"name": name, "namespace": self.net.name}
+        api.create({"apiVersion": "v1", "kind": kind, "metadata": metadata, "spec": spec})
+
+    def texts(self, reason: str) -> list[str]:
+        """What is told with this reason: in Events of pods and RosProxies, and in conditions."""
+        conditions = self.rosproxy.status.get("conditions", [])
+        own = self.rosproxy.events
+        pods = [
+            event
+            for pod in self.net.pods()
+            for event in events(self.net.name, pod["metadata"]["name"], "Pod")
+        ]
+        return [
+            *(c["message"] for c in conditions if c.get("reason") == reason),
+            *(event.message for event in (*own, *pods) if event.reason == reason),
+        ]
+
+    def is_well(self) -> bool:
+        status = self.rosproxy.status
+        now = {c["type"]: c["status"] for c in status.get("conditions", [])}
+        wanted = {"Ready": "True", "Degraded": "False"}
+        return status.get("nodes") == 1 and wanted.items() <= now.items()
+
+
+Step = Callable[[Site], None]
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What is done wrong, the reason and words that are told, and what is done about it."""
+
+    make: Step
+    reason: str
+    words: str
+    fix: Step
+
+
+def _both(spec: dict[str, Any], template: dict[str, Any]) -> Step:
+    def make(site: Site) -> None:
+        site.create_rosproxy(**spec)
+        site.create_app(**template)
+
+    return make
+
+
+def _spec(**spec: Any) -> Step:
+    """A wrong RosProxy, with a right Deployment."""
+    return _both(spec, {})
+
+
+def _template(**template: Any) -> Step:
+    """A wrong Deployment, with a right RosProxy."""
+    return _both({}, template)
+
+
+def _change(**spec: Any) -> Step:
+    return lambda site: site.rosproxy.change(**spec)
+
+
+def _relabel(value: str | None, **labels: Any) -> Step:
+    return lambda site: site.edit_app({INJECT: value, **labels})
+
+
+def _set_master(site: Site) -> None:
+    site.rosproxy.change(master={"uri": site.robot.master_uri, "service": None})
+
+
+def _without_variables(site: Site) -> None:
+    containers = site.net.pod_body("unused", "sleep", "infinity")["spec"]["containers"]
+    site.edit_app(containers=containers)
+
+
+def _late_rosproxy(site: Site) -> None:
+    site.create_app()
+    wait_until(lambda: bool(site.net.pods(f"app={APP}")), 60, "the pod")
+    site.create_rosproxy()
+
+
+def _rosproxy_and_restart(site: Site) -> None:
+    site.create_rosproxy()
+    site.restart_app()
+
+
+def _two(site: Site) -> None:
+    site.create_rosproxy()
+    rosproxy(site.net.name, "second", master={"uri": site.robot.master_uri}, ports=8)
+    site.create_app()
+
+
+def _unknown_name(site: Site) -> None:
+    port = site.robot.port
+    site.create_rosproxy(master={"uri": f"http://robott:{port}"})
+    site.create_app()
+
+
+def _set_address(site: Site) -> None:
+    host = site.robot.master_uri.removeprefix("http://").partition(":")[0]
+    site.rosproxy.change(master={"address": host})
+
+
+def _right_selector(site: Site) -> None:
+    site.rosproxy.change(podSelector={"matchLabels": {"app": APP}})
+    site.restart_app()
+
+
+def _namesake(site: Site) -> None:
+    site.create("Service", "rosproxy-robot", ports=[{"port": 80}])
+    site.create_rosproxy()
+    site.create_app()
+
+
+def _no_namesake(site: Site) -> None:
+    api.delete("services", site.net.name, "rosproxy-robot")
+
+
+def _quota(**hard: str) -> Step:
+    def make(site: Site) -> None:
+        site.create("ResourceQuota", "small", hard=hard)
+        site.create_rosproxy()
+        site.create_app()
+
+    return make
+
+
+def _more_pods(site: Site) -> None:
+    api.patch("resourcequotas", site.net.name, "small", {"spec": {"hard": {"pods": "8"}}})
+
+
+def _quota_of_cpu(site: Site) -> None:
+    site.create("ResourceQuota", "cpu", hard={"limits.cpu": "4"})
+    site.create_rosproxy()
+    site.create_app()
+    containers = site.net.pod_body("unused", "sleep", "infinity")["spec"]["containers"]
+    site.edit_app(containers=[{**containers[0], "resources": {"limits": {"cpu": "1"}}}])
+
+
+def _limit_range(site: Site) -> None:
+    site.create("LimitRange", "small", limits=[{"type": "Container", "max": {"memory": "256Mi"}}])
+    site.create_rosproxy()
+    site.create_app()
+
+
+def _pod_security(site: Site) -> None:
+    level = {"pod-security.kubernetes.io/enforce": "baseline"}
+    api.patch("namespaces", "", site.net.name, {"metadata": {"labels": level}})
+    site.create_rosproxy()
+    site.create_app()
+
+
+def _privileged(site: Site) -> None:
+    label = "pod-security.kubernetes.io/enforce=privileged"
+    kubectl("label", "namespace", site.net.name, label, "--overwrite")
+
+
+IMAGE = {"image": "rosproxy:typo", "imagePullPolicy": "Never"}
+MISTAKES: dict[str, Mistake] = {
+    "key of the label": Mistake(
+        _template(labels={"rosproxy.io/injekt": "true"}),
+        "UnknownName", "did you mean the label rosproxy.io/inject",
+        _relabel("true", **{"rosproxy.io/injekt": None}),
+    ),
+    "True with a capital": Mistake(
+        _template(labels={INJECT: "True"}), "NotWired", "true in lower case", _relabel("true")
+    ),
+    "label names no RosProxy": Mistake(
+        _template(labels={INJECT: "robott"}), "NotWired", "Set the label to robot",
+        _relabel("robot"),
+    ),
+    "no RosProxy": Mistake(
+        lambda site: site.create_app(), "NotWired", "RosProxy", _rosproxy_and_restart
+    ),
+    "RosProxy after the pod": Mistake(
+        _late_rosproxy, "NotWired", f"rollout restart deployment/{APP}", Site.restart_app
+    ),
+    "two RosProxies": Mistake(_two, "Ambiguous", INJECT, _relabel("robot")),
+    "another master in the template": Mistake(
+        _template(env={"ROS_MASTER_URI": "http://192.0.2.7:11311"}),
+        "NotWired", "Remove the variable from the template", _without_variables,
+    ),
+    "hostNetwork": Mistake(
+        _template(hostNetwork=True), "HostNetwork", "hostNetwork",
+        lambda site: site.edit_app(hostNetwork=None),
+    ),
+    "labels of the selector": Mistake(
+        _both({"podSelector": {"matchLabels": {"app": "other"}}}, {}),
+        "NotWired", "do not match spec.podSelector",
+        _right_selector,
+    ),
+    "pods without the label": Mistake(
+        _both({"podSelector": {"matchLabels": {"app": APP}}}, {"labels": {}}),
+        "NotWired", "Add the label", _relabel("true"),
+    ),
+    "master refuses": Mistake(
+        _spec(master={"uri": "http://10.88.0.50:1"}), "MasterUnreachable", "correct spec.master",
+        _set_master,
+    ),
+    "name of the master": Mistake(
+        _unknown_name, "MasterUnreachable", "set spec.master.address", _set_address
+    ),
+    "Service of the master": Mistake(
+        _spec(master={"service": {"name": "roscore"}}), "MasterUnknown",
+        "there is no Service roscore", lambda site: site.rosproxy.change(
+            master={"service": None, "uri": site.robot.master_uri}),
+    ),
+    "image": Mistake(
+        _spec(**IMAGE), "ProxyStuck", "set spec.image",
+        _change(image=None, imagePullPolicy=None),
+    ),
+    "image that is not allowed": Mistake(
+        _spec(image="example.org/other:1"), "NotAllowed", "Remove the field", _change(image=None)
+    ),
+    "no node fits": Mistake(
+        _spec(nodeSelector={"kubernetes.io/hostname": "nowhere"}), "NodeLeftOut",
+        "spec.nodeSelector", _change(nodeSelector=None),
+    ),
+    "more memory than a node has": Mistake(
+        _spec(resources={"requests": {"memory": "4Ti"}, "limits": {"memory": "4Ti"}}), "ProxyStuck",
+        "spec.resources", _change(resources=None),
+    ),
+    "no external address": Mistake(
+        _spec(advertise="ExternalIP"), "NoAdvertiseHost", "spec.advertise",
+        _change(advertise="InternalIP"),
+    ),
+    "ports of NodePorts": Mistake(
+        _spec(portWindow={"first": 30000, "last": 30100}), "PortsExhausted", "spec.portWindow",
+        _change(portWindow=None),
+    ),
+    "name is taken": Mistake(_namesake, "ProxyNotAdmitted", "Delete that object", _no_namesake),
+    "quota of pods": Mistake(
+        _quota(pods="1"), "ProxyNotAdmitted", "ResourceQuota", _more_pods
+    ),
+    "quota that wants limits": Mistake(
+        _quota_of_cpu, "ProxyNotAdmitted", "spec.resources",
+        _change(resources={"limits": {"cpu": "1", "memory": "256Mi"}}),
+    ),
+    "LimitRange": Mistake(
+        _limit_range, "ProxyNotAdmitted", "LimitRange",
+        _change(resources={"limits": {"memory": "256Mi"}, "requests": {"memory": "64Mi"}}),
+    ),
+    "Pod Security": Mistake(
+        _pod_security, "ProxyNotAdmitted", "kubectl label namespace", _privileged
+    ),
+    "domain in the template": Mistake(
+        _both({"ros": 2, "domain": 3, "master": None}, {"env": {"ROS_DOMAIN_ID": "7"}}),
+        "OtherDomain", "ROS_DOMAIN_ID", _without_variables,
+    ),
+    "peers in the template": Mistake(
+        _both({"ros": 2, "master": None}, {"env": {"ROS_STATIC_PEERS": "192.0.2.7"}}),
+        "NotWired", "ROS_STATIC_PEERS", _without_variables,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_told_and_the_fix_works(name: str, net: Namespace, robot: Robot) -> None:
+    site = Site(net, robot)
+    mistake = MISTAKES[name]
+    mistake.make(site)
+
+    def is_told() -> bool:
+        return any(mistake.words in text for text in site.texts(mistake.reason))
+
+    def story() -> str:
+        return f"{mistake.reason}: {site.texts(mistake.reason)}\n{site.rosproxy.tell()}"
+
+    wait_until(is_told, TOLD_WITHIN, lambda: f"{mistake.words!r} is told: {story()}")
+    code, found = doctor(net.name)
+    assert code == 1, found
+    mistake.fix(site)
+    wait_until(site.is_well, 90, lambda: f"the fix works: {story()}")
+    code, found = doctor(net.name)
+    assert code == 0, found
