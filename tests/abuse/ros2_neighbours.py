@@ -9,6 +9,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from time import monotonic
 from types import TracebackType
 
@@ -69,7 +70,18 @@ class Participant:
 
     def proves_to_receive(self, asked: Callable[[], object]) -> None:
         """Answer the question that the proxy sends to this address; ``asked`` is done meanwhile."""
-        question = self.is_asked(asked)
+        self._answer(self.is_asked(asked))
+
+    def answers_all(self) -> None:
+        """Answer each question that has come, as a real participant does: an answer may be lost."""
+        self.meta.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                datagram = self.meta.recv(65536)
+                if _is_question(datagram):
+                    self._answer(datagram)
+
+    def _answer(self, question: bytes) -> None:
         told = read_discovery(question).of_participant
         assert told is not None
         (meta, _) = (locator for _, locator in told.reached_at(question))

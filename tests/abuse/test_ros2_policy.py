@@ -141,12 +141,17 @@ async def test_a_change_of_the_policy_for_many_participants(
         met.update(met_anew(last))
         return met >= {*AT_PEER}
 
+    def told() -> str:
+        (domain,) = abused.status()["domains"]
+        numbers = f"lost {domain.get('lost')}, dropped {domain.get('dropped')}, {abused.refused()}"
+        return f"{len(met & {*AT_PEER})} of {len(AT_PEER)} have met again: {numbers}"
+
     with pair:
         await crowd(abused, robot, last, first)
         last.meta.setblocking(False)
         met_anew(last)
         with abused.watched():
             policy.write_text("deny publish /chatter")
-            await until(is_complete, "all have met again")
+            await until(is_complete, told)
     assert pair.figures.lost == 0
     assert pair.figures.longest_gap < LONGEST_GAP

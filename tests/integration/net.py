@@ -30,7 +30,9 @@ PATIENCE = 30.0
 """Seconds after which something awaited counts as missing, on however busy a machine."""
 
 
-async def until(condition: Callable[[], Any], expectation: str, within: float = PATIENCE) -> None:
+async def until(
+    condition: Callable[[], Any], expectation: str | Callable[[], str], within: float = PATIENCE
+) -> None:
     """Wait until ``condition`` holds; it may be a coroutine function."""
     clock = asyncio.get_running_loop().time
     end = clock() + within
@@ -38,7 +40,9 @@ async def until(condition: Callable[[], Any], expectation: str, within: float = 
         result = condition()
         if await result if isinstance(result, Awaitable) else result:
             return
-        assert clock() < end, f"waited {within:g} s in vain: {expectation}"
+        if clock() >= end:
+            told = expectation if isinstance(expectation, str) else expectation()
+            raise AssertionError(f"waited {within:g} s in vain: {told}")
         await asyncio.sleep(0.01)
 
 
