@@ -12,6 +12,7 @@ the proxies' reports, so that the next leader begins at once; at its end a term 
 """
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable
@@ -62,6 +63,8 @@ LONGEST_LOOK = 90.0
 """Seconds after which a look that has not ended is given up."""
 STANDING_BY = 5.0
 """Seconds between two looks of an operator that does not lead."""
+KEY_EVERY = 30.0
+"""Seconds between two checks whether the key of the proxies' tokens is another one."""
 
 
 class KubernetesController:
@@ -122,15 +125,26 @@ class KubernetesController:
         ]
         for reflector in reflectors:
             reflector.start()
+        key_check = asyncio.create_task(self._check_key())
         try:
             await self._loop.run(self.look)
         finally:
+            key_check.cancel()
             for reflector in reflectors:
                 reflector.stop()
             await self._tasks.cancel()
             await self._proxies.close()
             for reflector in reflectors:
                 await in_thread(reflector.join)
+
+    async def _check_key(self) -> None:
+        """Plan everything once the key was replaced, or removed from its Secret: no watch tells."""
+        while True:
+            await asyncio.sleep(KEY_EVERY)
+            with contextlib.suppress(ApiError):  # a look reports it
+                if self._acting and await in_thread(self._key.read) != self._secret:
+                    self._due.mark_all_due()
+                    self._loop.wake()
 
     async def stop_acting(self) -> None:
         """Cancel the tasks beside the looks. The next look finds that this one leads no more."""
@@ -191,7 +205,6 @@ class KubernetesController:
 
     async def _act(self) -> float | None:
         started = time.monotonic()
-        # A key that was removed from its Secret, or replaced, is noticed at the next resync.
         if self._due.is_all(started, self._settings.resync):
             self._secret = await in_thread(self._key.read)
         self._due.at_once(await self._sandbox.read(self._store.snapshot()))

@@ -19,6 +19,7 @@ from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.proxies import proxy_sync
 from rosproxy_operator.kubernetes.proxies.sandbox import SandboxFailures
 from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.settings import ClusterSettings, KubernetesSettings
 from rosproxy_operator.kubernetes.watch import reflector
 from rosproxy_operator.kubernetes.webhook.injector import Injector
@@ -45,7 +46,7 @@ class Running:
         self.metrics = ClusterMetrics()
         self.term = 1
         api.gate.open = lambda: bool(self.term)
-        settings = KubernetesSettings(resync=60.0)
+        settings = KubernetesSettings(resync=60.0, key_secret=Name(NAMESPACE, "key"))
         self.controller = KubernetesController(settings, api, self.metrics, lambda: self.term)
         self.task = asyncio.create_task(self.controller.run())
 
@@ -59,6 +60,7 @@ class Running:
 async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Running]:
     monkeypatch.setattr(module, "DEBOUNCE", 0.01)
     monkeypatch.setattr(module, "SETTLED", 0.05)
+    monkeypatch.setattr(module, "KEY_EVERY", 0.05)
     monkeypatch.setattr(control_loop, "PAUSES", (0.02,))
     monkeypatch.setattr(reflector, "PAUSES", (0.02,))
     monkeypatch.setattr(proxy_sync, "EVERY", 0.05)
@@ -92,6 +94,17 @@ async def test_a_labelled_pod_gets_a_proxy(server: ApiServer, running: Running) 
         return server.get("rosproxies", "arm", NAMESPACE)["status"].get("masterURI")
 
     await until(lambda: told() == "http://10.96.0.7:11311")
+
+
+async def test_a_key_that_is_removed_makes_the_proxies_anew(
+    server: ApiServer, running: Running
+) -> None:
+    server.put("secrets", {"metadata": {"name": "key"}}, NAMESPACE)
+    put_all(server)
+    await until(lambda: bool(proxies(server)))
+    first = proxies(server)[0]["metadata"]["annotations"]
+    server.put("secrets", {"metadata": {"name": "key"}}, NAMESPACE)
+    await until(lambda: any(pod["metadata"]["annotations"] != first for pod in proxies(server)))
 
 
 async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
