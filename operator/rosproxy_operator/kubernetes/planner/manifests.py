@@ -292,13 +292,14 @@ def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
 def pod_security_context(settings: ClusterSettings) -> dict[str, Any]:
     """The ``securityContext`` of pods of the proxies' image.
 
-    The group is that of the image in any case: the programs for the kernel plane belong to it.
+    The programs for the kernel plane belong to the image's group. Container runtimes refuse a
+    runAsGroup without a runAsUser.
     """
     user = settings.pod.run_as_user
+    in_group = {"runAsUser": user, "runAsGroup": USER} if user else {"supplementalGroups": [USER]}
     return {
         "runAsNonRoot": True,
-        **({"runAsUser": user} if user else {}),
-        "runAsGroup": USER,
+        **in_group,
         "seccompProfile": {"type": "RuntimeDefault"},
     }
 
