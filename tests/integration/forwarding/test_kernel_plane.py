@@ -377,7 +377,7 @@ async def test_other_modes_leave_the_kernel_alone(mode: str) -> None:
     endpoint = bench.node()
     bench.plane.recovered([endpoint])
     await bench.plane.look()
-    assert bench.plane.status()["reason"] == f"--data-plane {mode}"
+    assert bench.plane.status()["reason"] == f"data plane {mode}"
     await bench.plane.stop()
     assert endpoint.fast_port is None
     assert bench.tools.documents == []
