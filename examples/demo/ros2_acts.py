@@ -24,7 +24,7 @@ from examples.demo.proxy_process import DemoError
 from examples.demo.reliable_topics import ReliableReader, ReliableWriter
 from examples.demo.rtps_messages import pack_string, unpack_string
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.domain_settings import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
     SPDP_UNICAST,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from examples.demo.fake_http import free_ports
-from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS
+from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.abuse.apart import APART, APART_HOST, INSIDE

@@ -6,7 +6,7 @@ So tests that run in two processes at once heard each other, or found a port tak
 
 import socket
 
-from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST
+from rosproxy.ros2.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST
 
 _DOMAINS = range(29, 0, -1)
 """Their ports are below those that tests draw (`PortDraws`)."""

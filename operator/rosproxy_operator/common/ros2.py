@@ -4,7 +4,7 @@ import hashlib
 import hmac
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
+from rosproxy.ros2.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
 from rosproxy.setting_kinds import read_peer
 from rosproxy.settings import LEAST_PER_DOMAIN
 

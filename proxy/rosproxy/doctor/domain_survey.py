@@ -21,7 +21,7 @@ from rosproxy.forwarding import datagrams
 from rosproxy.net.addresses import HostPort, is_inside, plain_address
 from rosproxy.net.interfaces import address_into
 from rosproxy.ros2.discovery.announced_participant import traits
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.domain_settings import (
     PARTICIPANTS_TRIED,
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,

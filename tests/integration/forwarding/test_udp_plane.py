@@ -12,13 +12,13 @@ from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort, Route
-from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.data_leases import DataLeases
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, Refused
 from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
+from rosproxy.ros2.domain_settings import DomainSettings, Refused
 from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
+from rosproxy.ros2.sources.address_proofs import AddressProofs
 from rosproxy.runtime import Runtime
 from tests.integration.kernel_fake import OWN, FakeTools, clear_the_way
 from tests.integration.net import until

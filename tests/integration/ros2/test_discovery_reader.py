@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.discovery_rates import Standing
-from rosproxy.ros2.discovery.domain_settings import Outgoing
-from rosproxy.ros2.discovery.fair_queue import MOST_OF_SOURCE, OVERHEAD
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.servers.discovery_reader import LONGEST_ROUND, ROUND, DiscoveryReader
+from rosproxy.ros2.sources.fair_queue import MOST_OF_SOURCE, OVERHEAD
+from rosproxy.ros2.sources.rates import Standing
 
 
 def reading(

@@ -18,8 +18,7 @@ from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import lan_sources
-from rosproxy.ros2.discovery.discovery_rates import Standing
-from rosproxy.ros2.discovery.domain_settings import DomainSettings, LanRelayLink
+from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
@@ -27,6 +26,7 @@ from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
 from rosproxy.ros2.servers.lan_relay import LanRelay, LanRelaySettings
+from rosproxy.ros2.sources.rates import Standing
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
 from tests.unit.ros2.discovery.domains import A, B, spdp

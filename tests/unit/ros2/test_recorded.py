@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import may_be_discovery
 from rosproxy.ros2.protocol.parameters import FastDdsPid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_vendor

@@ -33,16 +33,6 @@ from functools import partial
 from typing import Self
 
 from rosproxy.leases.ports import PortPool
-from rosproxy.ros2.discovery.address_proofs import AddressProofs, is_question_of_proxy
-from rosproxy.ros2.discovery.claimed_addresses import claim_fault
-from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates, Standing, cost
-from rosproxy.ros2.discovery.domain_settings import (
-    DomainSettings,
-    LanRelayLink,
-    Outgoing,
-    Refused,
-    sent_to,
-)
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
@@ -53,6 +43,13 @@ from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
+from rosproxy.ros2.domain_settings import (
+    DomainSettings,
+    LanRelayLink,
+    Outgoing,
+    Refused,
+    sent_to,
+)
 from rosproxy.ros2.protocol.addressing import (
     destinations,
     for_all,
@@ -82,6 +79,9 @@ from rosproxy.ros2.rewriting.discovery import (
     read_messages,
     require_rewritable,
 )
+from rosproxy.ros2.sources.address_proofs import AddressProofs, is_question_of_proxy
+from rosproxy.ros2.sources.claimed_addresses import claim_fault
+from rosproxy.ros2.sources.rates import DiscoveryRates, Standing, cost
 
 ENDED_AT_ONCE = 64
 """Participants of a side that are forgotten at a time. The proxy looks twice a second."""

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from rosproxy.access.rules import RuleKind
-from rosproxy.ros2.discovery.domain_settings import Judge
+from rosproxy.ros2.domain_settings import Judge
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
 from rosproxy.ros2.rewriting.policing import rule_about

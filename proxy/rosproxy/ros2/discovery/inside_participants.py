@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
     note_endpoints,
     traits,
 )
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
+from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
     MOST_LEASES,
@@ -22,7 +22,6 @@ from rosproxy.ros2.discovery.domain_settings import (
     Outgoing,
     Refused,
 )
-from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.protocol.addressing import for_all
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
@@ -42,6 +41,7 @@ from rosproxy.ros2.rewriting.discovery import (
     require_rewritable,
     rewritten,
 )
+from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 PART_FOR_PROVEN = 4
 """One of so many parts of the range is for addresses that have proved to receive."""

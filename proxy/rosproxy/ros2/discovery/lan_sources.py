@@ -2,16 +2,16 @@
 
 A source that has not proved to receive may be forged, and a forger has as many sources as it likes.
 The relay has no participant, and asks nothing. So the proxy tells the relay every few seconds which
-addresses have proved to receive (`rosproxy.ros2.discovery.address_proofs`). All other sources share
+addresses have proved to receive (`rosproxy.ros2.sources.address_proofs`). All other sources share
 one allowance, as they do at the proxy.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from rosproxy.ros2.discovery.address_proofs import MOST_ADDRESSES
-from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates, Standing
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
+from rosproxy.ros2.sources.address_proofs import MOST_ADDRESSES
+from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 
 PER_SECOND = 500.0
 BURST = 2000.0

@@ -13,15 +13,14 @@ from functools import partial
 from math import inf
 
 from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
-from rosproxy.ros2.discovery.address_proofs import AddressProofs
 from rosproxy.ros2.discovery.announced_participant import (
     first_metatraffic,
     lease_duration,
     note_endpoints,
     traits,
 )
-from rosproxy.ros2.discovery.claimed_addresses import is_proxy_port
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
+from rosproxy.ros2.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
     MOST_LEASES,
@@ -36,7 +35,6 @@ from rosproxy.ros2.discovery.domain_settings import (
     Refused,
     sent_to,
 )
-from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
@@ -57,6 +55,8 @@ from rosproxy.ros2.rewriting.discovery import (
     require_rewritable,
     rewritten,
 )
+from rosproxy.ros2.sources.address_proofs import AddressProofs
+from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
 
 HIDDEN_SOURCE = (
     "this address is the gateway of the proxy's own network: the engine forwards datagrams from "

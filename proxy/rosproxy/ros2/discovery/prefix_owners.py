@@ -16,11 +16,11 @@ these seconds it may have come before the participant outside whose prefix it co
 
 from dataclasses import dataclass
 
-from rosproxy.ros2.discovery.address_proofs import AddressProofs
-from rosproxy.ros2.discovery.domain_settings import DomainSettings
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
+from rosproxy.ros2.domain_settings import DomainSettings
+from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 
 @dataclass(frozen=True, slots=True)

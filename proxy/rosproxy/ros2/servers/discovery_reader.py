@@ -8,9 +8,9 @@ the event loop serves whatever else is ready.
 import asyncio
 from collections.abc import Callable, Sequence
 
-from rosproxy.ros2.discovery.discovery_rates import Standing
-from rosproxy.ros2.discovery.domain_settings import Outgoing
-from rosproxy.ros2.discovery.fair_queue import OVERHEAD, DiscoveryQueue
+from rosproxy.ros2.domain_settings import Outgoing
+from rosproxy.ros2.sources.fair_queue import OVERHEAD, DiscoveryQueue
+from rosproxy.ros2.sources.rates import Standing
 
 ROUND = 8 * 1024
 """Bytes that are read and sent in a round. The longest datagram has a round of its own, of 5 ms."""

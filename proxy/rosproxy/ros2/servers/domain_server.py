@@ -26,7 +26,7 @@ from rosproxy.forwarding.datagrams import LARGEST_DATAGRAM
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, plain_address
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.domain_settings import (
     NEXT_PORTS,
     PARTICIPANTS_TRIED,
     DomainSettings,
@@ -35,10 +35,10 @@ from rosproxy.ros2.discovery.domain_settings import (
 from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
-from rosproxy.ros2.registry.selected import SelectedAddresses
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
+from rosproxy.ros2.sources.selected import SelectedAddresses
 
 log = logging.getLogger(__name__)
 

@@ -21,19 +21,19 @@ from functools import partial
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
 from rosproxy.net.addresses import HostPort, plain_address
-from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.discovery.lan_sources import BURST, PER_SECOND, LanSources
+from rosproxy.ros2.domain_settings import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
     Outgoing,
 )
-from rosproxy.ros2.discovery.lan_sources import BURST, PER_SECOND, LanSources
 from rosproxy.ros2.protocol.envelope import listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
+from rosproxy.ros2.sources.rates import DiscoveryRates
 
 log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ from itertools import chain
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, PAIRS_AT_ONCE, VERDICTS_AT_ONCE
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (

@@ -8,7 +8,7 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS, order_for

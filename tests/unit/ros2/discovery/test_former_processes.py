@@ -3,7 +3,7 @@
 import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.rtps import FAST_DDS, source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
@@ -18,7 +18,7 @@ from tests.unit.ros2.discovery.domains import (
     prove,
     spdp,
 )
-from tests.unit.ros2.discovery.test_proofs import answer, questions
+from tests.unit.ros2.sources.test_address_proofs import answer, questions
 
 RTI = b"\x01\x01"
 FORMER = FAST_DDS + bytes([7, 7, 1, 1, 1, 1, 0, 0, 0, 0])

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.parameters import Pid
 from tests.unit.ros2.discovery.domains import (
     INSIDE,

@@ -11,12 +11,11 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
-from rosproxy.ros2.discovery.discovery_rates import BURST
 from rosproxy.ros2.discovery.domain import ENDED_AT_ONCE
-from rosproxy.ros2.discovery.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
+from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, RtpsError
@@ -29,6 +28,7 @@ from rosproxy.ros2.registry.participants import (
     Participant,
 )
 from rosproxy.ros2.rewriting import discovery
+from rosproxy.ros2.sources.rates import BURST
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     LAN_RELAY,

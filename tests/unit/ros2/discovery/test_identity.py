@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter

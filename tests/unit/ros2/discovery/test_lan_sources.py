@@ -1,8 +1,5 @@
 """What the LAN relay reads of each source, while forged sources flood the LAN."""
 
-from rosproxy.ros2.discovery.address_proofs import MOST_ADDRESSES
-from rosproxy.ros2.discovery.discovery_rates import Standing, cost
-from rosproxy.ros2.discovery.fair_queue import DiscoveryQueue
 from rosproxy.ros2.discovery.lan_sources import (
     BURST,
     PER_SECOND,
@@ -11,6 +8,9 @@ from rosproxy.ros2.discovery.lan_sources import (
     UNPROVEN_PER_SECOND,
     LanSources,
 )
+from rosproxy.ros2.sources.address_proofs import MOST_ADDRESSES
+from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
+from rosproxy.ros2.sources.rates import Standing, cost
 
 LAPTOP = "192.0.2.7"
 SIZE = 500

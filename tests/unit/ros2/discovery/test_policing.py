@@ -8,14 +8,14 @@ import pytest
 from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import hidden_endpoints
-from rosproxy.ros2.discovery.discovery_rates import DiscoveryRates
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
 from rosproxy.ros2.discovery.hidden_endpoints import LONGEST_NAME
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.sources.rates import DiscoveryRates
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,

@@ -5,13 +5,13 @@ import struct
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.discovery_rates import BURST, STEP
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import MOST_OF_USERS, may_be_discovery
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.sources.rates import BURST, STEP
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,

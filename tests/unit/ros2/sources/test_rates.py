@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.discovery.discovery_rates import (
+from rosproxy.ros2.sources.rates import (
     BURST,
     MOST_SOURCES,
     PER_SECOND,

@@ -7,17 +7,10 @@ import pytest
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.address_proofs import (
-    ANSWER_KEPT,
-    KEPT,
-    LONGEST_ANSWER,
-    MOST_ADDRESSES,
-    MOST_ANSWERED,
-    AddressProofs,
-)
-from rosproxy.ros2.discovery.discovery_rates import BURST, Standing
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.domain_settings import (
+from rosproxy.ros2.discovery.inside_participants import PART_FOR_PROVEN
+from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
+from rosproxy.ros2.domain_settings import (
     MOST_INSIDE_UNPROVEN,
     MOST_INTRODUCED_UNPROVEN,
     MOST_OUTSIDE,
@@ -28,13 +21,20 @@ from rosproxy.ros2.discovery.domain_settings import (
     MOST_WAITING,
     Outgoing,
 )
-from rosproxy.ros2.discovery.inside_participants import PART_FOR_PROVEN
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
 from rosproxy.ros2.protocol.rtps import HEADER, PREFIX, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
+from rosproxy.ros2.sources.address_proofs import (
+    ANSWER_KEPT,
+    KEPT,
+    LONGEST_ANSWER,
+    MOST_ADDRESSES,
+    MOST_ANSWERED,
+    AddressProofs,
+)
+from rosproxy.ros2.sources.rates import BURST, Standing
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,

@@ -3,7 +3,7 @@
 import pytest
 
 from rosproxy.ros2.protocol.rtps import RtpsError, message_header
-from rosproxy.ros2.registry.selected import (
+from rosproxy.ros2.sources.selected import (
     LONGEST_HELD,
     MOST_HELD,
     MOST_HELD_EACH,

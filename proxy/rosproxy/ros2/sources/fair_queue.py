@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
-from rosproxy.ros2.discovery.discovery_rates import Standing
+from rosproxy.ros2.sources.rates import Standing
 
 MOST_OF_SOURCE = 256 * 1024
 MOST_OF_ALL = 3 * 1024 * 1024

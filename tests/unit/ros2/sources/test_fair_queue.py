@@ -5,8 +5,8 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.discovery.discovery_rates import Standing
-from rosproxy.ros2.discovery.fair_queue import MOST_KNOWN, OVERHEAD, DiscoveryQueue, FairQueue
+from rosproxy.ros2.sources.fair_queue import MOST_KNOWN, OVERHEAD, DiscoveryQueue, FairQueue
+from rosproxy.ros2.sources.rates import Standing
 from tests.unit.ros2.discovery.domains import INSIDE, ROBOT, make_domain, prove
 
 SIZES = st.integers(0, 60_000)

@@ -8,7 +8,7 @@ machine of the proxy, or to the proxy's own ports.
 from collections.abc import Container
 
 from rosproxy.net.addresses import HostPort, as_ip, is_loopback, is_of_link
-from rosproxy.ros2.discovery.domain_settings import DomainSettings
+from rosproxy.ros2.domain_settings import DomainSettings
 
 _BROADCAST = "255.255.255.255"
 
