@@ -34,7 +34,6 @@ from typing import Self
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.fragments import FragmentStores
-from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
@@ -50,6 +49,7 @@ from rosproxy.ros2.domain_settings import (
     Refused,
     sent_to,
 )
+from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.protocol.addressing import (
     destinations,
     for_all,

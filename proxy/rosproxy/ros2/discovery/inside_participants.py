@@ -12,7 +12,6 @@ from rosproxy.ros2.discovery.announced_participant import (
     note_endpoints,
     traits,
 )
-from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
@@ -22,6 +21,7 @@ from rosproxy.ros2.domain_settings import (
     Outgoing,
     Refused,
 )
+from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.protocol.addressing import for_all
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor

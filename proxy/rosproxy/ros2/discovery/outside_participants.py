@@ -19,7 +19,6 @@ from rosproxy.ros2.discovery.announced_participant import (
     note_endpoints,
     traits,
 )
-from rosproxy.ros2.discovery.hidden_endpoints import Verdicts
 from rosproxy.ros2.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
@@ -35,6 +34,7 @@ from rosproxy.ros2.domain_settings import (
     Refused,
     sent_to,
 )
+from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid

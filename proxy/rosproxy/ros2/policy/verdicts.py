@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.domain_settings import Judge
+from rosproxy.ros2.policy.rules import rule_about
 from rosproxy.ros2.registry.participants import InsideParticipant
 from rosproxy.ros2.rewriting.discovery import Announcement
-from rosproxy.ros2.rewriting.policing import rule_about
 
 MOST_VERDICTS = 1024
 MOST_VERDICTS_PER_ADDRESS = 16_384

@@ -3,8 +3,8 @@
 import pytest
 
 from rosproxy.access.rules import RuleKind
+from rosproxy.ros2.policy.rules import rule_about
 from rosproxy.ros2.registry.participants import EndpointKind
-from rosproxy.ros2.rewriting.policing import rule_about
 
 READER = EndpointKind.READER
 WRITER = EndpointKind.WRITER

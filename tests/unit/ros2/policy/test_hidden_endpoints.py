@@ -7,11 +7,11 @@ import pytest
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery import hidden_endpoints
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.hidden_endpoints import LONGEST_NAME
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.domain_settings import Outgoing
+from rosproxy.ros2.policy import verdicts
+from rosproxy.ros2.policy.verdicts import LONGEST_NAME
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import SubmessageId, source_prefix, submessages
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -146,7 +146,7 @@ def test_verdicts_of_one_address_are_bounded(monkeypatch: pytest.MonkeyPatch) ->
     """A container took 80 MB by 64 participants with 1,024 topics each, of 1 KB of name."""
     bounds = {"MOST_VERDICTS": 5, "MOST_VERDICTS_PER_ADDRESS": 8, "MOST_VERDICTS_IN_ALL": 10}
     for name, bound in bounds.items():
-        monkeypatch.setattr(hidden_endpoints, name, bound)
+        monkeypatch.setattr(verdicts, name, bound)
     rules = Rules()
     domain = domains.make_domain(judge=rules)
     for prefix in (A, NEIGHBOUR):

@@ -1,0 +1,1 @@
+"""The policy over readers and writers: which rule applies, and what it says."""
