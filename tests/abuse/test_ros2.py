@@ -14,11 +14,11 @@ import pytest
 from examples.demo.fake_http import free_ports
 from examples.demo.proxy_process import clean_environment
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.lan_sources import UNPROVEN_BURST, UNPROVEN_PER_SECOND
 from rosproxy.ros2.domain_settings import MOST_OUTSIDE_UNPROVEN, MOST_PER_UNPROVEN
-from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.lan_relay.sources import UNPROVEN_BURST, UNPROVEN_PER_SECOND
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.servers.groups import group_socket, join
 from rosproxy.ros2.sources.rates import cost

@@ -55,7 +55,7 @@ def relay_secret(key: bytes, proxy: str) -> str:
 def lan_relay_variables(
     domain: int, lan: str, bind: HostPort, proxy: HostPort, secret: str
 ) -> dict[str, str]:
-    """What a LAN relay is told; see `rosproxy.ros2.servers.lan_relay.LanRelaySettings`."""
+    """What a LAN relay is told; see `rosproxy.ros2.lan_relay.relay.LanRelaySettings`."""
     return {
         "ROSPROXY_LAN_RELAY_DOMAIN": str(domain),
         "ROSPROXY_LAN_RELAY_LAN": lan,

@@ -5,7 +5,7 @@ import logging
 
 from rosproxy.app.signals import stop_event
 from rosproxy.binding import setting_error_if_taken
-from rosproxy.ros2.servers.lan_relay import LanRelay, LanRelaySettings
+from rosproxy.ros2.lan_relay.relay import LanRelay, LanRelaySettings
 
 log = logging.getLogger(__name__)
 

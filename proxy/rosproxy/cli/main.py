@@ -110,7 +110,7 @@ def lan_relay(log_format: str, log_level: str, **given: Any) -> None:
     that the host publishes.
     """
     from rosproxy.app.lan_relay_program import run_lan_relay
-    from rosproxy.ros2.servers.lan_relay import LanRelaySettings
+    from rosproxy.ros2.lan_relay.relay import LanRelaySettings
     from rosproxy.telemetry import logs
 
     with options.setting_errors():

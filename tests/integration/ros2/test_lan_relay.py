@@ -17,15 +17,15 @@ from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery import lan_sources
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
-from rosproxy.ros2.protocol.envelope import address_lists
+from rosproxy.ros2.lan_relay import sources
+from rosproxy.ros2.lan_relay.relay import LanRelay, LanRelaySettings
+from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
-from rosproxy.ros2.servers.lan_relay import LanRelay, LanRelaySettings
 from rosproxy.ros2.sources.rates import Standing
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
@@ -240,8 +240,8 @@ async def test_unproven_sources_share_one_allowance(
     boundary: Boundary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each forged source had an allowance of its own, and the proxy got all announcements."""
-    monkeypatch.setattr(lan_sources, "UNPROVEN_PER_SECOND", 0.0)
-    monkeypatch.setattr(lan_sources, "UNPROVEN_BURST", float(SHARED))
+    monkeypatch.setattr(sources, "UNPROVEN_PER_SECOND", 0.0)
+    monkeypatch.setattr(sources, "UNPROVEN_BURST", float(SHARED))
     relay = boundary.start_relay()
     for number in range(FORGED):
         announce(f"127.0.8.{number + 1}", bytes([number]) * 12)

@@ -56,7 +56,7 @@ from rosproxy.ros2.protocol.addressing import (
     may_be_discovery,
 )
 from rosproxy.ros2.protocol.announcement import dispose_message
-from rosproxy.ros2.protocol.envelope import unwrapped
+from rosproxy.ros2.protocol.relay_envelope import unwrapped
 from rosproxy.ros2.protocol.relay_proof import Direction
 from rosproxy.ros2.protocol.rtps import (
     MAGIC,

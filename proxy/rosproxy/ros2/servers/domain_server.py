@@ -32,8 +32,8 @@ from rosproxy.ros2.domain_settings import (
     DomainSettings,
     Outgoing,
 )
-from rosproxy.ros2.protocol.envelope import address_lists
 from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
 from rosproxy.ros2.rewriting.discovery import read_messages
 from rosproxy.ros2.servers.discovery_reader import DiscoveryReader

@@ -10,9 +10,9 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.port_store import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.domain_settings import DomainSettings, Judge, LanRelayLink, Outgoing
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import HEADER, source_prefix
 from rosproxy.ros2.registry.locator_ports import REMEMBERED

@@ -7,9 +7,9 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import WINDOW_S, Direction, RelayProof
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery.domains import (

@@ -1,6 +1,6 @@
 """What the LAN relay reads of each source, while forged sources flood the LAN."""
 
-from rosproxy.ros2.discovery.lan_sources import (
+from rosproxy.ros2.lan_relay.sources import (
     BURST,
     PER_SECOND,
     REMEMBERED_S,

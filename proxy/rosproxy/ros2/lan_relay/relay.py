@@ -21,13 +21,13 @@ from functools import partial
 from rosproxy.forwarding import datagrams
 from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST_DATAGRAM
 from rosproxy.net.addresses import HostPort, plain_address
-from rosproxy.ros2.discovery.lan_sources import BURST, PER_SECOND, LanSources
 from rosproxy.ros2.domain_settings import (
     PORTS_PER_DOMAIN,
     SPDP_MULTICAST,
     Outgoing,
 )
-from rosproxy.ros2.protocol.envelope import listed_addresses, wrapped
+from rosproxy.ros2.lan_relay.sources import BURST, PER_SECOND, LanSources
+from rosproxy.ros2.protocol.relay_envelope import listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery

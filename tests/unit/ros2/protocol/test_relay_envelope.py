@@ -2,7 +2,7 @@
 
 import pytest
 
-from rosproxy.ros2.protocol.envelope import (
+from rosproxy.ros2.protocol.relay_envelope import (
     LIST_MAGIC,
     MOST_LISTED,
     address_lists,
