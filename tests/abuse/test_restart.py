@@ -13,7 +13,7 @@ import pytest
 
 from examples.demo.fake_http import free_ports
 from rosproxy.leases.ports import PortRange
-from rosproxy.ros2.discovery.port_store import PortStore, port_store_key
+from rosproxy.ros2.ports.store import PortStore, port_store_key
 from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.reliable import heartbeats

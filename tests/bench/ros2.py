@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rosproxy.ros2.registry.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.locator_ports import REMEMBERED
 from tests.bench.book import DIRECT, Book, in_turn, loss, percentile
 from tests.bench.nodes import busy
 from tests.bench.ros import RosNode, running_node, wait_for_rest

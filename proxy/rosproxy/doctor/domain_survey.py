@@ -20,7 +20,6 @@ from rosproxy.doctor.facts import HeardParticipant
 from rosproxy.forwarding import datagrams
 from rosproxy.net.addresses import HostPort, is_inside, plain_address
 from rosproxy.net.interfaces import address_into
-from rosproxy.ros2.discovery.announced_participant import traits
 from rosproxy.ros2.domain_settings import (
     PARTICIPANTS_TRIED,
     PORTS_PER_DOMAIN,
@@ -31,6 +30,7 @@ from rosproxy.ros2.protocol.announcement import SPDP_ENDPOINTS, announcement, di
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, source_vendor
 from rosproxy.ros2.registry.participants import Participant
+from rosproxy.ros2.rewriting.announced_participant import traits
 from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
 from rosproxy.ros2.servers.groups import family_of, groups_of, send_through
 

@@ -38,12 +38,12 @@ from rosproxy.net.interfaces import (
 from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
-from rosproxy.ros2.discovery.port_store import port_store_key
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.domain_watch import DomainWatch
+from rosproxy.ros2.ports.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.store import port_store_key
 from rosproxy.ros2.protocol.relay_proof import RelayProof
-from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
 from rosproxy.ros2.sources.selected import UPDATE_TIMEOUT
 from rosproxy.ros2.status import Ros2State

@@ -16,7 +16,7 @@ from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Refused
 from rosproxy.ros2.policy.verdicts import Verdicts
-from rosproxy.ros2.registry.locator_ports import LocatorPorts
+from rosproxy.ros2.ports.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 from rosproxy.runtime import Runtime

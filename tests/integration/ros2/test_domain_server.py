@@ -12,10 +12,10 @@ from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.domain_settings import DomainSettings
+from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING, stand_in_port
 from rosproxy.ros2.protocol.rtps import source_prefix
-from rosproxy.ros2.registry.locator_ports import REMEMBERED, SETTLING, stand_in_port
 from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT, DomainServer
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
 from rosproxy.ros2.sources.rates import DiscoveryRates

@@ -20,10 +20,10 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.lan_relay import sources
 from rosproxy.ros2.lan_relay.relay import LanRelay, LanRelaySettings
+from rosproxy.ros2.ports.locator_ports import REMEMBERED
 from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import source_prefix
-from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.servers.groups import GROUP, group_socket, join, send_through
 from rosproxy.ros2.sources.rates import Standing

@@ -2,7 +2,7 @@
 
 A proxy that is started again in its pod is told that by the participants themselves. A new pod has
 another address, at which they don't answer it (see
-`rosproxy.ros2.discovery.returning_participants`): then the operator tells it what the former proxy
+`rosproxy.ros2.ports.former_ports`): then the operator tells it what the former proxy
 reported last, if it has seen that; otherwise nobody does.
 """
 

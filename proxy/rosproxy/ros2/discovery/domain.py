@@ -38,10 +38,8 @@ from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.discovery.own_participants import OwnParticipants
-from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
-from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.domain_settings import (
     DomainSettings,
     LanRelayLink,
@@ -50,6 +48,9 @@ from rosproxy.ros2.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
+from rosproxy.ros2.ports.former_ports import ReturningParticipants
+from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
+from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import (
     destinations,
     for_all,
@@ -65,7 +66,6 @@ from rosproxy.ros2.protocol.rtps import (
     source_prefix,
     source_vendor,
 )
-from rosproxy.ros2.registry.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,

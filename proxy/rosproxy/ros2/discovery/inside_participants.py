@@ -6,12 +6,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced_participant import (
-    first_metatraffic,
-    lease_duration,
-    note_endpoints,
-    traits,
-)
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
@@ -22,10 +16,10 @@ from rosproxy.ros2.domain_settings import (
     Refused,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
+from rosproxy.ros2.ports.locator_ports import LocatorPorts
 from rosproxy.ros2.protocol.addressing import for_all
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
-from rosproxy.ros2.registry.locator_ports import LocatorPorts
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
@@ -35,6 +29,12 @@ from rosproxy.ros2.registry.participants import (
     ShortageKind,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
+from rosproxy.ros2.rewriting.announced_participant import (
+    first_metatraffic,
+    lease_duration,
+    note_endpoints,
+    traits,
+)
 from rosproxy.ros2.rewriting.discovery import (
     Announcement,
     DiscoveryMessage,

@@ -13,12 +13,6 @@ from functools import partial
 from math import inf
 
 from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
-from rosproxy.ros2.discovery.announced_participant import (
-    first_metatraffic,
-    lease_duration,
-    note_endpoints,
-    traits,
-)
 from rosproxy.ros2.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
@@ -35,11 +29,11 @@ from rosproxy.ros2.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
+from rosproxy.ros2.ports.locator_ports import stand_in_port
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_vendor
-from rosproxy.ros2.registry.locator_ports import stand_in_port
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Lease,
@@ -48,6 +42,12 @@ from rosproxy.ros2.registry.participants import (
     ParticipantTable,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
+from rosproxy.ros2.rewriting.announced_participant import (
+    first_metatraffic,
+    lease_duration,
+    note_endpoints,
+    traits,
+)
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     participant_alone,

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced_participant import first_metatraffic
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.discovery.port_store import PortStore
-from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
+from rosproxy.ros2.ports.former_ports import ReturningParticipants
+from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
+from rosproxy.ros2.rewriting.announced_participant import first_metatraffic
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.discovery.returning_participants import ReturningParticipants
 from rosproxy.ros2.domain_settings import DomainSettings
+from rosproxy.ros2.ports.former_ports import ReturningParticipants
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 

@@ -1,1 +1,1 @@
-"""Who is there on each side, and which ports of the range lead to whom."""
+"""What the proxy knows of the participants on each side, and of their readers and writers."""

@@ -8,14 +8,14 @@ from itertools import product
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.port_store import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.domain_settings import DomainSettings, Judge, LanRelayLink, Outgoing
+from rosproxy.ros2.ports.locator_ports import REMEMBERED
+from rosproxy.ros2.ports.store import HALF_BITS, WRITERS, halves
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, RelayProof
 from rosproxy.ros2.protocol.rtps import HEADER, source_prefix
-from rosproxy.ros2.registry.locator_ports import REMEMBERED
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, read_discovery
 from rosproxy.ros2.sources.rates import BURST
 from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage

@@ -5,8 +5,8 @@ from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
-from rosproxy.ros2.registry.locator_ports import SETTLING
+from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery.domains import (
     INSIDE,

@@ -9,9 +9,9 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
+from rosproxy.ros2.ports.locator_ports import MOST_SHARING, STAND_INS, order_for
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS, order_for
 from rosproxy.ros2.registry.participants import LeaseKind
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
@@ -121,7 +121,7 @@ def test_a_port_that_is_taken_is_left_alone() -> None:
 
 def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
+        "rosproxy.ros2.ports.locator_ports.order_for", lambda key, ports: iter([20_000])
     )
     domain = domains.make_domain(both_ways=True)
     meet(domain)
@@ -141,7 +141,7 @@ def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_fragments_go_to_whom_each_names(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last of them has those of all go on."""
     monkeypatch.setattr(
-        "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
+        "rosproxy.ros2.ports.locator_ports.order_for", lambda key, ports: iter([20_000])
     )
     domain = domains.make_domain()
     readers = (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])
@@ -164,7 +164,7 @@ def test_fragments_go_to_whom_each_names(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "rosproxy.ros2.registry.locator_ports.order_for", lambda key, ports: iter([20_000])
+        "rosproxy.ros2.ports.locator_ports.order_for", lambda key, ports: iter([20_000])
     )
     domain = domains.make_domain()
     readers = (bytes([9, 1]) + B[2:], bytes([9, 2]) + B[2:])

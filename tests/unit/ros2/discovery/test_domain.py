@@ -11,14 +11,14 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import outside_participants
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.domain_settings import MOST_LEASES, MOST_PER_ADDRESS, Outgoing
+from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.locator_ports import SETTLING
 from rosproxy.ros2.protocol.addressing import destination, destinations
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import source_prefix, source_vendor
-from rosproxy.ros2.registry.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import LeaseKind, ShortageKind
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from rosproxy.ros2.sources.rates import BURST, STEP, cost

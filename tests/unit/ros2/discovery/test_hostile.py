@@ -14,12 +14,13 @@ from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.domain import ENDED_AT_ONCE
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
+from rosproxy.ros2.ports import locator_ports
+from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, RtpsError
-from rosproxy.ros2.registry import locator_ports, participants
+from rosproxy.ros2.registry import participants
 from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
     EndpointKind,

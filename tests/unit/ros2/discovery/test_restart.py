@@ -5,13 +5,13 @@ from collections import Counter
 import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.domain_settings import Outgoing
+from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING
+from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.rtps import source_prefix
-from rosproxy.ros2.registry.locator_ports import REMEMBERED, SETTLING
 from rosproxy.ros2.rewriting.discovery import read_discovery
 from tests.unit.ros2.discovery.domains import (
     HOST,

@@ -15,8 +15,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.domain_settings import MOST_LEASES, Outgoing
+from rosproxy.ros2.ports.locator_ports import MOST_SHARING, STAND_INS
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
-from rosproxy.ros2.registry.locator_ports import MOST_SHARING, STAND_INS
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.sources.rates import BURST, MOST_SOURCES
 from tests.unit.ros2.discovery.domains import (

@@ -9,7 +9,6 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.inside_participants import PART_FOR_PROVEN
-from rosproxy.ros2.discovery.returning_participants import ANSWER_TIME
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE_UNPROVEN,
     MOST_INTRODUCED_UNPROVEN,
@@ -21,6 +20,7 @@ from rosproxy.ros2.domain_settings import (
     MOST_WAITING,
     Outgoing,
 )
+from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
 from rosproxy.ros2.protocol.rtps import HEADER, PREFIX, source_prefix

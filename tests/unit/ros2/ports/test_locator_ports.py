@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.registry.locator_ports import (
+from rosproxy.ros2.ports.locator_ports import (
     MOST_SHARING,
     REMEMBERED,
     SETTLING,

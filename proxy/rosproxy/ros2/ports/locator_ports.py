@@ -6,7 +6,7 @@ same port first. Then the evidence of the time before the start decides, best fi
 
 - the kernel's table, which the former process left there, leads the port to that very locator;
 - the participant *keeps* the port: a number that the former process has signed, or the operator's
-  record, says so (`rosproxy.ros2.discovery.port_store`);
+  record, says so (`rosproxy.ros2.ports.store`);
 - the participant *says* that it had the port, without a proof;
 - outside goes on sending to the port and names the participant (INFO_DST). A peer's word counts
   more than that of an address that has proved to receive, and that more than any other, since

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.port_store import (
+from rosproxy.ros2.ports.store import (
     COUNTS_EACH_SECOND,
     HALF_BITS,
     WRITERS,

@@ -10,16 +10,16 @@ from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.announced_participant import first_metatraffic
-from rosproxy.ros2.discovery.port_store import PortStore
 from rosproxy.ros2.domain_settings import (
     MOST_PER_ADDRESS,
     MOST_WAITING,
     DomainSettings,
     Outgoing,
 )
-from rosproxy.ros2.registry.locator_ports import LocatorPorts
+from rosproxy.ros2.ports.locator_ports import LocatorPorts
+from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.registry.participants import InsideParticipant
+from rosproxy.ros2.rewriting.announced_participant import first_metatraffic
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
