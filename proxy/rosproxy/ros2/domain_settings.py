@@ -95,7 +95,7 @@ class DomainSettings:
     participants outside that are known at an address. ``gateways`` are those of the proxy's
     default routes. ``settled`` is called with the address of each participant that is met.
     ``both_ways``: inside reaches the locators of those outside through the proxy alone.
-    ``port_store_key`` proves which ports participants had (`port_store.port_store_key`).
+    ``port_store_key`` proves which ports participants had (`ports.store.port_store_key`).
     """
 
     number: int

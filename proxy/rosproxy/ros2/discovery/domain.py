@@ -48,7 +48,7 @@ from rosproxy.ros2.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
-from rosproxy.ros2.ports.former_ports import ReturningParticipants
+from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import (
@@ -106,7 +106,7 @@ class Domain:
     own: OwnParticipants
     inside: InsideParticipants
     outside: OutsideParticipants
-    returning: ReturningParticipants
+    former_ports: FormerPorts
     refused: Refused
     fragments: FragmentStores
     rediscovery: Rediscovery
@@ -144,10 +144,10 @@ class Domain:
         inside = InsideParticipants(settings, ports, refused, proofs, verdicts)
         outside = OutsideParticipants(settings, refused, proofs, verdicts)
         settings.participants_at = outside.count_by_address.__getitem__
-        returning = ReturningParticipants(settings, ports, port_store, proofs)
+        former_ports = FormerPorts(settings, ports, port_store, proofs)
         fragments = FragmentStores()
         participants = OwnParticipants(
-            settings, Observer(own), port_store, inside, outside, returning, fragments, proofs
+            settings, Observer(own), port_store, inside, outside, former_ports, fragments, proofs
         )
         return cls(
             settings,
@@ -155,12 +155,12 @@ class Domain:
             participants,
             inside,
             outside,
-            returning,
+            former_ports,
             refused,
             fragments,
             Rediscovery(settings, inside, outside),
             proofs,
-            PrefixOwners(settings, inside, outside, returning, proofs),
+            PrefixOwners(settings, inside, outside, former_ports, proofs),
         )
 
     @property
@@ -306,7 +306,7 @@ class Domain:
 
     def settle(self, now: float) -> list[Outgoing]:
         """Ask participants that wait again, and have others meet."""
-        sent = self.returning.repeated_questions(now)
+        sent = self.former_ports.repeated_questions(now)
         for insider in list(self.inside.by_prefix.values()):
             proceed = partial(self.rediscovery.proceed, insider, now)
             sent += self._unless_malformed(insider.address, proceed)
@@ -318,7 +318,7 @@ class Domain:
 
     def admit(self, prefix: bytes, now: float) -> list[Outgoing]:
         """Let in a participant that has waited until it was known which ports it had."""
-        waited = self.returning.end_wait(prefix)
+        waited = self.former_ports.end_wait(prefix)
         if waited is None:
             return []  # it has ended meanwhile
         source, message = waited
@@ -350,7 +350,7 @@ class Domain:
         to forget (`Rediscovery`).
         """
         sent = list[Outgoing]()
-        self.returning.forget({insider.address for insider in self.inside.by_prefix.values()})
+        self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
         for insider in list(self.inside.by_prefix.values()):
             sent += self.rediscovery.separate(insider)
             self._forget_inside(insider)
@@ -390,7 +390,7 @@ class Domain:
 
         They can't say so themselves, and would be believed to be there for many seconds.
         """
-        self.returning.forget(addresses)
+        self.former_ports.forget(addresses)
         sent = list[Outgoing]()
         for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
             sent += self._end_for(leaver)
@@ -416,9 +416,7 @@ class Domain:
         if spdp.ended:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
-        if is_new and (
-            self.ports.may_have_returning(now) or self.inside.lacks_proof(prefix, source)
-        ):
+        if is_new and (self.ports.is_restoring(now) or self.inside.lacks_proof(prefix, source)):
             return self._wait(message, source, now)
         return self._admitted_inside(message, source, now)
 
@@ -428,7 +426,7 @@ class Domain:
         """Let in a participant inside, unless its prefix is that of a participant outside."""
         if not self.owners.yields_to_inside(message.prefix):
             outsider = self.outside.by_prefix[message.prefix]
-            self.returning.forget_participant(message.prefix)
+            self.former_ports.forget_participant(message.prefix)
             text = f"GUID prefix {outsider.guid_prefix} belongs to a participant outside, at "
             return self._drop("prefix", source, text + outsider.address)
         sent = self._give_prefix_to_inside(message.prefix, source)
@@ -436,9 +434,9 @@ class Domain:
 
     def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Have a participant inside wait until it has answered the proxy."""
-        if message.prefix in self.returning.waiting:
+        if message.prefix in self.former_ports.waiting:
             return []
-        sent = self.returning.wait(message, source, now)
+        sent = self.former_ports.wait(message, source, now)
         if sent and self.owners.yields_to_inside(message.prefix):
             sent += self._give_prefix_to_inside(message.prefix, source)
         return sent + self.own.question_to_announced(message, source)
@@ -543,14 +541,14 @@ class Domain:
             return sent
         if is_new:
             sent += self._end_former_processes(prefix, source)  # it has answered while it waited
-            insider.was_inside = self.returning.was_inside(prefix)
+            insider.was_inside = self.former_ports.was_inside(prefix)
             holders = self.ports.displaced_by(prefix, now)
             sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
         lease_count = len(insider.leases)
-        exported = self.inside.exported(insider, message, now, self.returning.former_ports(prefix))
+        exported = self.inside.exported(insider, message, now, self.former_ports.of(prefix))
         sent += self.inside.introduced(insider, message)
         # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
-        if is_new and self.returning.must_meet_anew(prefix):
+        if is_new and self.former_ports.must_be_rediscovered(prefix):
             sent += self.own.port_store_dispose_message(insider)
             insider.parting_from = now
         else:
@@ -582,7 +580,7 @@ class Domain:
         return self.outside.to_met(announcement)
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        self.returning.end(message.prefix, source)
+        self.former_ports.end(message.prefix, source)
         insider = self.inside.find(message.prefix, source)
         if insider is None:
             return []
@@ -625,7 +623,7 @@ class Domain:
         has_more = len(insider.leases) > former_count
         if not has_more or insider not in self.inside.port_keepers(self.inside.at(insider.address)):
             return []
-        return self.returning.reminders(insider, now)
+        return self.former_ports.reminders(insider, now)
 
     def _heard_at_lease(
         self,
@@ -698,7 +696,7 @@ class Domain:
 
     def _note_former_use(self, port: int, datagram: bytes, source: str, now: float) -> None:
         """Note whom outside means by a port that nobody has, soon after the start. RtpsError."""
-        if not self.ports.may_have_returning(now):
+        if not self.ports.is_restoring(now):
             return
         if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
             return
@@ -750,7 +748,7 @@ class Domain:
         """
         ended = _dispose_message_of(insider)
         self._forget_inside(insider)
-        self.returning.displace(insider.prefix)
+        self.former_ports.displace(insider.prefix)
         return self.settings.to_outside(ended)
 
     def _end_outside(

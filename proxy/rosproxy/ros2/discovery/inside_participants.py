@@ -334,7 +334,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             text = f"{locator} got no port: no port of {ports} is free"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
             return None
-        if former_port not in (None, port) and self.ports.may_have_returning(now):
+        if former_port not in (None, port) and self.ports.is_restoring(now):
             self._lose(participant, former_port, now)
         lease = participant.leases[locator] = Lease(port, locator, kind)
         self.leases[port] = participant, lease

@@ -14,7 +14,7 @@ from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
-from rosproxy.ros2.ports.former_ports import ReturningParticipants
+from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknack, heartbeats
@@ -33,7 +33,7 @@ class OwnParticipants:
     port_store: PortStore
     inside: InsideParticipants
     outside: OutsideParticipants
-    returning: ReturningParticipants
+    former_ports: FormerPorts
     fragments: FragmentStores
     proofs: AddressProofs
 
@@ -95,21 +95,21 @@ class OwnParticipants:
     def port_reminders(self, now: float) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
         participants = self.inside.port_keepers(self.inside.by_prefix.values())
-        return [sent for p in participants for sent in self.returning.reminders(p, now)]
+        return [sent for p in participants for sent in self.former_ports.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         """Take in what a participant inside tells the port store or the observer. RtpsError."""
         prefix = message.prefix
         insider = self.inside.find(prefix, source)
         # One that waits to be let in is in no table yet, and its answer is what it waits for.
-        is_waiting = self.returning.is_waiting(prefix, source)
-        if (is_waiting or insider) and self.returning.take_answer(prefix, source, message.datagram):
+        is_waiting = self.former_ports.is_waiting(prefix, source)
+        if (is_waiting or insider) and self.former_ports.take_answer(
+            prefix, source, message.datagram
+        ):
             return []
         if insider is None:
             return []
-        rewrite = partial(
-            self.inside.observed, insider, now=now, kept=self.returning.former_ports(prefix)
-        )
+        rewrite = partial(self.inside.observed, insider, now=now, kept=self.former_ports.of(prefix))
         return sent_to(insider.metatraffic, self._ask(self.settings.unicast_port, message, rewrite))
 
     def told_outside(self, message: DiscoveryMessage, source: str, received: int) -> list[Outgoing]:
@@ -148,7 +148,7 @@ class OwnParticipants:
     def forget(self, prefix: bytes) -> None:
         """Forget what a participant that has gone has told."""
         self.observer.forget(prefix)
-        self.returning.forget_participant(prefix)
+        self.former_ports.forget_participant(prefix)
 
     def _ask(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
         """Give the observer a message of discovery that came at a port; what it asks for then."""

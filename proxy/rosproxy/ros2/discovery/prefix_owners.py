@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings
-from rosproxy.ros2.ports.former_ports import ReturningParticipants
+from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 
@@ -30,18 +30,18 @@ class PrefixOwners:
     settings: DomainSettings
     inside: InsideParticipants
     outside: OutsideParticipants
-    returning: ReturningParticipants
+    former_ports: FormerPorts
     proofs: AddressProofs
 
     def is_inside(self, prefix: bytes) -> bool:
         """Whether a participant inside uses a prefix; it may wait to be served."""
-        return prefix in self.inside.by_prefix or prefix in self.returning.waiting
+        return prefix in self.inside.by_prefix or prefix in self.former_ports.waiting
 
     def yields_to_inside(self, prefix: bytes) -> bool:
         """Whether a prefix that outside may use belongs to a participant inside."""
         outsider = self.outside.by_prefix.get(prefix)
         is_weak = outsider is None or not (outsider.trusted or outsider.proven)
-        return is_weak or self.returning.was_inside(prefix)
+        return is_weak or self.former_ports.was_inside(prefix)
 
     def yields_to_outside(self, prefix: bytes, source: str, now: float) -> bool:
         """Whether a prefix that inside uses belongs to a participant outside at an address."""
@@ -49,5 +49,5 @@ class PrefixOwners:
             return False
         insider = self.inside.by_prefix.get(prefix)
         if insider is not None:
-            return not insider.was_inside and self.inside.ports.may_have_returning(now)
-        return not self.returning.was_inside(prefix)
+            return not insider.was_inside and self.inside.ports.is_restoring(now)
+        return not self.former_ports.was_inside(prefix)

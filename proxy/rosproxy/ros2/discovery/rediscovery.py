@@ -8,7 +8,7 @@ kept *apart* for a moment: both are told that the other has ended, nothing of di
 only then are they introduced.
 
 This is for participants whose policy has changed, and for those that knew the proxy at another
-address, as `ReturningParticipants` says. The latter wait until the LAN relay has been heard, which
+address, as `FormerPorts` says. The latter wait until the LAN relay has been heard, which
 starts after the proxy: before that, outside would not hear that they have ended. Participants are
 told again, with each announcement from outside, until they send something to where outside is found
 now: while so many meet, not every datagram arrives.

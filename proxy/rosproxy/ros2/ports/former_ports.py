@@ -1,8 +1,10 @@
-"""Participants that may have had ports before the proxy started: they are asked which.
+"""Restores ports after a start: participants get the ports again that they had before.
 
-For some seconds from the start an announcement from inside waits: until the participant has said
-which ports it had (`PortStore`), or has had the time to, and until outside has had the time to go
-on sending to the ports that it knows (`LocatorPorts`).
+For `REMEMBERED` seconds from the start the first announcement of a participant inside waits. The
+proxy asks the participant for its former ports (`rosproxy.ros2.ports.store` explains how it knows
+them). The wait ends with the answer, or after `ANSWER_TIME` without one. It does not end before
+outside has had `SETTLING` seconds to send to the ports that it knows (`LocatorPorts`). Later,
+reminders make participants remember the ports that they have now.
 """
 
 from collections import Counter
@@ -28,14 +30,17 @@ ANSWER_TIME = 5.0
 
 
 @dataclass(slots=True)
-class ReturningParticipants:
-    """Participants that wait, by prefix: where their announcement came from, it, and since when.
+class FormerPorts:
+    """The participants inside that wait, and the ports that they had before the start.
 
-    At one address as many may wait as there may be participants. ``former`` are the ports of those
-    that knew the proxy at another address, or with another range, by prefix, until they have gone.
-    ``displaced`` are those that the proxy has ended, and that may live: the last ones.
+    ``waiting``, by prefix: the source of the announcement, the announcement, and since when it
+    waits. At one address as many may wait as there may be participants. ``recorded``: ports that
+    the operator has recorded of participants that knew the proxy at another address, or with
+    another range, by prefix, until the participants have gone. ``displaced``: the last participants
+    that the proxy has ended, and that may live.
     Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp,
-    PDPSimple::updateInfoMatchesEDP): both must meet all outside anew.
+    PDPSimple::updateInfoMatchesEDP). So ``recorded`` and ``displaced`` participants must be
+    rediscovered by all outside.
     """
 
     settings: DomainSettings
@@ -43,7 +48,7 @@ class ReturningParticipants:
     port_store: PortStore
     proofs: AddressProofs
     waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
-    former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
+    recorded: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     displaced: dict[bytes, None] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
 
@@ -113,20 +118,22 @@ class ReturningParticipants:
         if self.is_waiting(prefix, source):
             self._forget_waiting(prefix)
 
-    def note_former(self, former: Mapping[bytes, Sequence[int]], present: Container[bytes]) -> None:
-        """Note which ports participants had at a proxy elsewhere; not of those ``present``.
+    def note_recorded(
+        self, recorded: Mapping[bytes, Sequence[int]], present: Container[bytes]
+    ) -> None:
+        """Note the ports that the operator has recorded, but of no participant in ``present``.
 
         A participant whose ports are not all in this range gets others.
         """
-        for prefix, ports in former.items():
+        for prefix, ports in recorded.items():
             in_range = all(port in self.ports.pool.range for port in ports)
-            if ports and prefix not in present and len(self.former) < MOST_WAITING:
-                self.former[prefix] = tuple(ports) if in_range else ()
-                self.ports.note_claims(prefix, self.former[prefix], len(ports))
+            if ports and prefix not in present and len(self.recorded) < MOST_WAITING:
+                self.recorded[prefix] = tuple(ports) if in_range else ()
+                self.ports.note_claims(prefix, self.recorded[prefix], len(ports))
 
-    def former_ports(self, prefix: bytes) -> Sequence[int]:
+    def of(self, prefix: bytes) -> Sequence[int]:
         """The ports that a participant had before the start, in the order of its locators."""
-        return self.former.get(prefix) or self.port_store.former_ports(prefix)
+        return self.recorded.get(prefix) or self.port_store.former_ports(prefix)
 
     def take_answer(self, prefix: bytes, source: str, datagram: bytes) -> bool:
         """Note what a participant tells the port store; return whether it does. Raises RtpsError.
@@ -135,7 +142,7 @@ class ReturningParticipants:
         """
         if not self.port_store.take(prefix, datagram):
             return False
-        if self.is_waiting(prefix, source) and prefix not in self.former:
+        if self.is_waiting(prefix, source) and prefix not in self.recorded:
             proven_count = self.port_store.proven_count(prefix)
             self.ports.note_claims(prefix, self.port_store.former_ports(prefix), proven_count)
         return True
@@ -146,14 +153,14 @@ class ReturningParticipants:
         The kernel's table tells nothing of it: this has addresses, and no prefixes.
         """
         return (
-            prefix in self.former
+            prefix in self.recorded
             or self.port_store.proven_count(prefix) > 0
             or self.ports.is_named(prefix)
         )
 
-    def must_meet_anew(self, prefix: bytes) -> bool:
-        """Whether outside knows a participant that comes by other ports than it gets."""
-        return prefix in self.former or prefix in self.displaced
+    def must_be_rediscovered(self, prefix: bytes) -> bool:
+        """Whether outside knows a participant by other ports than those that it gets."""
+        return prefix in self.recorded or prefix in self.displaced
 
     def displace(self, prefix: bytes) -> None:
         """Note that a participant has lost its ports, and with them all that is known of it."""
@@ -163,7 +170,7 @@ class ReturningParticipants:
 
     def forget_participant(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
-        self.former.pop(prefix, None)
+        self.recorded.pop(prefix, None)
         self.displaced.pop(prefix, None)
         self.port_store.forget(prefix)
         self.ports.forget_claims(prefix)
@@ -183,7 +190,7 @@ class ReturningParticipants:
 
     def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
         return (
-            self.must_meet_anew(prefix)
+            self.must_be_rediscovered(prefix)
             or self.port_store.has_answered(prefix)
             or now - since >= ANSWER_TIME
         )

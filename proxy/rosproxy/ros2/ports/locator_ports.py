@@ -142,7 +142,7 @@ class LocatorPorts:
         """Whether ports may be given."""
         return now - self._started >= SETTLING
 
-    def may_have_returning(self, now: float) -> bool:
+    def is_restoring(self, now: float) -> bool:
         """Whether there may still be participants that had ports before the start."""
         return now - self._started < REMEMBERED
 
@@ -158,7 +158,7 @@ class LocatorPorts:
         self, port: int, prefix: bytes, kind: LeaseKind, by: NamedBy, now: float
     ) -> None:
         """Note that a participant was named at a port."""
-        if self.may_have_returning(now) and port in self.pool.range:
+        if self.is_restoring(now) and port in self.pool.range:
             self._former_users.setdefault(port, _FormerUsers()).note((prefix, kind), by)
 
     def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
@@ -193,7 +193,7 @@ class LocatorPorts:
 
         That one has a proof and they have none; or the evidence is equal: then neither gets it.
         """
-        if not self.may_have_returning(now):
+        if not self.is_restoring(now):
             return set()
         displaced = set[bytes]()
         for port in self._ports_claimed.get(prefix, ()):
@@ -215,7 +215,7 @@ class LocatorPorts:
 
         ``had`` is the port that the participant had, by a proof or its own word (`note_claims`).
         """
-        if not self.may_have_returning(now):
+        if not self.is_restoring(now):
             self._forget_former()
         if not self.pool.free:
             return None  # looking takes long, and one datagram may name a thousand locators

@@ -167,7 +167,7 @@ class DomainServer:
 
     def note_former(self, former: Mapping[bytes, Sequence[int]]) -> None:
         """Take in which ports participants had at a proxy with another address."""
-        self.domain.returning.note_former(former, self.domain.inside.by_prefix)
+        self.domain.former_ports.note_recorded(former, self.domain.inside.by_prefix)
 
     def end(self, addresses: Collection[str]) -> int:
         """End the participants at addresses where nobody is any more; returns how many."""
@@ -244,11 +244,11 @@ class DomainServer:
         # The longest queue loses its last items without a word (`FairQueue`).
         admitting = {p: t for p, t in self._admitting.items() if now - t < ADMISSION_TIMEOUT}
         self._admitting = admitting
-        returning = self.domain.returning
-        for prefix in returning.ready(now):
+        former_ports = self.domain.former_ports
+        for prefix in former_ports.ready(now):
             if prefix in admitting:
                 continue
-            source, message, _ = returning.waiting[prefix]
+            source, message, _ = former_ports.waiting[prefix]
             standing = self.domain.standing(source)
             admit = partial(self._admit, prefix)
             if self._reader.put(source, standing, len(message.datagram), admit):

@@ -172,7 +172,7 @@ def finished(domain: Domain, sent: Sequence[Outgoing], now: float = NOW) -> list
 
 def settle(domain: Domain, now: float) -> list[Outgoing]:
     """Let in all that have waited for long enough, and have others meet."""
-    admitted = [out for p in domain.returning.ready(now) for out in domain.admit(p, now)]
+    admitted = [out for p in domain.former_ports.ready(now) for out in domain.admit(p, now)]
     return admitted + finished(domain, domain.settle(now), now)
 
 

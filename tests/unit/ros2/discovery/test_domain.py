@@ -621,7 +621,7 @@ def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:
 def test_who_is_gone_gets_no_port_any_more() -> None:
     domain = make_domain()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    assert domain.returning.waiting
+    assert domain.former_ports.waiting
 
     domain.gone({INSIDE})
     settle(domain, SETTLING + ANSWER_TIME + 1)
@@ -632,7 +632,7 @@ def test_who_is_gone_gets_no_port_any_more() -> None:
 def test_who_ends_while_he_waits_is_not_announced() -> None:
     """Outside was told of him once all others were, and took him for there."""
     domain = make_domain()
-    domain.returning.note_former({A: [45003]}, ())
+    domain.former_ports.note_recorded({A: [45003]}, ())
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     domain.heard_inside(spdp(B, OTHER), OTHER, 0.1)
     domain.heard_inside(dispose_message(B), INSIDE, 0.2)  # nobody ends one at another address
@@ -642,9 +642,9 @@ def test_who_ends_while_he_waits_is_not_announced() -> None:
 
     assert {source_prefix(told) for told in to(sent, ROBOT)} == {B}
     assert domain.inside.by_prefix.keys() == {B}
-    assert not domain.returning.former
+    assert not domain.former_ports.recorded
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 7.0)
-    assert domain.returning.waiting.keys() == {A}
+    assert domain.former_ports.waiting.keys() == {A}
 
 
 def test_no_port_of_the_range_stands_in() -> None:

@@ -291,11 +291,11 @@ def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
     domain = make_domain()
     for number in range(MOST_WAITING + 1):
         domain.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, 0.1)
-    assert len(domain.returning.waiting) == MOST_PER_ADDRESS
+    assert len(domain.former_ports.waiting) == MOST_PER_ADDRESS
     assert domain.heard_inside(spdp(A, OTHER), OTHER, 0.2)
-    assert A in domain.returning.waiting
+    assert A in domain.former_ports.waiting
     settle(domain, 0.2 + ANSWER_TIME)
-    assert not domain.returning.waiting
+    assert not domain.former_ports.waiting
     assert domain.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
 
 

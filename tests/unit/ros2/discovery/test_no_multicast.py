@@ -123,7 +123,7 @@ def moved(lan_relay: HostPort | None = None) -> Domain:
     """One whose participant has known the proxy at another address; the robot is there."""
     domain = make_domain(peers=(ROBOT,), lan_relay=lan_relay)
     domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
-    domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
+    domain.former_ports.note_recorded({A: PORTS}, domain.inside.by_prefix)
     return domain
 
 
@@ -205,7 +205,7 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
 def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
     domain = moved()
     port = RANGE.listen.last - 2
-    domain.returning.note_former({A: (*PORTS, port)}, {})
+    domain.former_ports.note_recorded({A: (*PORTS, port)}, {})
     meet(domain)
     settle(domain, NOW)
     domain.heard_inside(sedp(A, INSIDE, 7000, to=domain.own.observer.prefix), INSIDE, NOW)
@@ -218,7 +218,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
 ) -> None:
     """Outside heeds no other locators of whom it knows."""
     domain = make_domain(peers=(ROBOT,), lan_relay=None)
-    domain.returning.note_former({A: ports}, domain.inside.by_prefix)
+    domain.former_ports.note_recorded({A: ports}, domain.inside.by_prefix)
     meet(domain)
     assert not set(domain.inside.by_prefix[A].ports) & set(ports)
     parting = settle(domain, NOW)
@@ -229,7 +229,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
 
 def test_who_had_no_ports_was_not_there() -> None:
     domain = make_domain(lan_relay=LAN_RELAY)
-    domain.returning.note_former({A: ()}, domain.inside.by_prefix)
+    domain.former_ports.note_recorded({A: ()}, domain.inside.by_prefix)
     sent = meet(domain)
     assert domain.inside.by_prefix[A].ports
     told = by(domain.own.port_store.prefix, to(sent, INSIDE))
@@ -241,7 +241,7 @@ def test_who_is_there_already_keeps_what_he_has() -> None:
     domain = make_domain()
     meet(domain)
     before = domain.inside.by_prefix[A].ports
-    domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
+    domain.former_ports.note_recorded({A: PORTS}, domain.inside.by_prefix)
     meet(domain)
     assert domain.inside.by_prefix[A].ports == before
 

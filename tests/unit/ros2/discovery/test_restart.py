@@ -227,7 +227,7 @@ def test_the_operators_record_counts_more_than_a_word() -> None:
     domain = restarted(key=b"")
     come(domain, B, OTHER, NUMBER, 0.1)
     settle(domain, SETTLING)
-    domain.returning.note_former({A: PORTS}, domain.inside.by_prefix)
+    domain.former_ports.note_recorded({A: PORTS}, domain.inside.by_prefix)
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 3.0)
     settle(domain, 3.1)
     assert ports_of(domain, A) == PORTS

@@ -236,7 +236,7 @@ class Neighbours(RuleBasedStateMachine):
                 or out.target.host not in self.domain.inside.count_by_address
             ):
                 self.went[out.target.host] += len(out.datagram)
-        waiting = {source for source, *_ in self.domain.returning.waiting.values()}
+        waiting = {source for source, *_ in self.domain.former_ports.waiting.values()}
         for host, size in self.went.items():
             factor = ANSWERED_FACTOR if host in self.answered else 1
             assert host in waiting | set(NEAR_BY) or size <= factor * self.came[host]
@@ -292,7 +292,7 @@ class Neighbours(RuleBasedStateMachine):
         verdicts = [verdict for p in domain.inside.by_prefix.values() for verdict in p.verdicts]
         assert domain.inside.verdicts.count_by_address.total() == len(verdicts)
         assert {prefix for prefix, _ in domain.own.observer._received} <= prefixes
-        known = prefixes | domain.returning.waiting.keys()
+        known = prefixes | domain.former_ports.waiting.keys()
         assert {*domain.own.port_store.prefixes} <= known
         assert domain.ports._ports_claimed.keys() <= known
         assert domain.fragments.by_prefix.keys() <= prefixes

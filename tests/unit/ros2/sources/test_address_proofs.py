@@ -344,13 +344,13 @@ def test_forged_sources_keep_nobody_from_waiting_after_a_start() -> None:
     for number in range(MOST_WAITING):
         address = f"172.30.{number // 200 + 1}.{number % 200 + 1}"
         domain.heard_inside(spdp(named(number), address), address, 0.1)
-    assert len(domain.returning.waiting) == MOST_WAITING
+    assert len(domain.former_ports.waiting) == MOST_WAITING
     assert domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.2)
-    assert A in domain.returning.waiting
-    assert len(domain.returning.waiting) == MOST_WAITING
+    assert A in domain.former_ports.waiting
+    assert len(domain.former_ports.waiting) == MOST_WAITING
     for number in range(MOST_WAITING):
         domain.heard_inside(spdp(named(2000 + number), OTHER), OTHER, 0.3)
-    assert A in domain.returning.waiting
+    assert A in domain.former_ports.waiting
 
 
 def test_a_source_is_known_once_it_has_proved_to_receive() -> None:
@@ -511,9 +511,9 @@ def test_forged_participants_at_an_address_keep_none_from_waiting_after_a_start(
     crowd_at(domain, INSIDE, 0.1)
     answers_what_it_is_asked(domain, 0.2)
     answers_what_it_is_asked(domain, 0.3)
-    assert A in domain.returning.waiting
+    assert A in domain.former_ports.waiting
     crowd_at(domain, INSIDE, 0.4)
-    assert A in domain.returning.waiting
+    assert A in domain.former_ports.waiting
     settle(domain, ANSWER_TIME + 0.5)
     assert A in domain.inside.by_prefix
 
