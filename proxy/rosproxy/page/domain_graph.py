@@ -34,7 +34,7 @@ from rosproxy.page.page_document import (
     shown_text,
 )
 from rosproxy.ros2.domain_problems import DomainProblem, domain_problems, mismatch_problems
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 
 _QUIET_ENDINGS = (
     *("/describe_parameters", "/get_parameters", "/get_parameter_types", "/list_parameters"),
@@ -82,12 +82,12 @@ def _key(domain: DomainStatus, guid_prefix: str) -> str:
     return f"{domain.domain} {guid_prefix}"
 
 
-def _data_leases(participant: ParticipantStatus) -> list[LocatorStatus]:
+def _user_data_ports(participant: ParticipantStatus) -> list[LocatorStatus]:
     """The ports at which user data for a participant arrives, where the proxy passes that on.
 
     Cyclone DDS has one port for all that comes: then it is that of discovery.
     """
-    data = [lease for lease in participant.leases if lease.kind == LeaseKind.DATA.value]
+    data = [lease for lease in participant.leases if lease.kind == TrafficKind.USER_DATA.value]
     return data or [*participant.leases]
 
 
@@ -98,7 +98,7 @@ def _node(
     problem: DomainProblem | None,
 ) -> PageNode:
     is_passed = is_inside or domain.direction == "both"
-    data = _data_leases(participant) if is_passed else []
+    data = _user_data_ports(participant) if is_passed else []
     outside_lane = HOST if is_loopback(participant.address) else ROBOT
     return PageNode(
         CONTAINER if is_inside else outside_lane,
@@ -207,7 +207,7 @@ def _topic_link(
 ) -> PageLink:
     """A topic between two participants; ``is_passed``: the proxy passes its data on."""
     writer, reader = ends
-    port = next(iter(_data_leases(reader)), None) if is_passed else None
+    port = next(iter(_user_data_ports(reader)), None) if is_passed else None
     carried = (port.plane if port else "") if is_passed else "direct"
     link = PageLink(
         "topic",

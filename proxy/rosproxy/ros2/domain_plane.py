@@ -9,39 +9,39 @@ from prometheus_client.registry import Collector
 
 from rosproxy.admin import status_document as document
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.ros2.discovery.data_leases import DataLeases
+from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
-    Lease,
-    LeaseKind,
     Participant,
+    PortMapping,
+    TrafficKind,
 )
 
 
 @dataclass(eq=False)
 class DomainPlane(Collector):
-    """The kernel's plane, and the leases that it may forward, of all domains."""
+    """The kernel's plane, and the mappings that it may forward, of all domains."""
 
     _plane: KernelPlane
-    _forwarded: DataLeases
+    _forwarded: KernelPorts
 
     def status(self) -> document.DataPlaneStatus:
         """How user data is forwarded."""
         return msgspec.convert(self._plane.status(), document.DataPlaneStatus)
 
-    def locator(self, participant: Participant, lease: Lease) -> document.LocatorStatus:
+    def locator(self, participant: Participant, mapping: PortMapping) -> document.LocatorStatus:
         """A port of a participant, where the port leads, and what forwards the datagrams there."""
         status = document.LocatorStatus(
-            lease.port,
-            str(lease.target),
-            lease.kind.value,
-            lease.datagrams,
-            lease.bytes,
-            lease.rate,
+            mapping.port,
+            str(mapping.target),
+            mapping.kind.value,
+            mapping.datagrams,
+            mapping.bytes,
+            mapping.rate,
             self._plane.user_plane,
-            _reason(participant, lease),
+            _reason(participant, mapping),
         )
-        forwarded = self._forwarded.by_port.get(lease.port)
+        forwarded = self._forwarded.by_port.get(mapping.port)
         if forwarded is None:
             return status
         kernel = self._plane.status_of(forwarded)
@@ -51,7 +51,7 @@ class DomainPlane(Collector):
             reason=kernel["reason"],
             kernel_datagrams=kernel["received_packets"],
             kernel_bytes=kernel["received"],
-            rate=lease.rate + kernel["received_rate"],
+            rate=mapping.rate + kernel["received_rate"],
         )
 
     def collect(self) -> Iterator[Metric]:
@@ -67,12 +67,12 @@ class DomainPlane(Collector):
         yield CounterMetricFamily("rosproxy_ros2_kernel_bytes", text, value=received)
 
 
-def _reason(participant: Participant, lease: Lease) -> str:
-    """Why the kernel may not forward a lease, if it may not."""
-    if lease.kind is LeaseKind.METATRAFFIC:
+def _reason(participant: Participant, mapping: PortMapping) -> str:
+    """Why the kernel may not forward a mapping, if it may not."""
+    if mapping.kind is TrafficKind.METATRAFFIC:
         return "the proxy reads and rewrites discovery"
     if not isinstance(participant, InsideParticipant):
         return "the kernel forwards only to participants inside"
-    if not participant.reads_discovery_at(lease):
+    if not participant.reads_discovery_at(mapping):
         return "another participant at the address may read discovery at this port"
     return f"{participant.vendor_name} may read discovery at this port"

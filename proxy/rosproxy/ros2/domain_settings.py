@@ -38,7 +38,7 @@ MOST_PER_UNPROVEN = 16
 """Participants at one address outside that has not proved to receive."""
 MOST_INTRODUCED_UNPROVEN = 64
 """While so many participants outside are at unproven addresses, inside is told of these, too."""
-MOST_LEASES = 16
+MOST_MAPPINGS = 16
 """Ports of the range for one participant; Fast DDS takes three for one address."""
 
 Judge = Callable[[RuleKind, str, str], bool]

@@ -36,7 +36,7 @@ from rosproxy.net.interfaces import (
     interface_networks,
 )
 from rosproxy.net.resolver import resolve
-from rosproxy.ros2.discovery.data_leases import DataLeases
+from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
@@ -71,12 +71,12 @@ class Ros2:
         self.servers: list[DomainServer] = []
         self._hosts: tuple[str, ...] = ()
         ports = runtime.settings.ports.listen
-        self._leases = leases = DataLeases(PortPool(ports))
+        self._kernel_ports = kernel_ports = KernelPorts(PortPool(ports))
         table = KernelTable(DatagramTable(ports), Tools())
         self.plane = plane = KernelPlane(
-            runtime.settings, leases, runtime.tasks, runtime.problems, runtime.now, table
+            runtime.settings, kernel_ports, runtime.tasks, runtime.problems, runtime.now, table
         )
-        self._domain_plane = DomainPlane(plane, leases)
+        self._domain_plane = DomainPlane(plane, kernel_ports)
         self.state = Ros2State(self.servers, self._domain_plane)
         self._applied = runtime.policy.version
         self._awaiting = bool(self._settings.await_policy)
@@ -94,11 +94,11 @@ class Ros2:
         self._hosts = await self._first_hosts()
         # Before any port is opened: the table of a former process tells whose its ports were.
         await self.plane.start()
-        self._leases.note_former(self.plane.forwards)
+        self._kernel_ports.note_former(self.plane.forwards)
         self._start_servers()
         self._runtime.metrics.registry.register(self.state)
         self._runtime.metrics.registry.register(self._domain_plane)
-        # Unlike in ROS 1 there is no registry to rebuild: what was forwarded is among the leases.
+        # Unlike in ROS 1 there is no registry to rebuild: the kernel ports have what was forwarded.
         self.plane.recovered([])
         tasks.spawn(self._forget_former(), "waiting for participants from before the start")
         await self._refresh()
@@ -143,7 +143,7 @@ class Ros2:
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
-            self._leases.domains.append(server.domain.inside)
+            self._kernel_ports.domains.append(server.domain.inside)
             # Any proxy for ROS 2: these ports follow from the domain, not from the range.
             other_proxies = proxy_signs.overlapping_proxies("2", 1, 65535)
             with setting_error_if_taken(
@@ -227,7 +227,7 @@ class Ros2:
     async def _forget_former(self) -> None:
         """Stop the forwards of before the start that no participant has claimed since."""
         await asyncio.sleep(REMEMBERED)
-        self._leases.note_former({})
+        self._kernel_ports.note_former({})
         self.plane.syncer.note_change()
 
     def _domain_ports(self) -> list[PortMap]:
@@ -362,8 +362,8 @@ class Ros2:
     async def _sample_rates(self) -> None:
         now = self._runtime.now()
         for server in self.servers:
-            for _, lease in server.domain.inside.leases.values():
-                lease.sample(now)
+            for _, mapping in server.domain.inside.mappings.values():
+                mapping.sample(now)
 
     async def _resolve_peer(self, peer: HostPort) -> list[HostPort]:
         subject = f"peer {peer.host}"

@@ -106,7 +106,7 @@ class Ros2State(Collector):
         for server in self._servers:
             domain = server.domain
             number = str(server.domain.settings.number)
-            used.add_metric([number], len(domain.inside.leases))
+            used.add_metric([number], len(domain.inside.mappings))
             free.add_metric([number], domain.ports.pool.free)
             lacking.add_metric([number], len(domain.inside.port_shortages))
             dropped.add_metric([number], domain.refused.count)
@@ -151,7 +151,7 @@ class Ros2State(Collector):
             peers=tuple(peer.host if not peer.port else str(peer) for peer in settings.peers),
             lan_relay=str(settings.relay.address) if settings.relay else "",
             direction="both" if settings.both_ways else "out",
-            ports_used=len(domain.inside.leases),
+            ports_used=len(domain.inside.mappings),
             ports_free=domain.ports.pool.free,
             dropped=domain.refused.count,
             lost=server.lost,
@@ -205,7 +205,8 @@ class Ros2State(Collector):
             address=participant.address,
             vendor=participant.vendor_name,
             leases=tuple(
-                self._plane.locator(participant, lease) for lease in participant.leases.values()
+                self._plane.locator(participant, mapping)
+                for mapping in participant.mappings.values()
             ),
             publishes=tuple(publishes),
             subscribes=tuple(subscribes),

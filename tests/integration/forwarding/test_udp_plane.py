@@ -12,12 +12,12 @@ from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort, Route
-from rosproxy.ros2.discovery.data_leases import DataLeases
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
+from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.domain_settings import DomainSettings, Refused
 from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts
-from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
+from rosproxy.ros2.registry.participants import InsideParticipant, PortMapping, TrafficKind
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 from rosproxy.runtime import Runtime
 from tests.integration.kernel_fake import OWN, FakeTools, clear_the_way
@@ -30,7 +30,7 @@ OTHER = HostPort("192.0.2.6", 7411)
 
 
 class Bench:
-    """A plane for UDP over a made-up kernel, and the leases of one domain; nothing listens."""
+    """A plane for UDP over a made-up kernel, and the mappings of one domain; nothing listens."""
 
     def __init__(self, tools: FakeTools | None = None) -> None:
         told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": str(RANGE)}
@@ -52,12 +52,12 @@ class Bench:
         proofs = AddressProofs(b"a secret")
         verdicts = Verdicts(domain.judge)
         self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs, verdicts)
-        self.leases = DataLeases(pool)
-        self.leases.domains.append(self.inside)
+        self.mappings = KernelPorts(pool)
+        self.mappings.domains.append(self.inside)
         table = KernelTable(DatagramTable(RANGE), self.tools)
         self.plane = KernelPlane(
             runtime.settings,
-            self.leases,
+            self.mappings,
             runtime.tasks,
             runtime.problems,
             lambda: runtime.now() + self.later,
@@ -66,14 +66,14 @@ class Bench:
 
     async def start(self) -> None:
         await self.plane.start()
-        self.leases.note_former(self.plane.forwards)
+        self.mappings.note_former(self.plane.forwards)
         self.plane.recovered([])
 
     def lend(self, locator: HostPort = LOCATOR, port: int = 45001) -> InsideParticipant:
         participant = InsideParticipant(bytes(12), locator.host, b"", 0.0)
-        lease = participant.leases[locator] = Lease(port, locator, LeaseKind.DATA)
+        mapping = participant.mappings[locator] = PortMapping(port, locator, TrafficKind.USER_DATA)
         self.inside.by_prefix[participant.prefix] = participant
-        self.inside.leases[port] = participant, lease
+        self.inside.mappings[port] = participant, mapping
         self.inside.changes += 1
         self.plane.syncer.note_change()
         return participant
@@ -117,8 +117,8 @@ async def bench(sound: None) -> AsyncIterator[Bench]:
 async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
     participant = bench.lend()
     await bench.forwarding({45001: LOCATOR})
-    (lease,) = bench.leases
-    await until(lambda: bench.plane.status_of(lease)["plane"] == "kernel", "it is told")
+    (mapping,) = bench.mappings
+    await until(lambda: bench.plane.status_of(mapping)["plane"] == "kernel", "it is told")
     assert bench.sources == {(LOCATOR.host, LOCATOR.port): OWN}
     bench.end(participant)
     await bench.forwarding({})
@@ -151,9 +151,9 @@ async def test_a_locator_behind_a_shorter_mtu_stays_with_the_proxy(
     monkeypatch.setattr(syncer, "read_forwarding", lambda: HostForwarding(longest_packet=9000))
     bench.plane.syncer.look_around()
     bench.lend()
-    (lease,) = bench.leases
-    assert "same MTU" in bench.plane.status_of(lease)["reason"]
-    assert bench.plane.status_of(lease)["plane"] == "copy"
+    (mapping,) = bench.mappings
+    assert "same MTU" in bench.plane.status_of(mapping)["reason"]
+    assert bench.plane.status_of(mapping)["plane"] == "copy"
 
 
 class NftAlone(FakeTools):
@@ -186,8 +186,8 @@ async def test_datagrams_are_counted_and_need_no_answer(bench: Bench) -> None:
     for _ in range(4):
         await bench.plane.look()
         bench.tools.counted["received"] += 1000
-    (lease,) = bench.leases
-    told = bench.plane.status_of(lease)
+    (mapping,) = bench.mappings
+    told = bench.plane.status_of(mapping)
     assert (told["plane"], told["received"], told["received_packets"]) == ("kernel", 5028, 1)
     assert bench.plane.total.received == 5028
     assert bench.plane.total.packets == 1
@@ -211,7 +211,7 @@ async def test_what_a_killed_process_left_goes_on_for_a_while(bench: Bench) -> N
     await later.forwarding({45001: LOCATOR, 45002: OTHER, 45003: LOCATOR})
     later.lend(LOCATOR, 45002)
     await later.forwarding({45001: LOCATOR, 45002: LOCATOR, 45003: LOCATOR})
-    later.leases.note_former({})
+    later.mappings.note_former({})
     later.plane.syncer.note_change()
     await later.forwarding({45002: LOCATOR, 45003: LOCATOR})
     await later.runtime.tasks.cancel()

@@ -8,7 +8,7 @@ import pytest
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.data_leases import DataLeases
+from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.domain_plane import DomainPlane
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -47,10 +47,10 @@ def test_why_the_kernel_does_not_forward_a_port(
         domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     elif prefix == B:
         domain.heard_inside(spdp(B, INSIDE), INSIDE, NOW)
-    leases = DataLeases(PortPool(domain.settings.ports.listen))
-    leases.domains.append(domain.inside)
+    mappings = KernelPorts(PortPool(domain.settings.ports.listen))
+    mappings.domains.append(domain.inside)
     table = domain.inside if address == INSIDE else domain.outside
     participant = table.by_prefix[prefix]
-    lease = participant.leases[HostPort(address, port)]
-    status = DomainPlane(cast(KernelPlane, Plane()), leases).locator(participant, lease)
+    mapping = participant.mappings[HostPort(address, port)]
+    status = DomainPlane(cast(KernelPlane, Plane()), mappings).locator(participant, mapping)
     assert (status.plane, status.reason) == ("copy", reason)

@@ -16,7 +16,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.participants import COMES_IN_WITHIN_S, Lease, Participant
+from rosproxy.ros2.registry.participants import COMES_IN_WITHIN_S, Participant, PortMapping
 from rosproxy.ros2.servers.domain_server import DomainServer
 from rosproxy.ros2.status import Ros2State
 from tests.unit.ros2.discovery import domains
@@ -51,8 +51,8 @@ class Copied:
     def status(self) -> DataPlaneStatus:
         return DataPlaneStatus()
 
-    def locator(self, _: Participant, lease: Lease) -> LocatorStatus:
-        return LocatorStatus(lease.port, rate=lease.rate)
+    def locator(self, _: Participant, mapping: PortMapping) -> LocatorStatus:
+        return LocatorStatus(mapping.port, rate=mapping.rate)
 
 
 def text(value: str) -> bytes:
@@ -90,9 +90,9 @@ def announce(domain: Domain, reliability: int) -> None:
     ):
         domain.at_stand_in(stand_in, sedp(A, writer, topic, kind, 1), INSIDE, NOW)
     port = next(
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     )
-    domain.at_lease(port, sedp(B, SUBSCRIPTIONS, "rt/scan", string, reliability), ROBOT, NOW)
+    domain.at_range_port(port, sedp(B, SUBSCRIPTIONS, "rt/scan", string, reliability), ROBOT, NOW)
 
 
 def test_topics_and_their_types() -> None:
@@ -146,10 +146,10 @@ def test_who_does_not_match() -> None:
 def test_the_rate_of_a_port() -> None:
     domain = make_domain()
     announce(domain, 1)
-    (_, lease), *_ = domain.inside.leases.values()
-    lease.sample(NOW)
-    lease.bytes += 3000
-    lease.sample(NOW + 2)
+    (_, mapping), *_ = domain.inside.mappings.values()
+    mapping.sample(NOW)
+    mapping.bytes += 3000
+    mapping.sample(NOW + 2)
     (inside,) = told(domain).inside
     assert 1500.0 in {locator.rate for locator in inside.leases}
 
@@ -160,7 +160,7 @@ def test_metrics_tell_the_ports_that_are_left() -> None:
     state = Ros2State([cast(DomainServer, Served(domain))], cast(DomainPlane, Copied()))
     values = {sample.name: sample.value for family in state.collect() for sample in family.samples}
     used, free = (values[f"rosproxy_ros2_leases_{use}"] for use in ("used", "free"))
-    assert (used, free) == (len(domain.inside.leases), domain.ports.pool.free)
+    assert (used, free) == (len(domain.inside.mappings), domain.ports.pool.free)
     assert used > 0
     assert values["rosproxy_ros2_participants_without_port"] == 0
 
@@ -189,7 +189,7 @@ def test_outside_comes_in_or_may_still_do_so() -> None:
         domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + seconds)
         (outside,) = told(domain).outside
         assert outside.proven is is_proven
-    port = next(iter(domain.inside.leases))
-    domain.at_lease(port, spdp(B, ROBOT), ROBOT, NOW + COMES_IN_WITHIN_S)
+    port = next(iter(domain.inside.mappings))
+    domain.at_range_port(port, spdp(B, ROBOT), ROBOT, NOW + COMES_IN_WITHIN_S)
     (outside,) = told(domain).outside
     assert outside.proven

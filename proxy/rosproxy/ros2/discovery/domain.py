@@ -9,12 +9,12 @@ inside through the range, to outside without the proxy. Discovery that a sender 
 read like any other where the receiver would read it (`Participant.reads_discovery_at`).
 
 Nothing here does I/O: each method takes a datagram, where it came from and the time, and gives the
-datagrams to send. After each, `leases` and `stand_ins` tell which ports have to be open.
+datagrams to send. After each, `mappings` and `stand_ins` tell which ports have to be open.
 
 Every datagram may be forged. So
 
 - a participant inside is one whose address is inside, and only locators at that very address get a
-  lease: no announcement makes the proxy a way to another host;
+  port: no announcement makes the proxy a way to another host;
 - the prefix of a participant that is there can't be taken at another address or on the other side
   (`PrefixOwners`);
 - a participant outside is one whose address is a peer's, or that the LAN relay has heard from
@@ -68,10 +68,10 @@ from rosproxy.ros2.protocol.rtps import (
 )
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
-    Lease,
-    LeaseKind,
     OutsideParticipant,
     Participant,
+    PortMapping,
+    TrafficKind,
 )
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
@@ -88,8 +88,8 @@ ENDED_AT_ONCE = 64
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
 
-_StandInUsers = Sequence[tuple[OutsideParticipant, Lease]]
-"""Participants outside that a stand-in leads to, each by its lease."""
+_StandInUsers = Sequence[tuple[OutsideParticipant, PortMapping]]
+"""Participants outside that a stand-in leads to, each with the mapping of its locator."""
 _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams that go on, and what goes back to where they came from."""
 
@@ -113,7 +113,7 @@ class Domain:
     proofs: AddressProofs
     owners: PrefixOwners
     rates: DiscoveryRates = field(default_factory=DiscoveryRates)
-    passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
+    passed: Counter[tuple[TrafficKind, bool]] = field(default_factory=Counter)
 
     @classmethod
     def starting(
@@ -249,32 +249,32 @@ class Domain:
         """Whether `heard_inside` reads a datagram, which takes long."""
         return not self.proofs.is_answer(source, datagram)
 
-    def is_read_at(self, port: int, datagram: bytes, source: str) -> bool:
-        """Whether `at_lease` reads a datagram, which takes long, and does not just pass it on."""
-        leased = self.inside.leases.get(port)
-        if leased is None:
+    def is_read_at_range_port(self, port: int, datagram: bytes, source: str) -> bool:
+        """Whether `at_range_port` reads a datagram, which takes long, and does not just pass it."""
+        mapped = self.inside.mappings.get(port)
+        if mapped is None:
             return False
-        _, lease = leased
-        may_be_read = lease.is_read and self.outside.is_met(source)
+        _, mapping = mapped
+        may_be_read = mapping.is_read and self.outside.is_met(source)
         return may_be_read and may_be_discovery(datagram)
 
     def is_read_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
         """Whether `at_stand_in` reads a datagram, which takes long, and does not just pass it."""
         users = self.outside.stand_ins.get(port, ())
-        may_be_read = any(outsider.reads_discovery_at(lease) for outsider, lease in users)
+        may_be_read = any(outsider.reads_discovery_at(mapping) for outsider, mapping in users)
         return may_be_read and may_be_discovery(datagram)
 
-    def at_lease(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+    def at_range_port(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What outside sends to a port of the range."""
-        leased = self.inside.leases.get(port)
+        mapped = self.inside.mappings.get(port)
         try:
-            if leased is None:  # outside may mean a participant of before the start
+            if mapped is None:  # outside may mean a participant of before the start
                 self._note_former_use(port, datagram, source, now)
                 return []
-            insider, lease = leased
-            is_for_data = lease.kind is LeaseKind.DATA
-            if is_for_data and not (lease.is_read and may_be_discovery(datagram)):
-                return [self._passed(lease, datagram, True)]
+            insider, mapping = mapped
+            is_for_data = mapping.kind is TrafficKind.USER_DATA
+            if is_for_data and not (mapping.is_read and may_be_discovery(datagram)):
+                return [self._passed(mapping, datagram, True)]
             if self.outside.is_strange(source):
                 return []
             passed = [datagram]
@@ -282,11 +282,11 @@ class Domain:
             if is_for_data or may_be_discovery(datagram):  # Cyclone DDS has one locator for both
                 if self._is_too_much(datagram, source, now):
                     return []
-                heard = partial(self._heard_at_lease, port, source, insider, now)
+                heard = partial(self._heard_at_range_port, port, source, insider, now)
                 passed, back = _pass_on_each(datagram, heard)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
-        return [self._passed(lease, d, True) for d in passed] + back
+        return [self._passed(mapping, d, True) for d in passed] + back
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What inside sends to a port that stands for locators outside."""
@@ -544,7 +544,7 @@ class Domain:
             insider.was_inside = self.former_ports.was_inside(prefix)
             holders = self.ports.displaced_by(prefix, now)
             sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
-        lease_count = len(insider.leases)
+        mapping_count = len(insider.mappings)
         exported = self.inside.exported(insider, message, now, self.former_ports.of(prefix))
         sent += self.inside.introduced(insider, message)
         # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
@@ -552,8 +552,8 @@ class Domain:
             sent += self.own.port_store_dispose_message(insider)
             insider.parting_from = now
         else:
-            sent += self._reminders(insider, lease_count, now)
-        if not is_new and len(insider.leases) > lease_count:
+            sent += self._reminders(insider, mapping_count, now)
+        if not is_new and len(insider.mappings) > mapping_count:
             insider.parting_from = now  # outside takes up no new locators of it
         sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
         if is_new:
@@ -607,7 +607,7 @@ class Domain:
             for reader in readers:
                 self.rediscovery.note_met(insider, reader)
         reader = readers[0] if readers else users[0][0].prefix
-        count = len(insider.leases)
+        count = len(insider.mappings)
         exported = partial(self.inside.exported, insider, now=now)
         passed, questions = self.fragments.rewritten(port, message, reader, exported)
         back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count, now)
@@ -620,12 +620,12 @@ class Domain:
 
         The proxy may be killed before the next round; what is lost on its way comes again then.
         """
-        has_more = len(insider.leases) > former_count
+        has_more = len(insider.mappings) > former_count
         if not has_more or insider not in self.inside.port_keepers(self.inside.at(insider.address)):
             return []
         return self.former_ports.reminders(insider, now)
 
-    def _heard_at_lease(
+    def _heard_at_range_port(
         self,
         port: int,
         source: str,
@@ -678,9 +678,9 @@ class Domain:
     def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
         """A datagram that goes to participants outside, as far as they may be sent any."""
         sent = list[Outgoing]()
-        for target, lease in users:
+        for target, mapping in users:
             if target.may_be_sent(len(datagram)):
-                sent.append(self._passed(lease, datagram, False))
+                sent.append(self._passed(mapping, datagram, False))
             else:
                 text = (
                     f"participant {target.guid_prefix} has not shown yet that it receives datagrams"
@@ -688,11 +688,11 @@ class Domain:
                 sent += self._drop("unproven", target.address, text)
         return sent
 
-    def _passed(self, lease: Lease, datagram: bytes, inwards: bool) -> Outgoing:
-        """A datagram that goes to where a lease leads."""
-        lease.note_passed(len(datagram))
-        self.passed[lease.kind, inwards] += len(datagram)
-        return Outgoing(lease.target, datagram)
+    def _passed(self, mapping: PortMapping, datagram: bytes, inwards: bool) -> Outgoing:
+        """A datagram that goes to where a mapping leads."""
+        mapping.note_passed(len(datagram))
+        self.passed[mapping.kind, inwards] += len(datagram)
+        return Outgoing(mapping.target, datagram)
 
     def _note_former_use(self, port: int, datagram: bytes, source: str, now: float) -> None:
         """Note whom outside means by a port that nobody has, soon after the start. RtpsError."""

@@ -9,7 +9,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
-    MOST_LEASES,
+    MOST_MAPPINGS,
     MOST_PER_ADDRESS,
     DomainSettings,
     Outgoing,
@@ -22,11 +22,11 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
-    Lease,
-    LeaseKind,
     ParticipantTable,
+    PortMapping,
     PortShortage,
     ShortageKind,
+    TrafficKind,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.announced_participant import (
@@ -52,10 +52,10 @@ all that it can get leaves something for others."""
 
 @dataclass(slots=True)
 class InsideParticipants(ParticipantTable[InsideParticipant]):
-    """The participants inside; ``leases`` by port of the range, each with its participant.
+    """The participants inside; ``mappings`` by port of the range, each with its participant.
 
     ``port_shortages`` tells why a locator got no port, by its participant's prefix. ``changes``
-    counts how often the leases have changed.
+    counts how often the mappings have changed.
     """
 
     settings: DomainSettings
@@ -63,7 +63,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
     refused: Refused
     proofs: AddressProofs
     verdicts: Verdicts
-    leases: dict[int, tuple[InsideParticipant, Lease]] = field(default_factory=dict)
+    mappings: dict[int, tuple[InsideParticipant, PortMapping]] = field(default_factory=dict)
     port_shortages: dict[bytes, PortShortage] = field(default_factory=dict)
     changes: int = 0
 
@@ -218,8 +218,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
 
     def forget(self, participant: InsideParticipant) -> None:
         """Forget a participant that has gone, and take its ports back."""
-        for lease in participant.leases.values():
-            self._take_back(lease)
+        for mapping in participant.mappings.values():
+            self._take_back(mapping)
         self.remove(participant)
         self.verdicts.forget(participant)
         self._mark_read(participant.address)
@@ -234,25 +234,25 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         """
         address = participant.address
         named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
-        if len(named) <= MOST_LEASES < len(named | participant.leases.keys()):
-            for locator in participant.leases.keys() - named:
-                self._take_back(participant.leases.pop(locator))
+        if len(named) <= MOST_MAPPINGS < len(named | participant.mappings.keys()):
+            for locator in participant.mappings.keys() - named:
+                self._take_back(participant.mappings.pop(locator))
             self.port_shortages.pop(participant.prefix, None)
             self._mark_read(address)
 
-    def _take_back(self, lease: Lease) -> None:
-        del self.leases[lease.port]
-        self.ports.give_back(lease.port)
+    def _take_back(self, mapping: PortMapping) -> None:
+        del self.mappings[mapping.port]
+        self.ports.give_back(mapping.port)
 
     def _mark_read(self, address: str) -> None:
-        """Mark the leases to locators at which a participant at an address reads discovery.
+        """Mark the mappings to locators at which a participant at an address reads discovery.
 
         A participant may name the locator of another participant at the same address.
         """
-        leases = [(p, lease) for p in self.at(address) for lease in p.leases.values()]
-        read = {lease.target for p, lease in leases if p.reads_discovery_at(lease)}
-        for _, lease in leases:
-            lease.is_read = lease.target in read
+        mappings = [(p, mapping) for p in self.at(address) for mapping in p.mappings.values()]
+        read = {mapping.target for p, mapping in mappings if p.reads_discovery_at(mapping)}
+        for _, mapping in mappings:
+            mapping.is_read = mapping.target in read
         self.changes += 1
 
     def _lead_out(
@@ -267,20 +267,20 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         if locator.host != participant.address or self._is_own(locator):
             return None
         is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
-        kind = LeaseKind.METATRAFFIC if is_metatraffic else LeaseKind.DATA
-        lease = participant.leases.get(locator)
-        if lease is None:
+        kind = TrafficKind.METATRAFFIC if is_metatraffic else TrafficKind.USER_DATA
+        mapping = participant.mappings.get(locator)
+        if mapping is None:
             # Ports are kept in the order in which they were lent (`ports` of a participant).
-            index = len(participant.leases)
+            index = len(participant.mappings)
             former_port = kept[index] if index < len(kept) else None
-            lease = self._lend(participant, locator, kind, former_port, now)
-        if lease is None:
+            mapping = self._lend(participant, locator, kind, former_port, now)
+        if mapping is None:
             return None
-        if is_metatraffic and lease.kind is not kind:
-            lease.kind = kind  # Cyclone DDS has one locator for both
+        if is_metatraffic and mapping.kind is not kind:
+            mapping.kind = kind  # Cyclone DDS has one locator for both
             self._mark_read(participant.address)
         host = self.settings.host_for(locator.host)
-        return HostPort(host, self.settings.ports.advertised(lease.port))
+        return HostPort(host, self.settings.ports.advertised(mapping.port))
 
     def _is_own(self, locator: HostPort) -> bool:
         """Whether a locator is a port of the range itself: a datagram there would never end."""
@@ -302,18 +302,18 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         """
         size = len(self.settings.ports.listen)
         at_address = (p for p in self.by_prefix.values() if p.address == address)
-        return sum(len(p.leases) for p in at_address) >= size - size // PART_FOR_OTHERS
+        return sum(len(p.mappings) for p in at_address) >= size - size // PART_FOR_OTHERS
 
     def _lend(
         self,
         participant: InsideParticipant,
         locator: HostPort,
-        kind: LeaseKind,
+        kind: TrafficKind,
         former_port: int | None,
         now: float,
-    ) -> Lease | None:
-        if len(participant.leases) >= MOST_LEASES:
-            text = f"{locator} got no port: the participant has more than {MOST_LEASES} locators"
+    ) -> PortMapping | None:
+        if len(participant.mappings) >= MOST_MAPPINGS:
+            text = f"{locator} got no port: the participant has more than {MOST_MAPPINGS} locators"
             self.port_shortages[participant.prefix] = PortShortage(ShortageKind.BOUND, text)
             return None
         ports = self.settings.ports.listen
@@ -336,7 +336,7 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             return None
         if former_port not in (None, port) and self.ports.is_restoring(now):
             self._lose(participant, former_port, now)
-        lease = participant.leases[locator] = Lease(port, locator, kind)
-        self.leases[port] = participant, lease
+        mapping = participant.mappings[locator] = PortMapping(port, locator, kind)
+        self.mappings[port] = participant, mapping
         self._mark_read(participant.address)
-        return lease
+        return mapping

@@ -17,7 +17,7 @@ from rosproxy.ros2.protocol.reliable import MOST_ASKED, Heartbeat, acknack, hear
 from rosproxy.ros2.protocol.rtps import samples
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
-LEASE = 12.0
+LEASE_DURATION_S = 12.0
 """Seconds after which others that do not hear it forget it: the proxy may have been killed."""
 ANNOUNCE_INTERVAL = 3.0
 OBSERVED = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
@@ -74,7 +74,7 @@ class Observer:
 
     def announcement(self, *reached_at: HostPort) -> bytes:
         """The datagram by which it announces itself; ``reached_at`` is where it is answered."""
-        return announcement(self.prefix, reached_at, LEASE, READER_ENDPOINTS)
+        return announcement(self.prefix, reached_at, LEASE_DURATION_S, READER_ENDPOINTS)
 
     def dispose_message(self) -> bytes:
         """The datagram by which it says that it has ended."""

@@ -16,7 +16,7 @@ from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
 from rosproxy.ros2.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
-    MOST_LEASES,
+    MOST_MAPPINGS,
     MOST_OUTSIDE,
     MOST_OUTSIDE_UNPROVEN,
     MOST_PER_HOST,
@@ -36,10 +36,10 @@ from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_vendor
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
-    Lease,
-    LeaseKind,
     OutsideParticipant,
     ParticipantTable,
+    PortMapping,
+    TrafficKind,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.announced_participant import (
@@ -77,7 +77,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     refused: Refused
     proofs: AddressProofs
     verdicts: Verdicts
-    stand_ins: dict[int, list[tuple[OutsideParticipant, Lease]]] = field(default_factory=dict)
+    stand_ins: dict[int, list[tuple[OutsideParticipant, PortMapping]]] = field(default_factory=dict)
     blocked: set[int] = field(default_factory=set)
     changes: int = 0
 
@@ -283,7 +283,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def forget(self, participant: OutsideParticipant) -> None:
         """Forget a participant that has gone."""
         self.remove(participant)
-        for locator in list(participant.leases):
+        for locator in list(participant.mappings):
             self._close(participant, locator)
 
     def block(self, port: int, for_good: bool = True) -> None:
@@ -293,8 +293,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """
         if for_good:
             self.blocked.add(port)
-        for participant, lease in list(self.stand_ins.get(port, ())):
-            self._close(participant, lease.target)
+        for participant, mapping in list(self.stand_ins.get(port, ())):
+            self._close(participant, mapping.target)
 
     def gives_place(self, source: str) -> OutsideParticipant | None:
         """The participant that ends for a new one at an address; None if there is none.
@@ -394,37 +394,37 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Where inside reaches a locator of a participant outside; None if it does not."""
         if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
             # Whichever locator it is, discovery goes to the one at the address that it sends from.
-            lease = outsider.metatraffic and self._lease(
-                outsider, outsider.metatraffic, LeaseKind.METATRAFFIC
+            mapping = outsider.metatraffic and self._mapping(
+                outsider, outsider.metatraffic, TrafficKind.METATRAFFIC
             )
         elif not self.settings.both_ways:
             return None if _leads_elsewhere(outsider, near, only_heard, locator) else locator
         else:
             is_led = locator.host == outsider.address and not self._is_own_port(locator)
-            lease = self._lease(outsider, locator, LeaseKind.DATA) if is_led else None
-        return HostPort(near, lease.port) if lease else None
+            mapping = self._mapping(outsider, locator, TrafficKind.USER_DATA) if is_led else None
+        return HostPort(near, mapping.port) if mapping else None
 
-    def _lease(
-        self, outsider: OutsideParticipant, locator: HostPort, kind: LeaseKind
-    ) -> Lease | None:
+    def _mapping(
+        self, outsider: OutsideParticipant, locator: HostPort, kind: TrafficKind
+    ) -> PortMapping | None:
         """The stand-in for a locator, which is opened if there is none; None if there are too many.
 
         Where Cyclone DDS has one locator for both, it is of metatraffic, whichever comes first.
         """
-        lease = outsider.leases.get(locator)
-        if lease is None and len(outsider.leases) < MOST_LEASES:
+        mapping = outsider.mappings.get(locator)
+        if mapping is None and len(outsider.mappings) < MOST_MAPPINGS:
             users = partial(self._users, outsider.is_known)
             port = stand_in_port(f"{outsider.prefix.hex()} {locator}", users, self._is_taken)
             if port is not None:
-                lease = outsider.leases[locator] = Lease(port, locator, kind)
-                self.stand_ins.setdefault(port, []).append((outsider, lease))
+                mapping = outsider.mappings[locator] = PortMapping(port, locator, kind)
+                self.stand_ins.setdefault(port, []).append((outsider, mapping))
                 self.changes += 1
-        if lease is None:
+        if mapping is None:
             text = f"participant {outsider.guid_prefix}: no stand-in port is left for {locator}"
             self.refused("stand_ins", outsider.address, text)
-        elif kind is LeaseKind.METATRAFFIC:
-            lease.kind = kind
-        return lease
+        elif kind is TrafficKind.METATRAFFIC:
+            mapping.kind = kind
+        return mapping
 
     def _is_own_port(self, locator: HostPort) -> bool:
         """Whether a locator is a port of the proxy itself: a stand-in there would lead inside."""
@@ -443,11 +443,11 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         return port in self.blocked or port in self.settings.ports.listen
 
     def _close(self, participant: OutsideParticipant, locator: HostPort) -> None:
-        lease = participant.leases.pop(locator)
+        mapping = participant.mappings.pop(locator)
         participant.introduction = None
-        remaining = [pair for pair in self.stand_ins.pop(lease.port) if pair[1] is not lease]
+        remaining = [pair for pair in self.stand_ins.pop(mapping.port) if pair[1] is not mapping]
         if remaining:
-            self.stand_ins[lease.port] = remaining
+            self.stand_ins[mapping.port] = remaining
         self.changes += 1
 
 

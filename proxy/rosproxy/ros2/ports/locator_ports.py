@@ -28,7 +28,7 @@ from itertools import chain, islice
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import destination, of_built_in_writer
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 
 STAND_INS = PortRange(20_000, 32_767)
 """Where ports for participants outside are chosen from: below those that Linux gives away."""
@@ -52,7 +52,7 @@ def order_for(key: str, ports: PortRange) -> Iterator[int]:
         yield ports.first + (start + number) % len(ports)
 
 
-_User = tuple[bytes, LeaseKind]
+_User = tuple[bytes, TrafficKind]
 """A participant's prefix, and what arrives at its port."""
 
 
@@ -151,11 +151,11 @@ class LocatorPorts:
         prefix = destination(datagram)
         is_built_in = of_built_in_writer(datagram)
         if prefix is not None and is_built_in is not None:
-            kind = LeaseKind.METATRAFFIC if is_built_in else LeaseKind.DATA
+            kind = TrafficKind.METATRAFFIC if is_built_in else TrafficKind.USER_DATA
             self.note_former_user(port, prefix, kind, by, now)
 
     def note_former_user(
-        self, port: int, prefix: bytes, kind: LeaseKind, by: NamedBy, now: float
+        self, port: int, prefix: bytes, kind: TrafficKind, by: NamedBy, now: float
     ) -> None:
         """Note that a participant was named at a port."""
         if self.is_restoring(now) and port in self.pool.range:
@@ -209,7 +209,12 @@ class LocatorPorts:
         return displaced
 
     def take(
-        self, prefix: bytes, locator: HostPort, kind: LeaseKind, now: float, had: int | None = None
+        self,
+        prefix: bytes,
+        locator: HostPort,
+        kind: TrafficKind,
+        now: float,
+        had: int | None = None,
     ) -> int | None:
         """A port for a locator of a participant; None if all are taken.
 
@@ -254,7 +259,7 @@ class LocatorPorts:
         """Whose a port was, as it seems to a participant that wants one for a locator."""
         prefix, kind = user
         if (former_locator := self._forwarded.get(port)) is not None:
-            is_own = former_locator == locator and kind is LeaseKind.DATA
+            is_own = former_locator == locator and kind is TrafficKind.USER_DATA
             return _Claim.FORWARDED if is_own else _Claim.ANOTHERS
         if port == had:
             return self._judged(port, prefix)

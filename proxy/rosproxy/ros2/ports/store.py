@@ -35,7 +35,7 @@ from rosproxy.ros2.protocol.rtps import HEADER, NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
 COUNTS_EACH_SECOND = 4
-LEASE = 24 * 3600.0
+LEASE_DURATION_S = 24 * 3600.0
 """Seconds for which participants remember the port store without hearing it."""
 WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
 """The writers of a participant that keeps a number: for its lower half, and for its upper half."""
@@ -257,7 +257,7 @@ class PortStore:
                 heartbeat(own, prefix, writer, numbers[own, writer], count & 0x7FFFFFFF)
                 for writer in WRITERS
             ]
-            sent.append(announcement(own, [reached_at], LEASE, PORT_STORE_ENDPOINTS))
+            sent.append(announcement(own, [reached_at], LEASE_DURATION_S, PORT_STORE_ENDPOINTS))
             sent.append(beats[0] + b"".join(beat[HEADER:] for beat in beats[1:]))
         return sent
 

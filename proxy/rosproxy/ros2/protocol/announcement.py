@@ -25,9 +25,9 @@ SEDP, its writer of publications, or its writers of publications and of subscrip
 
 
 def announcement(
-    prefix: bytes, reached_at: Iterable[HostPort], lease: float, endpoints: int
+    prefix: bytes, reached_at: Iterable[HostPort], lease_duration: float, endpoints: int
 ) -> bytes:
-    """The datagram by which a participant announces itself, for ``lease`` seconds."""
+    """The datagram by which a participant announces itself, for ``lease_duration`` seconds."""
     locators = [pack_locator(host_port, "<") for host_port in reached_at]
     return _message(
         prefix,
@@ -41,7 +41,7 @@ def announcement(
             # (ddsi_discovery_spdp.c, get_locators).
             *((Pid.METATRAFFIC_UNICAST_LOCATOR, locator) for locator in locators),
             *((Pid.DEFAULT_UNICAST_LOCATOR, locator) for locator in locators),
-            (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
+            (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease_duration), 0)),
             (Pid.BUILTIN_ENDPOINT_SET, struct.pack("<I", endpoints)),
         ],
     )

@@ -48,15 +48,15 @@ ENDPOINT_OVERHEAD = 500
 """Bytes that a reader or writer takes beside its texts."""
 
 
-class LeaseKind(StrEnum):
-    """What the participant announces a lease for: discovery (``METATRAFFIC``), or user data.
+class TrafficKind(StrEnum):
+    """What a participant announces a locator for: discovery, or user data.
 
-    The proxy reads discovery at a lease for user data as well, unless the participant ignores
+    The proxy reads discovery at a port for user data as well, unless the participant ignores
     discovery there (`Participant.reads_discovery_at`).
     """
 
     METATRAFFIC = "metatraffic"
-    DATA = "data"
+    USER_DATA = "data"
 
 
 class EndpointKind(StrEnum):
@@ -134,18 +134,18 @@ UNKNOWN_TRAITS = ParticipantTraits()
 
 
 @dataclass(slots=True)
-class Lease:
-    """A port that leads to one locator of a participant.
+class PortMapping:
+    """A port of the proxy that leads to one locator of a participant.
 
-    Of one inside it is a port of the range; of one outside its *stand-in*, a port that those inside
-    reach. ``is_read`` (inside alone): a participant there may act on discovery. ``bytes`` and
+    A locator inside has a port of the range. A locator outside has a *stand-in*, a port that inside
+    reaches. ``is_read`` (inside alone): a participant there may act on discovery. ``bytes`` and
     ``datagrams`` are those that were passed on; ``rate`` is in bytes per second, as of the last
     `sample`.
     """
 
     port: int
     target: HostPort
-    kind: LeaseKind
+    kind: TrafficKind
     is_read: bool = False
     datagrams: int = 0
     bytes: int = 0
@@ -173,7 +173,7 @@ class Participant:
     ``announcement`` is its last SPDP datagram: of one inside as outside gets it, of one outside as
     it came, without what else the datagram held (`participant_alone`). ``next_number`` is the
     sequence number after that of the announcement. ``endpoints`` are by their entity ids,
-    ``leases`` by its locators.
+    ``mappings`` by its locators.
     """
 
     prefix: bytes
@@ -185,7 +185,7 @@ class Participant:
     metatraffic: HostPort | None = None
     traits: ParticipantTraits = UNKNOWN_TRAITS
     endpoints: dict[bytes, DdsEndpoint] = field(default_factory=dict)
-    leases: dict[HostPort, Lease] = field(default_factory=dict)
+    mappings: dict[HostPort, PortMapping] = field(default_factory=dict)
 
     @property
     def guid_prefix(self) -> str:
@@ -197,8 +197,8 @@ class Participant:
         """The implementation's name, or its id."""
         return VENDORS.get(self.vendor, self.vendor.hex())
 
-    def reads_discovery_at(self, lease: Lease) -> bool:
-        """Whether the participant may act on discovery that arrives where a lease leads.
+    def reads_discovery_at(self, mapping: PortMapping) -> bool:
+        """Whether the participant may act on discovery that arrives where a mapping leads.
 
         Fast DDS gives a datagram only to the readers that have the port among their own locators.
         The built-in readers have the ports for metatraffic alone (RTPSParticipantImpl.cpp,
@@ -206,7 +206,7 @@ class Participant:
         Cyclone DDS finds the writer of a datagram in one table for all sockets (ddsi_receive.c,
         handle_submsg_sequence). Other implementations count as Cyclone DDS does.
         """
-        return lease.kind is LeaseKind.METATRAFFIC or self.vendor != FAST_DDS
+        return mapping.kind is TrafficKind.METATRAFFIC or self.vendor != FAST_DDS
 
     def note_vendor(self, vendor: bytes) -> bool:
         """Note the vendor in a later announcement. Return whether the vendor has changed.
@@ -292,7 +292,7 @@ class InsideParticipant(Participant):
     @property
     def ports(self) -> list[int]:
         """The ports that it has, in the order in which they were given."""
-        return [lease.port for lease in self.leases.values()]
+        return [mapping.port for mapping in self.mappings.values()]
 
 
 COMES_IN_WITHIN_S = 2.0

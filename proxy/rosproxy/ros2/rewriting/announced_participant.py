@@ -17,9 +17,9 @@ from rosproxy.ros2.registry.participants import (
 )
 from rosproxy.ros2.rewriting.discovery import Announcement
 
-LONGEST_LEASE = 300.0
+LONGEST_LEASE_DURATION_S = 300.0
 """Seconds after which a participant that is not heard counts as gone, whatever it says itself."""
-USUAL_LEASE = 100.0
+DEFAULT_LEASE_DURATION_S = 100.0
 """The same if it says nothing (DDSI-RTPS 2.5, 9.6.3.2)."""
 _UNKNOWN_DOMAIN = 0xFFFF_FFFF
 """What Fast DDS calls a domain that it does not know."""
@@ -33,7 +33,9 @@ _VALID = 0x8000_0000
 def lease_duration(spdp: Announcement, datagram: bytes) -> float:
     """For how many seconds a participant counts as there without being heard, within bounds."""
     seconds = spdp.parameters.seconds(datagram, Pid.PARTICIPANT_LEASE_DURATION)
-    return min(max(USUAL_LEASE if seconds is None else seconds, 1.0), LONGEST_LEASE)
+    return min(
+        max(DEFAULT_LEASE_DURATION_S if seconds is None else seconds, 1.0), LONGEST_LEASE_DURATION_S
+    )
 
 
 def first_metatraffic(spdp: Announcement, datagram: bytes, address: str) -> HostPort | None:

@@ -60,7 +60,7 @@ MustRead = Callable[[bytes, str], bool]
 class DomainServer:
     """Serves one domain. ``now`` is the clock; ``is_inside`` tells an address's side.
 
-    ``changed`` is called when a lease was given or has ended.
+    ``changed`` is called when a mapping was given or has ended.
     For ``awaited`` seconds nobody is let in unless an operator has told who may.
     """
 
@@ -122,7 +122,11 @@ class DomainServer:
             if port == settings.discovery_port:
                 self._read(sock, self._at_discovery, self._is_read_at_discovery)
             else:
-                self._read(sock, partial(domain.at_lease, port), partial(domain.is_read_at, port))
+                self._read(
+                    sock,
+                    partial(domain.at_range_port, port),
+                    partial(domain.is_read_at_range_port, port),
+                )
         return taken_ports
 
     async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
@@ -421,7 +425,7 @@ class DomainServer:
                 log.debug("can't send a datagram to %s: %s", out.target, error)
 
     def _tell_changes(self) -> None:
-        """Tell that leases have changed, if they have."""
+        """Tell that mappings have changed, if they have."""
         changes = self.domain.inside.changes
         if changes != self._told_changes:
             self._told_changes = changes

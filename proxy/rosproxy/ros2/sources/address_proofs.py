@@ -4,7 +4,7 @@ The source of a datagram is what its sender wrote there. So an address gets a qu
 address hears: the announcement of a participant whose GUID prefix follows from the address and from
 a secret of this process. An answer names that prefix (INFO_DST), so its sender has the question.
 The participant in the question has a writer of SEDP, whose heartbeat each reader answers
-(DDSI-RTPS 2.5, 8.4.9). It is forgotten after `LEASE_DURATION`.
+(DDSI-RTPS 2.5, 8.4.9). It is forgotten after `LEASE_DURATION_S`.
 
 An address that has proved to receive may be forged as any other. So each participant inside answers
 for itself: a question names the participant (INFO_DST), and no other one answers.
@@ -32,7 +32,7 @@ from rosproxy.ros2.protocol.rtps import (
 from rosproxy.ros2.registry.participants import ParticipantTable
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter, DiscoveryMessage
 
-LEASE_DURATION = 12.0
+LEASE_DURATION_S = 12.0
 """Seconds for which a participant remembers the one in a question. Cyclone DDS announces itself
 each 8 s and is asked again then."""
 KEPT = 60.0
@@ -81,7 +81,7 @@ class AddressProofs:
         own = self._prefix(address)
         self._count += 1
         asks = heartbeat(own, prefix, BuiltinWriter.PUBLICATIONS, 1, self._count)
-        return announcement(own, reached_at, LEASE_DURATION, WRITER_ENDPOINTS) + asks[HEADER:]
+        return announcement(own, reached_at, LEASE_DURATION_S, WRITER_ENDPOINTS) + asks[HEADER:]
 
     def is_answer(self, address: str, datagram: bytes) -> bool:
         """Return whether a datagram is the first answer of a participant, and nothing else.

@@ -10,7 +10,7 @@ from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import FAST_DDS, NO_VENDOR, RTI, SubmessageId, submessages
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 from tests.unit.ros2.discovery.domains import (
     CYCLONE_DDS,
     INSIDE,
@@ -54,16 +54,20 @@ def met(vendor: bytes = CYCLONE_DDS, both_ways: bool = False, is_denied: bool = 
     return domain
 
 
-def data_lease(domain: Domain) -> int:
+def data_port(domain: Domain) -> int:
     """The port that leads to where A receives user data."""
-    (port,) = [p for p, (_, lease) in domain.inside.leases.items() if lease.kind is LeaseKind.DATA]
+    (port,) = [
+        p
+        for p, (_, mapping) in domain.inside.mappings.items()
+        if mapping.kind is TrafficKind.USER_DATA
+    ]
     return port
 
 
 def data_stand_in(domain: Domain, prefix: bytes = B) -> int:
     """The port that stands for where a participant outside receives user data."""
-    leases = domain.outside.by_prefix[prefix].leases.values()
-    (port,) = [lease.port for lease in leases if lease.kind is LeaseKind.DATA]
+    mappings = domain.outside.by_prefix[prefix].mappings.values()
+    (port,) = [mapping.port for mapping in mappings if mapping.kind is TrafficKind.USER_DATA]
     return port
 
 
@@ -95,76 +99,76 @@ GAP = [SubmessageId.GAP, SubmessageId.PAD]
 def test_a_strangers_discovery_does_not_pass(vendor: bytes, source: str) -> None:
     """A reader of a denied topic, announced to the port for user data, got that topic's data."""
     domain = met(vendor, is_denied=False)
-    port = data_lease(domain)
+    port = data_port(domain)
     for datagram in (sedp(B, ROBOT, 7000), sedp(C, source, 7000), *in_fragments(B)):
-        assert domain.at_lease(port, datagram, source, NOW) == []
+        assert domain.at_range_port(port, datagram, source, NOW) == []
     assert domain.refused.count
 
 
 @OTHERS
 def test_a_peers_discovery_is_policed_and_led_elsewhere(vendor: bytes) -> None:
     domain = met(vendor, both_ways=True)
-    port = data_lease(domain)
+    port = data_port(domain)
     announced = sedp(B, ROBOT, 7000)
-    assert domain.is_read_at(port, announced, ROBOT)
-    assert kinds(domain.at_lease(port, announced, ROBOT, NOW)) == [GAP]
+    assert domain.is_read_at_range_port(port, announced, ROBOT)
+    assert kinds(domain.at_range_port(port, announced, ROBOT, NOW)) == [GAP]
     domain = met(vendor, both_ways=True, is_denied=False)
-    (sent,) = domain.at_lease(data_lease(domain), announced, ROBOT, NOW)
+    (sent,) = domain.at_range_port(data_port(domain), announced, ROBOT, NOW)
     assert sent.target == HostPort(INSIDE, 7411)
     assert [locator.host for locator in reached_at(sent.datagram)] == [NEAR]
 
 
 def test_a_peers_discovery_in_fragments_is_policed() -> None:
     domain = met()
-    port = data_lease(domain)
+    port = data_port(domain)
     first, second = in_fragments(B)
-    assert domain.at_lease(port, first, ROBOT, NOW) == []
-    assert kinds(domain.at_lease(port, second, ROBOT, NOW)) == [GAP, GAP]
+    assert domain.at_range_port(port, first, ROBOT, NOW) == []
+    assert kinds(domain.at_range_port(port, second, ROBOT, NOW)) == [GAP, GAP]
 
 
 def test_fragments_at_both_ports_of_a_participant_do_not_make_a_whole() -> None:
     """Cyclone DDS joins fragments from all sockets."""
     domain = met()
-    (meta,) = domain.inside.leases.keys() - {data_lease(domain)}
+    (meta,) = domain.inside.mappings.keys() - {data_port(domain)}
     first, second = in_fragments(B)
-    assert domain.at_lease(meta, first, ROBOT, NOW) == []
-    assert domain.at_lease(data_lease(domain), second, ROBOT, NOW) == []
+    assert domain.at_range_port(meta, first, ROBOT, NOW) == []
+    assert domain.at_range_port(data_port(domain), second, ROBOT, NOW) == []
 
 
 def test_a_participant_that_has_not_announced_itself_is_not_read() -> None:
     domain = met(is_denied=False)
-    assert domain.at_lease(data_lease(domain), sedp(C, ROBOT, 7000), ROBOT, NOW) == []
+    assert domain.at_range_port(data_port(domain), sedp(C, ROBOT, 7000), ROBOT, NOW) == []
 
 
 def test_discovery_is_charged_and_user_data_is_not() -> None:
     domain = met()
-    port = data_lease(domain)
+    port = data_port(domain)
     before = allowance_left(domain, ROBOT)
-    domain.at_lease(port, USER, ROBOT, NOW)
+    domain.at_range_port(port, USER, ROBOT, NOW)
     assert allowance_left(domain, ROBOT) == before
-    domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    domain.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     assert allowance_left(domain, ROBOT) < before
     domain.rates.charge(ROBOT, int(before))
-    assert domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW) == []
-    assert domain.at_lease(port, USER, ROBOT, NOW)
+    assert domain.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW) == []
+    assert domain.at_range_port(port, USER, ROBOT, NOW)
 
 
 @pytest.mark.parametrize("source", [ROBOT, STRANGER])
 def test_user_data_passes_unread(source: str) -> None:
     domain = met()
-    port = data_lease(domain)
-    assert not domain.is_read_at(port, USER, source)
-    assert domain.at_lease(port, USER, source, NOW) == [Outgoing(HostPort(INSIDE, 7411), USER)]
+    port = data_port(domain)
+    assert not domain.is_read_at_range_port(port, USER, source)
+    assert domain.at_range_port(port, USER, source, NOW) == [Outgoing(HostPort(INSIDE, 7411), USER)]
 
 
 @pytest.mark.parametrize("source", [ROBOT, STRANGER])
 def test_fast_dds_ignores_discovery_there_and_nothing_is_read(source: str) -> None:
     domain = met(FAST_DDS)
-    port = data_lease(domain)
+    port = data_port(domain)
     before = allowance_left(domain, source)
     announced = sedp(B, ROBOT, 7000)
-    assert not domain.is_read_at(port, announced, source)
-    assert domain.at_lease(port, announced, source, NOW) == [
+    assert not domain.is_read_at_range_port(port, announced, source)
+    assert domain.at_range_port(port, announced, source, NOW) == [
         Outgoing(HostPort(INSIDE, 7411), announced)
     ]
     assert allowance_left(domain, source) == before
@@ -197,7 +201,7 @@ def test_a_stranger_can_not_disguise_discovery(disguise: str, vendor: bytes) -> 
     """Cyclone DDS reads up to a broken submessage, and skips unknown submessages."""
     domain = met(is_denied=False)
     datagram = of_vendor(DISGUISES[disguise], vendor)
-    assert domain.at_lease(data_lease(domain), datagram, STRANGER, NOW) == []
+    assert domain.at_range_port(data_port(domain), datagram, STRANGER, NOW) == []
 
 
 @OTHERS
@@ -243,11 +247,11 @@ def test_one_participant_that_reads_discovery_has_a_shared_stand_in_read(
 def test_a_forged_vendor_does_not_outlast_the_participants_own_word() -> None:
     """A forger announced the participant first, from the same address, with the vendor Fast DDS."""
     domain = met(FAST_DDS)
-    port = data_lease(domain)
+    port = data_port(domain)
     domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, NOW + 1)
-    assert domain.at_lease(port, sedp(B, ROBOT, 7000), STRANGER, NOW + 1) == []
+    assert domain.at_range_port(port, sedp(B, ROBOT, 7000), STRANGER, NOW + 1) == []
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 2)
-    assert domain.at_lease(port, sedp(B, ROBOT, 7000), STRANGER, NOW + 2) == []
+    assert domain.at_range_port(port, sedp(B, ROBOT, 7000), STRANGER, NOW + 2) == []
 
 
 @pytest.mark.parametrize("vendor", [FAST_DDS, CYCLONE_DDS])
@@ -261,16 +265,16 @@ def test_a_port_of_another_participant_at_the_address_is_read(
     said = [of_vendor(spdp(A, INSIDE, 7410), vendor), spdp(C, INSIDE, 7409)]
     for datagram in reversed(said) if is_named_first else said:
         domain.heard_inside(datagram, INSIDE, NOW)
-    lease = domain.inside.by_prefix[C].leases[HostPort(INSIDE, 7410)]
-    assert domain.at_lease(lease.port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []
+    mapping = domain.inside.by_prefix[C].mappings[HostPort(INSIDE, 7410)]
+    assert domain.at_range_port(mapping.port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []
     domain.heard_inside(of_vendor(dispose_message(A), vendor), INSIDE, NOW)
-    assert domain.at_lease(lease.port, sedp(B, ROBOT, 7000), STRANGER, NOW)
+    assert domain.at_range_port(mapping.port, sedp(B, ROBOT, 7000), STRANGER, NOW)
 
 
 def test_the_end_of_one_participant_leaves_the_ports_of_another_read() -> None:
     """Several participants of a program of Cyclone DDS have the same ports."""
     domain = met()
     domain.heard_inside(of_vendor(spdp(C, INSIDE)), INSIDE, NOW)
-    port = domain.inside.by_prefix[C].leases[HostPort(INSIDE, 7411)].port
+    port = domain.inside.by_prefix[C].mappings[HostPort(INSIDE, 7411)].port
     domain.heard_inside(of_vendor(dispose_message(A)), INSIDE, NOW)
-    assert domain.at_lease(port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []
+    assert domain.at_range_port(port, sedp(B, ROBOT, 7000), STRANGER, NOW) == []

@@ -12,7 +12,7 @@ from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.ports.locator_ports import MOST_SHARING, STAND_INS, order_for
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 from tests.unit.ros2.discovery import domains
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -45,27 +45,27 @@ def both_ways() -> Domain:
     return domain
 
 
-def stand_in(domain: Domain, kind: LeaseKind) -> int:
-    (lease,) = [
-        lease for lease in domain.outside.by_prefix[B].leases.values() if lease.kind is kind
+def stand_in(domain: Domain, kind: TrafficKind) -> int:
+    (mapping,) = [
+        mapping for mapping in domain.outside.by_prefix[B].mappings.values() if mapping.kind is kind
     ]
-    return lease.port
+    return mapping.port
 
 
 def test_inside_is_told_of_stand_ins_alone() -> None:
     domain = both_ways()
     (told,) = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     meta, user = reached_at(told)
-    assert meta == HostPort(NEAR, stand_in(domain, LeaseKind.METATRAFFIC))
-    assert user == HostPort(NEAR, stand_in(domain, LeaseKind.DATA))
+    assert meta == HostPort(NEAR, stand_in(domain, TrafficKind.METATRAFFIC))
+    assert user == HostPort(NEAR, stand_in(domain, TrafficKind.USER_DATA))
 
 
 def test_locators_of_readers_and_writers_get_one_too() -> None:
     domain = both_ways()
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
-    (sent,) = domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    (sent,) = domain.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     (locator,) = reached_at(sent.datagram)
     assert locator.host == NEAR
     (passed,) = domain.at_stand_in(locator.port, USER, INSIDE, NOW)
@@ -74,9 +74,9 @@ def test_locators_of_readers_and_writers_get_one_too() -> None:
 
 def test_what_inside_sends_goes_on_as_it_is() -> None:
     domain = both_ways()
-    (sent,) = domain.at_stand_in(stand_in(domain, LeaseKind.DATA), USER, INSIDE, NOW)
+    (sent,) = domain.at_stand_in(stand_in(domain, TrafficKind.USER_DATA), USER, INSIDE, NOW)
     assert (sent.target, sent.datagram) == (HostPort(ROBOT, 7411), USER)
-    assert domain.at_stand_in(stand_in(domain, LeaseKind.DATA), USER, OTHER, NOW) == []
+    assert domain.at_stand_in(stand_in(domain, TrafficKind.USER_DATA), USER, OTHER, NOW) == []
 
 
 def test_no_locator_leads_to_another_host() -> None:
@@ -85,18 +85,20 @@ def test_no_locator_leads_to_another_host() -> None:
     datagram = spdp(B, ROBOT).replace(bytes([10, 0, 0, 9]), bytes([10, 0, 0, 8]))
     domain.heard_outside(datagram, ROBOT, NOW)
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (sent,) = domain.at_lease(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
+    (sent,) = domain.at_range_port(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
     assert reached_at(sent.datagram) == []
 
 
 def test_after_a_restart_the_observer_learns_which_ones_there_are() -> None:
     before = both_ways()
     after = both_ways()
-    (port,) = [p for p, (_, lease) in before.inside.leases.items() if lease.target.port == 7410]
-    before.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    (port,) = [
+        p for p, (_, mapping) in before.inside.mappings.items() if mapping.target.port == 7410
+    ]
+    before.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     after.heard_outside(sedp(B, ROBOT, 7000, to=after.own.observer.prefix), ROBOT, NOW)
     assert after.outside.stand_ins.keys() == before.outside.stand_ins.keys()
     (endpoint,) = after.outside.by_prefix[B].endpoints.values()
@@ -111,7 +113,7 @@ def test_ports_are_given_back() -> None:
 
 def test_a_port_that_is_taken_is_left_alone() -> None:
     domain = both_ways()
-    port = stand_in(domain, LeaseKind.DATA)
+    port = stand_in(domain, TrafficKind.USER_DATA)
     domain.outside.block(port)
     (told,) = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     _, user = reached_at(told)
@@ -181,7 +183,7 @@ def test_who_is_not_named_has_not_been_met(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:
     """Where there were no more sockets, the ports of that moment were never used again."""
     domain = both_ways()
-    port = stand_in(domain, LeaseKind.DATA)
+    port = stand_in(domain, TrafficKind.USER_DATA)
     domain.outside.block(port, for_good=False)
     assert port not in domain.outside.stand_ins
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)

@@ -11,7 +11,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import outside_participants
 from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
-from rosproxy.ros2.domain_settings import MOST_LEASES, MOST_PER_ADDRESS, Outgoing
+from rosproxy.ros2.domain_settings import MOST_MAPPINGS, MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.ports.locator_ports import SETTLING
 from rosproxy.ros2.protocol.addressing import destination, destinations
@@ -19,7 +19,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import source_prefix, source_vendor
-from rosproxy.ros2.registry.participants import LeaseKind, ShortageKind
+from rosproxy.ros2.registry.participants import ShortageKind, TrafficKind
 from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
 from rosproxy.ros2.sources.rates import BURST, STEP, cost
 from tests.unit.ros2.discovery.domains import (
@@ -67,9 +67,12 @@ def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
     assert told == carried
     meta, user = reached_at(told)
     assert {meta.host, user.host} == {HOST}
-    leases = {lease.target.port: lease for _, lease in domain.inside.leases.values()}
-    assert (meta.port - 1000, user.port - 1000) == (leases[7410].port, leases[7411].port)
-    assert [leases[7410].kind, leases[7411].kind] == [LeaseKind.METATRAFFIC, LeaseKind.DATA]
+    mappings = {mapping.target.port: mapping for _, mapping in domain.inside.mappings.values()}
+    assert (meta.port - 1000, user.port - 1000) == (mappings[7410].port, mappings[7411].port)
+    assert [mappings[7410].kind, mappings[7411].kind] == [
+        TrafficKind.METATRAFFIC,
+        TrafficKind.USER_DATA,
+    ]
 
 
 def test_participants_that_share_a_datagram_are_all_taken_in() -> None:
@@ -128,13 +131,13 @@ def test_a_participant_at_two_networks_is_served_at_the_first() -> None:
     domain = make_domain()
     meet(domain)
     assert domain.heard_inside(spdp(A, OTHER), OTHER, NOW) == []
-    assert {lease.target.host for _, lease in domain.inside.leases.values()} == {INSIDE}
+    assert {mapping.target.host for _, mapping in domain.inside.mappings.values()} == {INSIDE}
 
 
 def test_nobody_gets_a_way_to_somebody_elses_address() -> None:
     domain = make_domain()
     sent = domain.heard_inside(spdp(A, OTHER), INSIDE, NOW)
-    assert not domain.inside.leases
+    assert not domain.inside.mappings
     assert reached_at(to(sent, ROBOT)[0]) == []
 
 
@@ -142,10 +145,10 @@ def test_what_outside_sends_goes_to_the_locator() -> None:
     domain = make_domain()
     meet(domain)
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7411
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7411
     ]
     datagram = message(submessage(0x07, 0, bytes(28)), prefix=B)
-    assert domain.at_lease(port, datagram, STRANGER, NOW) == [
+    assert domain.at_range_port(port, datagram, STRANGER, NOW) == [
         Outgoing(HostPort(INSIDE, 7411), datagram)
     ]
 
@@ -154,9 +157,9 @@ def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
     domain = make_domain()
     meet(domain)
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
-    (sent,) = domain.at_lease(port, spdp(B, ROBOT), ROBOT, NOW)
+    (sent,) = domain.at_range_port(port, spdp(B, ROBOT), ROBOT, NOW)
     assert sent.target == HostPort(INSIDE, 7410)
     meta, user = reached_at(sent.datagram)
     (stand_in,) = domain.outside.stand_ins
@@ -178,9 +181,9 @@ def test_loopback_is_for_those_on_this_machine(near: str, robot: str, told: list
     meet(domain)
     domain.heard_outside(spdp(B, robot), robot, NOW)
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
-    (sent,) = domain.at_lease(port, sedp(B, "127.0.1.10", 7000), robot, NOW)
+    (sent,) = domain.at_range_port(port, sedp(B, "127.0.1.10", 7000), robot, NOW)
     assert reached_at(sent.datagram) == told
 
 
@@ -201,7 +204,7 @@ def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
     assert {reminder.target for reminder in reminders} == {HostPort(INSIDE, 7410)}
     (locator,) = reached_at(sent.datagram)
     assert locator.host == HOST
-    assert domain.inside.leases[locator.port - 1000][1].target.port == 7000
+    assert domain.inside.mappings[locator.port - 1000][1].target.port == 7000
     (endpoint,) = domain.inside.by_prefix[A].endpoints.values()
     assert (endpoint.topic, endpoint.type_name) == ("rt/chatter", "Str")
 
@@ -210,9 +213,9 @@ def test_a_stranger_is_not_answered() -> None:
     domain = make_domain()
     meet(domain)
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
-    assert domain.at_lease(port, spdp(B, STRANGER), STRANGER, NOW) == []
+    assert domain.at_range_port(port, spdp(B, STRANGER), STRANGER, NOW) == []
     assert domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
     assert not domain.outside.by_prefix
 
@@ -228,13 +231,13 @@ def test_nobody_takes_the_prefix_of_another() -> None:
     domain = make_domain()
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    before = dict(domain.inside.leases)
+    before = dict(domain.inside.mappings)
     assert domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW) == []
     assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
     assert domain.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
     assert domain.heard_inside(dispose_message(A), OTHER, NOW) == []
     assert domain.heard_outside(carried(STRANGER, dispose_message(B)), LAN_RELAY.host, NOW) == []
-    assert domain.inside.leases == before
+    assert domain.inside.mappings == before
     assert domain.outside.by_prefix.keys() == {B}
 
 
@@ -250,9 +253,9 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
             sent += len(outgoing.datagram) if outgoing.target.host == ROBOT else 0
     assert 0 < sent <= len(heard)
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
-    domain.at_lease(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
+    domain.at_range_port(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
     assert domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
 
 
@@ -272,7 +275,7 @@ def test_a_range_that_is_too_short_is_told() -> None:
         address = f"172.30.0.{number}"
         prove(domain, address, prefixes=[prefix])
         domain.heard_inside(spdp(prefix, address), address, NOW)
-    assert len(domain.inside.leases) == 15  # of sixteen, one is for discovery
+    assert len(domain.inside.mappings) == 15  # of sixteen, one is for discovery
     shortages = domain.inside.port_shortages.values()
     assert all("got no port: no port of" in shortage.text for shortage in shortages)
     assert {shortage.kind for shortage in shortages} == {ShortageKind.RANGE}
@@ -287,7 +290,7 @@ def test_who_has_gone_gives_everything_back() -> None:
     domain.expire(NOW + 21)
     assert not domain.inside.by_prefix
     assert not domain.outside.by_prefix
-    assert not domain.inside.leases
+    assert not domain.inside.mappings
     assert not domain.outside.stand_ins
     assert domain.ports.pool.free == free + 2
     meet(domain)
@@ -301,9 +304,9 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
     told, *asked = domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     assert {told.target, *(out.target for out in asked)} == {HostPort(INSIDE, 7410)}
     assert len(to(settle(domain, 0.5), INSIDE)) == 2  # asked again
-    assert not domain.inside.leases
+    assert not domain.inside.mappings
     assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
-    assert domain.inside.leases
+    assert domain.inside.mappings
 
 
 def test_a_participant_says_which_ports_it_had() -> None:
@@ -314,7 +317,7 @@ def test_a_participant_says_which_ports_it_had() -> None:
     assert not domain.own.port_store.prefixes  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)
     settle(domain, SETTLING)
-    ports = {lease.target.port: port for port, (_, lease) in domain.inside.leases.items()}
+    ports = {mapping.target.port: port for port, (_, mapping) in domain.inside.mappings.items()}
     assert ports == {7410: 45009, 7411: 45004}
 
 
@@ -323,12 +326,15 @@ def test_what_a_peer_says_of_a_port_counts_more_than_what_others_do() -> None:
     outsider = bytes([1, 15, *range(10, 20)])
     for prefix, source in ((A, ROBOT), (B, STRANGER)):
         for port in (45002, 45005):
-            domain.at_lease(port, sedp(outsider, ROBOT, 7410, to=prefix), source, 0.1)
+            domain.at_range_port(port, sedp(outsider, ROBOT, 7410, to=prefix), source, 0.1)
     domain.heard_inside(spdp(B, INSIDE), INSIDE, 0.2)
     domain.heard_inside(spdp(A, OTHER), OTHER, 0.3)
     settle(domain, SETTLING + ANSWER_TIME)
-    ports = {participant.prefix: port for port, (participant, lease) in domain.inside.leases.items()
-             if lease.kind is LeaseKind.METATRAFFIC}  # fmt: skip
+    ports = {
+        participant.prefix: port
+        for port, (participant, mapping) in domain.inside.mappings.items()
+        if mapping.kind is TrafficKind.METATRAFFIC
+    }
     assert ports[A] in {45002, 45005}
     assert ports[B] not in {45002, 45005}
 
@@ -394,7 +400,7 @@ def test_nothing_that_is_sent_breaks_it(start: bytes, rest: bytes, source: str) 
     domain.heard_outside(datagram, source, NOW)
     domain.at_stand_in(stand_in, datagram, source, NOW)
     for port in range(45000, 45016):
-        domain.at_lease(port, datagram, source, NOW)
+        domain.at_range_port(port, datagram, source, NOW)
     domain.expire(NOW)
     assert domain.inside.by_prefix.keys() >= {A}
 
@@ -572,7 +578,7 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     assert [source_prefix(datagram) for datagram in to(met, OTHER)] == [B]
 
 
-@pytest.mark.parametrize("count", [1, MOST_LEASES])
+@pytest.mark.parametrize("count", [1, MOST_MAPPINGS])
 def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -> None:
     """Others were announced in its name, before it announced itself again after a start.
 
@@ -592,8 +598,8 @@ def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -
     assert read_discovery(ended).announcements[0].ended
     (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     ports = {RANGE.listen.first + p.port - RANGE.advertise.first for p in reached_at(again)}
-    assert {domain.inside.leases[port][1].target.port for port in ports} == {7410, 7411}
-    assert len(domain.inside.leases) <= MOST_LEASES
+    assert {domain.inside.mappings[port][1].target.port for port in ports} == {7410, 7411}
+    assert len(domain.inside.mappings) <= MOST_MAPPINGS
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 3)
     assert not domain.inside.by_prefix[A].is_apart
 

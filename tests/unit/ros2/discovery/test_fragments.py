@@ -18,7 +18,7 @@ from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, 
 from tests.unit.ros2.protocol.messages import PREFIX, data, fragment, message, payload, submessage
 
 LOCATOR = HostPort("172.30.0.5", 7411)
-LEASED = HostPort("10.0.0.1", 45001)
+MAPPED = HostPort("10.0.0.1", 45001)
 PORT = 45000
 READER = b"reader's pre"
 HEARTBEAT = submessage(0x07, 0, bytes(28))
@@ -45,11 +45,11 @@ def cut(whole: bytes, size: int, sequence: int = 1) -> list[bytes]:
 
 
 def led(told: DiscoveryMessage) -> bytes:
-    return rewritten(told, lambda pid, locator: LEASED, lambda _: False)
+    return rewritten(told, lambda pid, locator: MAPPED, lambda _: False)
 
 
 def hidden(told: DiscoveryMessage) -> bytes:
-    return rewritten(told, lambda pid, locator: LEASED, lambda _: True)
+    return rewritten(told, lambda pid, locator: MAPPED, lambda _: True)
 
 
 def through(

@@ -42,7 +42,7 @@ def denying() -> Domain:
 
 
 def metatraffic(domain: Domain) -> int:
-    (port,) = [port for port, (_, le) in domain.inside.leases.items() if le.target.port == 7410]
+    (port,) = [port for port, (_, le) in domain.inside.mappings.items() if le.target.port == 7410]
     return port
 
 
@@ -50,7 +50,7 @@ def crossing(domain: Domain, submessages: bytes) -> Iterator[list[Outgoing]]:
     """What goes on of a message from inside, and of one from outside."""
     (stand_in,) = domain.outside.stand_ins
     yield domain.at_stand_in(stand_in, message(submessages, prefix=A), INSIDE, NOW)
-    yield domain.at_lease(metatraffic(domain), message(submessages, prefix=B), ROBOT, NOW)
+    yield domain.at_range_port(metatraffic(domain), message(submessages, prefix=B), ROBOT, NOW)
 
 
 def announced(parameters: bytes, little: bool = True) -> bytes:

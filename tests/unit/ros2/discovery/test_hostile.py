@@ -107,14 +107,14 @@ def test_fragments_behind_an_announcement_are_not_passed_unread(count: int) -> N
     domain = make_domain(judge=lambda *_: False)
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (lease, *_) = domain.inside.by_prefix[A].leases.values()
+    (mapping, *_) = domain.inside.by_prefix[A].mappings.values()
     sent = domain.heard_inside(spdp(A, INSIDE) + behind, INSIDE, NOW)
     sent += domain.heard_inside(dispose_message(A) + behind, INSIDE, NOW)
     sent += domain.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW)
     sent += domain.heard_outside(
         carried(STRANGER, spdp(EVIL, STRANGER) + behind), LAN_RELAY.host, NOW
     )
-    sent += domain.at_lease(lease.port, spdp(B, ROBOT) + behind, ROBOT, NOW)
+    sent += domain.at_range_port(mapping.port, spdp(B, ROBOT) + behind, ROBOT, NOW)
     assert domain.refused.count == 5
     sent += domain.heard_outside(dispose_message(B) + behind, ROBOT, NOW)
     sent += meet(domain, EVIL, OTHER)
@@ -163,19 +163,21 @@ def test_what_is_split_is_not_multiplied() -> None:
     assert sum(len(out.datagram) for out in sent) <= 1.5 * len(datagram)
 
 
-@pytest.mark.parametrize("is_at_lease", [False, True])
+@pytest.mark.parametrize("is_at_range_port", [False, True])
 @pytest.mark.parametrize("size", [12, 9000])
-def test_an_unproven_participant_has_no_credit_for_copies(is_at_lease: bool, size: int) -> None:
+def test_an_unproven_participant_has_no_credit_for_copies(
+    is_at_range_port: bool, size: int
+) -> None:
     """What a message became when it was split counted as received: a victim was sent 30 times what
     came in its name."""
     domain = make_domain(peers=[])
     domain.heard_outside(carried(STRANGER, spdp(B, STRANGER)), LAN_RELAY.host, NOW)
     meet(domain)
-    (port, *_) = domain.inside.leases
+    (port, *_) = domain.inside.mappings
     info_dst = submessage(0x0E, 0, bytes([7]) * size)
     datagram = shared_message([B] * 100, info_dst, to_each=heartbeat(1, 0))
-    if is_at_lease:
-        domain.at_lease(port, datagram, STRANGER, NOW)
+    if is_at_range_port:
+        domain.at_range_port(port, datagram, STRANGER, NOW)
     else:
         domain.heard_outside(datagram, STRANGER, NOW)
     assert len(datagram) < domain.outside.by_prefix[B].credit
@@ -215,23 +217,23 @@ def test_one_address_leaves_ports_for_others() -> None:
     assert domain.ports.pool.free == 1  # of 16 the first is the proxy's own, and two are for others
     assert "as many" in domain.inside.port_shortages[prefixes[-1]].text
     meet(domain, B, OTHER)
-    assert len(domain.inside.by_prefix[B].leases) == 1
+    assert len(domain.inside.by_prefix[B].mappings) == 1
 
 
 def test_no_port_of_the_range_leads_to_the_range() -> None:
     """A datagram there never ended: a process on the proxy's own machine could do that."""
     domain = make_domain()
     domain.heard_inside(spdp(A, NEAR, RANGE.listen.first + 2), NEAR, NOW)
-    assert not domain.inside.leases
+    assert not domain.inside.mappings
     domain.heard_inside(spdp(B, NEAR, 7410), NEAR, NOW)
-    assert len(domain.inside.leases) == 2
+    assert len(domain.inside.mappings) == 2
 
 
 def test_users_data_of_before_a_restart_is_not_charged() -> None:
     domain = make_domain()
     user = message(submessage(0x07, 0, bytes(28)), prefix=B)
     for _ in range(int(BURST) + 5):
-        domain.at_lease(45007, user, ROBOT, 0.5)
+        domain.at_range_port(45007, user, ROBOT, 0.5)
     assert domain.heard_outside(spdp(B, ROBOT), ROBOT, 0.6)
     assert B in domain.outside.by_prefix
 
@@ -373,7 +375,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
     domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
     domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), LAN_RELAY.host, NOW)
-    assert (domain.refused.count, domain.inside.leases) == (3, {})
+    assert (domain.refused.count, domain.inside.mappings) == (3, {})
     assert EVIL not in {*domain.inside.by_prefix, *domain.outside.by_prefix}
     meet(domain, A, OTHER)
     assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), OTHER)
@@ -394,7 +396,7 @@ def test_who_can_not_be_rewritten_is_not_taken_in(monkeypatch: pytest.MonkeyPatc
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
     domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
     assert not domain.inside.by_prefix
-    assert not domain.inside.leases
+    assert not domain.inside.mappings
     assert not domain.outside.by_prefix
     assert meet(domain)
     assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
@@ -450,7 +452,7 @@ def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(
 
     monkeypatch.setattr(InsideParticipants, "exported", lambda _, *rest: refusing(*rest))
     assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
-    assert domain.inside.by_prefix[A].leases
+    assert domain.inside.by_prefix[A].mappings
 
 
 def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -459,6 +461,6 @@ def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     meet(domain)
     monkeypatch.setattr(discovery_domain, "read_messages", None)
     domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
-    for port in domain.inside.leases:
-        domain.at_lease(port, message(prefix=B), STRANGER, NOW)
+    for port in domain.inside.mappings:
+        domain.at_range_port(port, message(prefix=B), STRANGER, NOW)
     assert STRANGER not in domain.rates._by_source

@@ -45,12 +45,14 @@ def met() -> Domain:
 def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     """What goes on of what A says inside, and B outside, by each way that there is."""
     (stand_in,) = domain.outside.stand_ins
-    (lease,) = [le for le in domain.inside.by_prefix[A].leases.values() if le.target.port == 7410]
+    (mapping,) = [
+        le for le in domain.inside.by_prefix[A].mappings.values() if le.target.port == 7410
+    ]
     inside = message(said, prefix=A)
     outside = message(said, prefix=B)
     yield domain.at_stand_in(stand_in, inside, INSIDE, NOW)
     yield domain.heard_inside(inside, INSIDE, NOW)
-    yield domain.at_lease(lease.port, outside, ROBOT, NOW)
+    yield domain.at_range_port(mapping.port, outside, ROBOT, NOW)
     yield domain.heard_outside(outside, ROBOT, NOW)
     yield domain.heard_outside(carried(ROBOT, outside), LAN_RELAY.host, NOW)
 
@@ -67,12 +69,14 @@ def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> N
         "witness": port_store.witness,
     }
     prefix = own[whose]
-    (port,) = [p for p, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410]
+    (port,) = [
+        p for p, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+    ]
     sent = list[Outgoing]()
     for said in (spdp(prefix, ROBOT), dispose_message(prefix)):
         sent += domain.heard_outside(said, ROBOT, NOW)
         sent += domain.heard_outside(carried(ROBOT, said), LAN_RELAY.host, NOW)
-        sent += domain.at_lease(port, said, ROBOT, NOW)
+        sent += domain.at_range_port(port, said, ROBOT, NOW)
     for said in (spdp(prefix, OTHER), dispose_message(prefix)):
         sent += domain.heard_inside(said, OTHER, NOW)
     assert prefix not in {source_prefix(datagram) for datagram in to(sent, INSIDE)}

@@ -11,7 +11,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.relay_envelope import wrapped
 from rosproxy.ros2.protocol.relay_proof import WINDOW_S, Direction, RelayProof
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 from tests.unit.ros2.discovery.domains import (
     HOST,
     INSIDE,
@@ -182,7 +182,7 @@ def test_any_other_address_may_be_claimed(address: str, is_own: bool) -> None:
     meet(domain)
     sent = domain.heard_outside(carried(address, spdp(B, address, 7412)), LAN_RELAY.host, NOW)
     assert to(sent, INSIDE)
-    leads = {lease.target for lease in domain.outside.by_prefix[B].leases.values()}
+    leads = {mapping.target for mapping in domain.outside.by_prefix[B].mappings.values()}
     assert leads == {HostPort(address, 7412), HostPort(address, 7413)}
 
 
@@ -194,12 +194,12 @@ def by_peer(domain: Domain, host: str, port: int) -> None:
     domain.heard_outside(spdp(B, host, port), host, NOW)
 
 
-def at_a_lease(domain: Domain, host: str, port: int) -> None:
-    (lease, *_) = domain.inside.by_prefix[A].leases.values()
-    domain.at_lease(lease.port, spdp(B, host, port), host, NOW)
+def at_a_range_port(domain: Domain, host: str, port: int) -> None:
+    (mapping, *_) = domain.inside.by_prefix[A].mappings.values()
+    domain.at_range_port(mapping.port, spdp(B, host, port), host, NOW)
 
 
-@pytest.mark.parametrize("way", [by_relay, by_peer, at_a_lease])
+@pytest.mark.parametrize("way", [by_relay, by_peer, at_a_range_port])
 @pytest.mark.parametrize("port", [PUBLISHED, LISTEN, 7410, 20001])
 def test_no_stand_in_leads_to_a_port_of_the_proxy(
     way: Callable[[Domain, str, int], None], port: int
@@ -243,10 +243,12 @@ def test_other_locators_of_an_announcement_get_no_stand_in(host: str, port: int)
     if host == HOST:  # the first one for discovery at the claimed address is the one that counts
         datagram = message(data(payload(told[1:])), prefix=B)
     assert to(domain.heard_outside(carried(HOST, datagram), LAN_RELAY.host, NOW), INSIDE)
-    leads = {lease.target: lease.kind for lease in domain.outside.by_prefix[B].leases.values()}
+    leads = {
+        mapping.target: mapping.kind for mapping in domain.outside.by_prefix[B].mappings.values()
+    }
     assert leads == {
-        HostPort(HOST, 7410): LeaseKind.METATRAFFIC,
-        HostPort(HOST, 7411): LeaseKind.DATA,
+        HostPort(HOST, 7410): TrafficKind.METATRAFFIC,
+        HostPort(HOST, 7411): TrafficKind.USER_DATA,
     }
 
 

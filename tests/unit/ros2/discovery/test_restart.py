@@ -192,7 +192,7 @@ def test_a_peer_decides_between_two_words() -> None:
     come(domain, B, OTHER, NUMBER, 0.1)
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
-        domain.at_lease(port, sedp(C, ROBOT, 7410, to=A), ROBOT, 0.5)
+        domain.at_range_port(port, sedp(C, ROBOT, 7410, to=A), ROBOT, 0.5)
     settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
     assert not {*ports_of(domain, B)} & {*PORTS}
@@ -206,7 +206,7 @@ def test_a_forged_name_at_a_port_decides_nothing(source: str) -> None:
     come(domain, B, OTHER, NUMBER, 0.1)
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
-        domain.at_lease(port, sedp(C, source, 7410, to=B), source, 0.5)
+        domain.at_range_port(port, sedp(C, source, 7410, to=B), source, 0.5)
     settle(domain, SETTLING)
     assert not {*ports_of(domain, B)} & {*PORTS}
 
@@ -217,8 +217,8 @@ def test_an_address_that_receives_decides_between_two_words() -> None:
     come(domain, B, OTHER, NUMBER, 0.1)
     come(domain, A, INSIDE, NUMBER, 0.1)
     for port in PORTS:
-        domain.at_lease(port, sedp(C, LAPTOP, 7410, to=A), LAPTOP, 0.5)
-        domain.at_lease(port, sedp(C, "10.0.0.66", 7410, to=B), "10.0.0.66", 0.5)
+        domain.at_range_port(port, sedp(C, LAPTOP, 7410, to=A), LAPTOP, 0.5)
+        domain.at_range_port(port, sedp(C, "10.0.0.66", 7410, to=B), "10.0.0.66", 0.5)
     settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
 
@@ -324,7 +324,7 @@ def test_a_proof_of_before_the_start_beats_peers_and_proven_addresses(
 
 def test_what_a_peer_sends_to_a_participant_tells_that_it_was_inside() -> None:
     domain = restarted(key=b"")
-    domain.at_lease(PORTS[0], sedp(C, ROBOT, 7410, to=A), ROBOT, 0.1)
+    domain.at_range_port(PORTS[0], sedp(C, ROBOT, 7410, to=A), ROBOT, 0.1)
     announce_from(domain, A, ROBOT, 0.2)
     come(domain, A, INSIDE, 1, 0.3)
     settle(domain, SETTLING)

@@ -10,7 +10,7 @@ from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.addressing import MOST_OF_USERS, may_be_discovery
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 from rosproxy.ros2.sources.rates import BURST, STEP
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
@@ -59,9 +59,9 @@ def shared() -> tuple[Domain, int, int]:
     domain = make_domain(both_ways=True)
     domain.heard_inside(message(announcement(A, INSIDE), prefix=A), INSIDE, NOW)
     domain.heard_outside(message(announcement(B, ROBOT), prefix=B), ROBOT, NOW)
-    (port,) = domain.inside.leases
+    (port,) = domain.inside.mappings
     (stand_in,) = domain.outside.stand_ins
-    assert domain.inside.leases[port][1].kind is LeaseKind.METATRAFFIC
+    assert domain.inside.mappings[port][1].kind is TrafficKind.METATRAFFIC
     return domain, port, stand_in
 
 
@@ -72,7 +72,7 @@ def test_what_users_send_takes_nothing_of_the_allowance_of_discovery() -> None:
     inwards = message(TIME, TO_A, SAID, prefix=B)
     outwards = message(TIME, SAID, prefix=A)
     for _ in range(40_000):
-        assert domain.at_lease(port, inwards, ROBOT, NOW) == [
+        assert domain.at_range_port(port, inwards, ROBOT, NOW) == [
             Outgoing(HostPort(INSIDE, 7410), inwards)
         ]
         assert domain.at_stand_in(stand_in, outwards, INSIDE, NOW) == [
@@ -93,7 +93,7 @@ def test_discovery_behind_what_users_send_is_read_and_charged(in_front: bytes) -
         inwards = message(in_front, kind(B, ROBOT, 7000)[20:], prefix=B)
         for sent in (
             domain.at_stand_in(stand_in, outwards, INSIDE, NOW),
-            domain.at_lease(port, inwards, ROBOT, NOW),
+            domain.at_range_port(port, inwards, ROBOT, NOW),
         ):
             assert len(sent[-1].datagram) in (len(outwards), len(inwards))
             assert sent[-1].datagram not in (outwards, inwards)  # its locators lead elsewhere
@@ -106,14 +106,14 @@ def test_what_users_send_passes_where_discovery_is_used_up() -> None:
     domain.rates.charge(INSIDE, int(BURST))
     domain.rates.charge(ROBOT, int(BURST))
     hidden = message(SAID, spdp(B, ROBOT)[20:], prefix=B)
-    assert domain.at_lease(port, message(SAID, prefix=B), ROBOT, NOW)
+    assert domain.at_range_port(port, message(SAID, prefix=B), ROBOT, NOW)
     assert domain.at_stand_in(stand_in, message(SAID, prefix=A), INSIDE, NOW)
-    assert domain.at_lease(port, hidden, ROBOT, NOW) == []
+    assert domain.at_range_port(port, hidden, ROBOT, NOW) == []
 
 
 def test_strangers_are_not_passed_on_there() -> None:
     domain, port, stand_in = shared()
-    assert domain.at_lease(port, message(SAID, prefix=B), STRANGER, NOW) == []
+    assert domain.at_range_port(port, message(SAID, prefix=B), STRANGER, NOW) == []
     assert domain.at_stand_in(stand_in, message(SAID, prefix=A), OTHER, NOW) == []
 
 

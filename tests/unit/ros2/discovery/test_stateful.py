@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery import fragments
-from rosproxy.ros2.domain_settings import MOST_LEASES, Outgoing
+from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
 from rosproxy.ros2.ports.locator_ports import MOST_SHARING, STAND_INS
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
@@ -140,12 +140,12 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(datagram=datagrams(), source=ADDRESS, port=st.integers(45001, 45015))
     def a_port_gets_something(self, datagram: bytes, source: str, port: int) -> None:
-        leased = self.domain.inside.leases.get(port)
+        mapped = self.domain.inside.mappings.get(port)
         self.came[source] += len(datagram)
-        sent = self.domain.at_lease(port, datagram, source, self.now)
-        target = leased[1].target if leased else None
+        sent = self.domain.at_range_port(port, datagram, source, self.now)
+        target = mapped[1].target if mapped else None
         assert {out.target for out in sent} <= {target}
-        assert not leased or len(sent) <= 1 or leased[0].prefix in self.domain.inside.by_prefix
+        assert not mapped or len(sent) <= 1 or mapped[0].prefix in self.domain.inside.by_prefix
 
     @rule(datagram=datagrams(), source=ADDRESS, index=st.integers(0, 9))
     def a_stand_in_gets_something(self, datagram: bytes, source: str, index: int) -> None:
@@ -242,20 +242,20 @@ class Neighbours(RuleBasedStateMachine):
             assert host in waiting | set(NEAR_BY) or size <= factor * self.came[host]
 
     @invariant()
-    def leases_are_of_those_inside(self) -> None:
+    def mappings_are_of_those_inside(self) -> None:
         inside = self.domain.inside
         pool = self.domain.ports.pool
-        assert pool.free + len(inside.leases) + 1 == len(pool.range)
-        leases = [
-            lease
+        assert pool.free + len(inside.mappings) + 1 == len(pool.range)
+        mappings = [
+            mapping
             for participant in inside.by_prefix.values()
-            for lease in participant.leases.values()
+            for mapping in participant.mappings.values()
         ]
-        assert len(leases) == len(inside.leases)
-        for port, (participant, lease) in inside.leases.items():
+        assert len(mappings) == len(inside.mappings)
+        for port, (participant, mapping) in inside.mappings.items():
             assert inside.by_prefix[participant.prefix] is participant
-            assert participant.leases[lease.target] is lease
-            assert (lease.port, lease.target.host) == (port, participant.address)
+            assert participant.mappings[mapping.target] is mapping
+            assert (mapping.port, mapping.target.host) == (port, participant.address)
             assert not pool.is_free(port)
         assert inside.count_by_address == Counter(
             participant.address for participant in inside.by_prefix.values()
@@ -268,12 +268,12 @@ class Neighbours(RuleBasedStateMachine):
         for port, users in outside.stand_ins.items():
             assert port not in outside.blocked
             assert 0 < len(users) <= 2 * MOST_SHARING
-            for participant, lease in users:
+            for participant, mapping in users:
                 assert outside.by_prefix[participant.prefix] is participant
-                assert participant.leases[lease.target] is lease
-                assert (lease.port, lease.target.host) == (port, participant.address)
-        lease_count = sum(len(participant.leases) for participant in outside.by_prefix.values())
-        assert lease_count == sum(map(len, outside.stand_ins.values()))
+                assert participant.mappings[mapping.target] is mapping
+                assert (mapping.port, mapping.target.host) == (port, participant.address)
+        mapping_count = sum(len(participant.mappings) for participant in outside.by_prefix.values())
+        assert mapping_count == sum(map(len, outside.stand_ins.values()))
         assert outside.count_by_address == Counter(
             participant.address for participant in outside.by_prefix.values()
         )
@@ -285,7 +285,7 @@ class Neighbours(RuleBasedStateMachine):
         prefixes = domain.inside.by_prefix.keys() | domain.outside.by_prefix.keys()
         for side in (domain.inside, domain.outside):
             everybody = side.by_prefix.values()
-            assert all(len(participant.leases) <= MOST_LEASES for participant in everybody)
+            assert all(len(participant.mappings) <= MOST_MAPPINGS for participant in everybody)
             endpoints = [e for participant in everybody for e in participant.endpoints.values()]
             assert side.notes.size == sum(endpoint.size for endpoint in endpoints)
             assert side.notes.size == side.notes.size_by_address.total()

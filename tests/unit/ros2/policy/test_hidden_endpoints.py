@@ -61,9 +61,9 @@ def outwards(domain: Domain) -> list[Outgoing]:
 
 def inwards(domain: Domain) -> list[Outgoing]:
     (port,) = [
-        port for port, (_, lease) in domain.inside.leases.items() if lease.target.port == 7410
+        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
     ]
-    return domain.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    return domain.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
 
 
 def kinds(sent: list[Outgoing]) -> list[int]:
@@ -126,7 +126,7 @@ def test_the_proxy_itself_is_told_of_what_is_denied() -> None:
     told = sedp(A, INSIDE, 7000, to=domain.own.observer.prefix)
     domain.heard_inside(told, INSIDE, NOW)
     assert len(domain.inside.by_prefix[A].endpoints) == 1
-    assert HostPort(INSIDE, 7000) in domain.inside.by_prefix[A].leases
+    assert HostPort(INSIDE, 7000) in domain.inside.by_prefix[A].mappings
 
 
 def announced_topics(domain: Domain, prefix: bytes, names: Iterable[bytes]) -> None:

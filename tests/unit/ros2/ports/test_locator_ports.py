@@ -17,11 +17,11 @@ from rosproxy.ros2.ports.locator_ports import (
     order_for,
     stand_in_port,
 )
-from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.participants import TrafficKind
 
 RANGE = PortRange(45000, 45019)
-DATA = LeaseKind.DATA
-METATRAFFIC = LeaseKind.METATRAFFIC
+DATA = TrafficKind.USER_DATA
+METATRAFFIC = TrafficKind.METATRAFFIC
 OTHERS = NamedBy.OTHERS
 PROVEN = NamedBy.PROVEN
 PEER = NamedBy.PEER

@@ -68,11 +68,11 @@ def test_a_participant_announces_where_it_is_reached(little: bool) -> None:
 
 
 @BOTH
-def test_each_locator_leads_to_a_lease_and_what_can_not_be_led_is_gone(little: bool) -> None:
-    leases = {7412: 45000, 7413: 45001}
+def test_each_locator_leads_to_a_port_and_what_can_not_be_led_is_gone(little: bool) -> None:
+    mappings = {7412: 45000, 7413: 45001}
 
     def lead(pid: int, locator: HostPort) -> HostPort | None:
-        return HostPort(HOST, leases[locator.port]) if locator.host == INSIDE else None
+        return HostPort(HOST, mappings[locator.port]) if locator.host == INSIDE else None
 
     before = participant(little)
     after = rewritten(read_discovery(before), lead, nothing)

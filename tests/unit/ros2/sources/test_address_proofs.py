@@ -98,7 +98,7 @@ def answer(asked: bytes, prefix: bytes) -> bytes:
 
 
 def test_forged_sources_keep_nobody_from_being_met() -> None:
-    """1,200 announcements with leases of 300 s took all places for these 300 s."""
+    """1,200 announcements with lease durations of 300 s took all places for these 300 s."""
     domain = make_domain()
     meet(domain)
     forge(domain, 0, 1200)
@@ -125,12 +125,12 @@ def test_a_participant_that_is_not_introduced_reaches_nothing_inside() -> None:
     meet(domain)
     forge(domain, 0, MOST_INTRODUCED_UNPROVEN)
     hear(domain, B, LAPTOP)
-    (port, *_) = domain.inside.leases
+    (port, *_) = domain.inside.mappings
     for said in (spdp(B, LAPTOP), sedp(B, LAPTOP, 7411, to=A)):
-        assert to(domain.at_lease(port, said, LAPTOP, NOW), INSIDE) == []
-    assert not domain.outside.by_prefix[B].leases
+        assert to(domain.at_range_port(port, said, LAPTOP, NOW), INSIDE) == []
+    assert not domain.outside.by_prefix[B].mappings
     domain.heard_outside(sedp(B, LAPTOP, 7411, to=domain.own.observer.prefix), LAPTOP, NOW)
-    assert not domain.outside.by_prefix[B].leases
+    assert not domain.outside.by_prefix[B].mappings
     prove(domain, LAPTOP)
     assert domain.outside.prove(LAPTOP) == ([domain.outside.by_prefix[B]], [])
 
@@ -227,10 +227,10 @@ def test_a_participant_that_only_answers_is_sent_three_times_as_much() -> None:
     meet(domain)
     hear(domain, B, LAPTOP)
     outsider = domain.outside.by_prefix[B]
-    (port, *_) = domain.inside.leases
+    (port, *_) = domain.inside.mappings
     before = outsider.credit
     said = sedp(B, LAPTOP, 7411, to=A)
-    domain.at_lease(port, said, LAPTOP, NOW)
+    domain.at_range_port(port, said, LAPTOP, NOW)
     assert outsider.credit == before + ANSWERED_FACTOR * len(said)
     assert outsider.may_be_sent(outsider.credit)
     assert not outsider.may_be_sent(1)
@@ -256,7 +256,7 @@ def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
     (question,) = questions(asking.heard_outside(carried(HOST, padded), LAN_RELAY.host, NOW), HOST)
     if known:
         hear(asked, B, LAPTOP)
-    back = asked.at_lease(meta.port - 1000, question, LAPTOP, NOW)
+    back = asked.at_range_port(meta.port - 1000, question, LAPTOP, NOW)
     assert bool(back) is known
     for out in back:
         assert out.target == HostPort(LAPTOP, 46000)
@@ -278,7 +278,7 @@ def exchange(proxies: dict[str, Domain]) -> Counter[str]:
         host = out.target.host
         if host in proxies:
             listening = out.target.port - RANGE.advertised(RANGE.listen.first) + RANGE.listen.first
-            at = partial(proxies[host].at_lease, listening)
+            at = partial(proxies[host].at_range_port, listening)
             heard = at if listening > RANGE.listen.first else proxies[host].heard_outside
             sent += [(host, back) for back in heard(out.datagram, source, NOW)]
     return counts
@@ -319,7 +319,7 @@ def test_forged_sources_inside_keep_nobody_from_being_announced() -> None:
         domain.heard_inside(answer(question, A), INSIDE, NOW)
     told = settle(domain, NOW + ANSWER_TIME)
     assert A in {source_prefix(datagram) for datagram in to(told, ROBOT)}
-    assert len(domain.inside.by_prefix[A].leases) == 2
+    assert len(domain.inside.by_prefix[A].mappings) == 2
 
 
 def test_who_gives_its_place_up_inside_is_ended_outside() -> None:
@@ -527,7 +527,7 @@ def test_forged_participants_at_proven_addresses_take_three_quarters_of_the_rang
     assert domain.ports.pool.free == len(RANGE.listen) // PART_FOR_PROVEN
     answers_what_it_is_asked(domain, NOW)
     settle(domain, NOW + ANSWER_TIME)
-    assert len(domain.inside.by_prefix[A].leases) == 2
+    assert len(domain.inside.by_prefix[A].mappings) == 2
 
 
 def test_a_participant_that_never_answers_pushes_out_none_at_its_address() -> None:

@@ -16,7 +16,7 @@ from rosproxy.ros2.discovery.inside_participants import InsideParticipants
 
 
 @dataclass(eq=False, slots=True)
-class ForwardedLease:
+class ForwardedPort:
     """A port and the locator that it leads to, as `rosproxy.leases.fast_ports.LeaseHolder`.
 
     Nothing tells by itself whether a locator is answered. ``fast_peers`` stays empty: datagrams
@@ -53,8 +53,8 @@ class ForwardedLease:
         return [self.label]
 
 
-class DataLeases:
-    """The leases of user data of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
+class KernelPorts:
+    """The mappings of user data of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
 
     ``domains`` are the participants inside of each; ``pool`` are the ports of all.
     """
@@ -62,45 +62,45 @@ class DataLeases:
     def __init__(self, pool: PortPool) -> None:
         self.pool = pool
         self.domains: list[InsideParticipants] = []
-        self._former: dict[int, ForwardedLease] = {}
-        self._cached: dict[int, ForwardedLease] = {}
+        self._former: dict[int, ForwardedPort] = {}
+        self._cached: dict[int, ForwardedPort] = {}
         self._cached_changes = -1
 
     @property
-    def by_port(self) -> Mapping[int, ForwardedLease]:
+    def by_port(self) -> Mapping[int, ForwardedPort]:
         """All of them by their ports."""
         changes = sum(inside.changes for inside in self.domains)
         if changes != self._cached_changes:
             self._cached_changes = changes
-            self._cached = {lease.port: lease for lease in self._leases()}
-            lent_ports = {port for inside in self.domains for port in inside.leases}
+            self._cached = {mapping.port: mapping for mapping in self._mappings()}
+            lent_ports = {port for inside in self.domains for port in inside.mappings}
             for port in lent_ports & self._former.keys():
                 del self._former[port]
             self._cached |= self._former
         return self._cached
 
-    def __iter__(self) -> Iterator[ForwardedLease]:
+    def __iter__(self) -> Iterator[ForwardedPort]:
         """All of them."""
         return iter(list(self.by_port.values()))
 
     def note_former(self, forwards: Mapping[int, HostPort]) -> None:
         """Note what a former process had the kernel forward; with an empty mapping, forget it."""
         self._former = {
-            port: ForwardedLease(port, target, "a participant from before the start of the proxy")
+            port: ForwardedPort(port, target, "a participant from before the start of the proxy")
             for port, target in forwards.items()
         }
         self._cached_changes = -1  # none: all is looked at anew
 
-    def _leases(self) -> Iterator[ForwardedLease]:
-        """The leases that are lent, each the same object for as long as it leads to the same."""
+    def _mappings(self) -> Iterator[ForwardedPort]:
+        """The mappings that are lent, each the same object for as long as it leads to the same."""
         for inside in self.domains:
-            for port, (participant, lease) in inside.leases.items():
-                if lease.is_read:
+            for port, (participant, mapping) in inside.mappings.items():
+                if mapping.is_read:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
                 cached = self._cached.get(port)
-                # The kernel plane takes another object for another lease (`ForwardSyncer`).
-                if cached is not None and (cached.target, cached.label) == (lease.target, label):
+                # The kernel plane takes another object for another mapping (`ForwardSyncer`).
+                if cached is not None and (cached.target, cached.label) == (mapping.target, label):
                     yield cached
                 else:
-                    yield ForwardedLease(port, lease.target, label)
+                    yield ForwardedPort(port, mapping.target, label)
