@@ -28,9 +28,7 @@ Every datagram may be forged. So
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Self
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.fragments import FragmentStores
@@ -94,45 +92,34 @@ _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams that go on, and what goes back to where they came from."""
 
 
-@dataclass(slots=True)
 class Domain:
     """A domain: its participants, what the proxy knows of them, and what becomes of datagrams.
 
-    ``own`` are the proxy's own participants; ``passed`` counts bytes, by kind and whether inwards.
+    It starts without participants. ``own`` is the GUID prefix of the observer, which
+    is random. ``secret`` are random bytes, ``when`` is Unix time. ``passed`` counts bytes, by kind
+    and whether inwards.
     """
 
-    settings: DomainSettings
-    ports: LocatorPorts
-    own: OwnParticipants
-    inside: InsideParticipants
-    outside: OutsideParticipants
-    former_ports: FormerPorts
-    refused: Refused
-    fragments: FragmentStores
-    rediscovery: Rediscovery
-    proofs: AddressProofs
-    owners: PrefixOwners
-    rates: DiscoveryRates = field(default_factory=DiscoveryRates)
-    passed: Counter[tuple[TrafficKind, bool]] = field(default_factory=Counter)
-
-    @classmethod
-    def starting(
-        cls,
+    def __init__(
+        self,
         settings: DomainSettings,
         pool: PortPool,
         own: bytes,
         secret: bytes,
         now: float,
         when: float = 0.0,
-    ) -> Self:
-        """A domain without participants.
-
-        ``own`` is a random prefix, ``secret`` random bytes, ``when`` Unix time.
-        """
-        pool.claim(settings.discovery_port)  # where outside announces itself: nobody gets it
-        ports = LocatorPorts(pool, now)
-        refused = Refused(settings.note)
-        proofs = AddressProofs(secret)
+    ) -> None:
+        pool.claim(settings.discovery_port)  # where outside announces itself: no locator gets it
+        self.settings = settings
+        self.refused = refused = Refused(settings.note)
+        self.proofs = proofs = AddressProofs(secret)
+        self.rates = DiscoveryRates()
+        self.passed = Counter[tuple[TrafficKind, bool]]()
+        self.ports = LocatorPorts(pool, now)
+        verdicts = Verdicts(settings.judge)
+        self.inside = InsideParticipants(settings, self.ports, refused, proofs, verdicts)
+        self.outside = OutsideParticipants(settings, refused, proofs, verdicts)
+        settings.participants_at = self.outside.count_by_address.__getitem__
         port_store = PortStore.of(
             settings.host,
             settings.ports.listen,
@@ -140,27 +127,19 @@ class Domain:
             when - now,
             settings.port_store_key,
         )
-        verdicts = Verdicts(settings.judge)
-        inside = InsideParticipants(settings, ports, refused, proofs, verdicts)
-        outside = OutsideParticipants(settings, refused, proofs, verdicts)
-        settings.participants_at = outside.count_by_address.__getitem__
-        former_ports = FormerPorts(settings, ports, port_store, proofs)
-        fragments = FragmentStores()
-        participants = OwnParticipants(
-            settings, Observer(own), port_store, inside, outside, former_ports, fragments, proofs
-        )
-        return cls(
+        self.former_ports = FormerPorts(settings, self.ports, port_store, proofs)
+        self.owners = PrefixOwners(settings, self.inside, self.outside, self.former_ports, proofs)
+        self.rediscovery = Rediscovery(settings, self.inside, self.outside)
+        self.fragments = FragmentStores()
+        self.own = OwnParticipants(
             settings,
-            ports,
-            participants,
-            inside,
-            outside,
-            former_ports,
-            refused,
-            fragments,
-            Rediscovery(settings, inside, outside),
+            Observer(own),
+            port_store,
+            self.inside,
+            self.outside,
+            self.former_ports,
+            self.fragments,
             proofs,
-            PrefixOwners(settings, inside, outside, former_ports, proofs),
         )
 
     @property

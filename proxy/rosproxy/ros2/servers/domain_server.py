@@ -81,9 +81,7 @@ class DomainServer:
         pool = PortPool(settings.ports.listen)
         # A new prefix for each process: only to an observer that they don't know yet participants
         # announce themselves at once, and send what they had told the former one.
-        self.domain = Domain.starting(
-            settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time()
-        )
+        self.domain = Domain(settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time())
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
         self._sockets: list[socket.socket] = []

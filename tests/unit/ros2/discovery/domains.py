@@ -64,7 +64,7 @@ def make_domain(
         relay=LanRelayLink(lan_relay, PROOF) if lan_relay else None,
         port_store_key=port_store_key,
     )
-    return Domain.starting(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
+    return Domain(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
 
 
 def spdp(
