@@ -36,8 +36,8 @@ from rosproxy.net.interfaces import (
     interface_networks,
 )
 from rosproxy.net.resolver import resolve
+from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL
 from rosproxy.ros2.discovery.kernel_ports import KernelPorts
-from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.domain_watch import DomainWatch
@@ -107,7 +107,7 @@ class Ros2:
         tasks.repeat(self._look_at_policy, POLICY_INTERVAL, "applying the policy")
         for server in self.servers:
             tasks.repeat(server.expire, EXPIRY_INTERVAL, "ending participants")
-            tasks.repeat(server.observe, ANNOUNCE_INTERVAL, "observing participants")
+            tasks.repeat(server.announce, ANNOUNCE_INTERVAL, "announcing the proxy")
         tasks.repeat(self._refresh, REFRESH_INTERVAL, "checking networks and peers")
         tasks.repeat(self._watch.look, REFRESH_INTERVAL, "checking connections of participants")
         tasks.repeat(self._sample_rates, RATE_INTERVAL, "sampling rates")

@@ -228,7 +228,7 @@ async def test_secrets_that_differ_are_told(
             return "relay_proof" in boundary.reasons
 
         def relay_refuses() -> bool:
-            server._send(server.domain.own.announced_outside())
+            server._send(server.domain.proxy_participants.announced_outside())
             return bool(caplog.records)
 
         await until(proxy_refuses, "the proxy refuses what the relay carries")
@@ -272,7 +272,7 @@ async def test_the_relay_is_told_which_addresses_are_proven(boundary: Boundary) 
     proofs = server.domain.proofs
     for address in (INSIDE, LAPTOP):
         proofs._until[address] = float("inf")
-    await server.observe()
+    await server.announce()
 
     def standing(address: str) -> Standing:
         return relay._sources.standing(address, asyncio.get_running_loop().time())

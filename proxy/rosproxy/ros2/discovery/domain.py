@@ -31,12 +31,12 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 
 from rosproxy.leases.ports import PortPool
+from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.discovery.own_participants import OwnParticipants
 from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
+from rosproxy.ros2.discovery.proxy_participants import ProxyParticipants
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.domain_settings import (
     DomainSettings,
@@ -95,7 +95,7 @@ _Passing = tuple[list[bytes], list[Outgoing]]
 class Domain:
     """A domain: its participants, what the proxy knows of them, and what becomes of datagrams.
 
-    It starts without participants. ``own`` is the GUID prefix of the observer, which
+    It starts without participants. ``own`` is the GUID prefix of the discovery participant, which
     is random. ``secret`` are random bytes, ``when`` is Unix time. ``passed`` counts bytes, by kind
     and whether inwards.
     """
@@ -131,9 +131,9 @@ class Domain:
         self.owners = PrefixOwners(settings, self.inside, self.outside, self.former_ports, proofs)
         self.rediscovery = Rediscovery(settings, self.inside, self.outside)
         self.fragments = FragmentStores()
-        self.own = OwnParticipants(
+        self.proxy_participants = ProxyParticipants(
             settings,
-            Observer(own),
+            DiscoveryParticipant(own),
             port_store,
             self.inside,
             self.outside,
@@ -165,7 +165,7 @@ class Domain:
         """What came to the discovery port.
 
         Participants announce themselves there, if the LAN relay has heard them or they are a
-        peer's; and those that are known answer the observer.
+        peer's; and those that are known answer the discovery participant.
         """
         relay = self.settings.relay
         # Other programs have the relay's address, too. What they send has no proof.
@@ -313,9 +313,11 @@ class Domain:
         """Announce the participants inside at other addresses of the advertised host.
 
         Fast DDS takes no new locators of a participant that it knows (PDPListener.cpp), so all
-        outside meet the participants and the observer anew.
+        outside meet the participants and the discovery participant anew.
         """
-        sent = self.settings.to_outside(self.own.observer.dispose_message())
+        sent = self.settings.to_outside(
+            self.proxy_participants.discovery_participant.dispose_message()
+        )
         self.settings.hosts = hosts
         for insider in self.inside.by_prefix.values():
             move = partial(self.rediscovery.move, insider)
@@ -346,7 +348,7 @@ class Domain:
 
     def is_kept(self, participant: InsideParticipant) -> bool:
         """Whether a participant inside keeps all the ports that it has, for the next process."""
-        return self.own.port_store.keeps(participant.prefix, participant.ports)
+        return self.proxy_participants.port_store.keeps(participant.prefix, participant.ports)
 
     def expire(self, now: float) -> list[Outgoing]:
         """Forget participants that have not been heard for as long as they said.
@@ -385,13 +387,15 @@ class Domain:
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         prefix = message.prefix
         spdp = message.of_participant
-        if source_vendor(message.datagram) == NO_VENDOR or self.own.is_own(prefix):
+        if source_vendor(message.datagram) == NO_VENDOR or self.proxy_participants.is_of_proxy(
+            prefix
+        ):
             return []  # a proxy's own participants are not passed on
         if self.proofs.note(source, message.datagram, now):
             sent = self._end_former_processes(prefix, source)
             return sent + [out for p in self.inside.prove() for out in self._end_for(p)]
         if spdp is None:
-            return self.own.told_inside(message, source, now)
+            return self.proxy_participants.told_inside(message, source, now)
         if spdp.ended:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
@@ -418,7 +422,7 @@ class Domain:
         sent = self.former_ports.wait(message, source, now)
         if sent and self.owners.yields_to_inside(message.prefix):
             sent += self._give_prefix_to_inside(message.prefix, source)
-        return sent + self.own.question_to_announced(message, source)
+        return sent + self.proxy_participants.question_to_announced(message, source)
 
     def _heard_outside(
         self,
@@ -428,14 +432,16 @@ class Domain:
         received: int,
         now: float,
     ) -> list[Outgoing]:
-        if self.own.is_own(message.prefix):
+        if self.proxy_participants.is_of_proxy(message.prefix):
             return []
         if is_question_of_proxy(message):
-            return self.own.answer_to_proxy(self.own.observer.prefix, message, source)
+            return self.proxy_participants.answer_to_proxy(
+                self.proxy_participants.discovery_participant.prefix, message, source
+            )
         if message.of_participant is None:
             return self._told_outside(message, source, received, now)
         if not by_relay and not self.outside.may_announce(
-            message, source, self.own.observer.prefix
+            message, source, self.proxy_participants.discovery_participant.prefix
         ):
             self.outside.refuse_stranger(
                 source, "a participant announces itself, and the address is not a peer"
@@ -457,7 +463,7 @@ class Domain:
             return self._announced_outside(message, source, received, now)
         text = f"GUID prefix {claimant.guid_prefix} belongs to a participant inside"
         self.refused("prefix", source, text)
-        return self.own.question_to_outside(claimant)
+        return self.proxy_participants.question_to_outside(claimant)
 
     def _told_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
@@ -470,7 +476,7 @@ class Domain:
             inside = self.inside.by_prefix.values()
             sent += [out for outsider in ended for out in self._end_outside(outsider, inside)]
             sent += self.outside.introduced(told, inside, now)
-        return sent + self.own.told_outside(message, source, received)
+        return sent + self.proxy_participants.told_outside(message, source, received)
 
     def _announced_outside(
         self, message: DiscoveryMessage, source: str, received: int, now: float
@@ -482,7 +488,7 @@ class Domain:
         outsider.credit += received
         sent += self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
         if message.of_participant is None or not message.of_participant.ended:
-            return sent + self.own.question_to_outside(outsider)
+            return sent + self.proxy_participants.question_to_outside(outsider)
         self._forget_outside(outsider)  # those inside are told of that, too
         return sent
 
@@ -510,13 +516,13 @@ class Domain:
         if is_new and self.inside.lacks_proof(prefix, source):
             # It is announced with all of its ports or not at all: outside takes up no new locators
             # of a participant that it knows. It announces itself again.
-            return self.own.question_to_announced(message, source)
+            return self.proxy_participants.question_to_announced(message, source)
         gives_place = self.inside.gives_place(prefix, source) if is_new else None
         sent = self._end_for(gives_place) if gives_place else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
             if prefix not in self.inside.by_prefix:  # it may get a place once it has answered
-                sent += self.own.question_to_announced(message, source)
+                sent += self.proxy_participants.question_to_announced(message, source)
             return sent
         if is_new:
             sent += self._end_former_processes(prefix, source)  # it has answered while it waited
@@ -528,17 +534,21 @@ class Domain:
         sent += self.inside.introduced(insider, message)
         # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
         if is_new and self.former_ports.must_be_rediscovered(prefix):
-            sent += self.own.port_store_dispose_message(insider)
+            sent += self.proxy_participants.port_store_dispose_message(insider)
             insider.parting_from = now
         else:
             sent += self._reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
             insider.parting_from = now  # outside takes up no new locators of it
-        sent += self._tell_outside(insider, for_all(exported), now)  # it may answer the observer
+        sent += self._tell_outside(
+            insider, for_all(exported), now
+        )  # it may answer the discovery participant
         if is_new:
             sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
-        sent += self.own.question_to_inside(insider.address, prefix, insider.metatraffic)
-        return sent + self.own.first_questions(insider)
+        sent += self.proxy_participants.question_to_inside(
+            insider.address, prefix, insider.metatraffic
+        )
+        return sent + self.proxy_participants.first_questions(insider)
 
     def _tell_outside(
         self, insider: InsideParticipant, announcement: bytes, now: float
@@ -615,7 +625,7 @@ class Domain:
     ) -> _Passing:
         """What becomes of metatraffic from outside at a port of the range. Raises RtpsError."""
         if is_question_of_proxy(message):
-            return [], self.own.answer_to_proxy(insider.prefix, message, source)
+            return [], self.proxy_participants.answer_to_proxy(insider.prefix, message, source)
         return self._imported(port, source, insider, now, message, received)
 
     def _imported(
@@ -632,7 +642,10 @@ class Domain:
         spdp = message.of_participant
         if outsider is not None:
             outsider.has_come_in = True
-        is_anothers = message.prefix in self.inside.by_prefix or self.own.is_own(message.prefix)
+        is_anothers = (
+            message.prefix in self.inside.by_prefix
+            or self.proxy_participants.is_of_proxy(message.prefix)
+        )
         if is_anothers or insider.is_apart:
             return [], []
         back = list[Outgoing]()
@@ -780,14 +793,14 @@ class Domain:
 
     def _forget_inside(self, insider: InsideParticipant) -> None:
         self.inside.forget(insider)
-        self.own.forget(insider.prefix)
+        self.proxy_participants.forget(insider.prefix)
         self.fragments.forget(insider.prefix)
 
     def _forget_outside(self, outsider: OutsideParticipant) -> None:
         self.rediscovery.forget(self.inside.by_prefix.values(), outsider.prefix)
         self.outside.forget(outsider)
         # What is known of ports belongs to a participant inside, which may have the same prefix.
-        self.own.observer.forget(outsider.prefix)
+        self.proxy_participants.discovery_participant.forget(outsider.prefix)
         self.fragments.forget(outsider.prefix)
 
     def _drop(self, reason: str, source: str, text: str) -> list[Outgoing]:

@@ -182,8 +182,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         """Note what one inside tells the proxy itself: what it has, and where. RtpsError."""
         note_endpoints(self.notes, participant, message.datagram, message.announcements)
         lead = partial(self._lead_out, participant, now, kept)
-        # The observer alone gets this: it is rewritten to lend the ports. Nothing is hidden,
-        # since the observer would ask for that again and again.
+        # The discovery participant alone gets this: it is rewritten to map the ports. Nothing is
+        # hidden, since the discovery participant would ask for that again and again.
         return rewritten(message, lead, lambda _: False)
 
     def note_in_group(self, datagram: bytes, source: str) -> None:

@@ -149,8 +149,8 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def observed(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> bytes:
         """Note what one outside tells the proxy itself: what it has, and where. RtpsError."""
         note_endpoints(self.notes, outsider, message.datagram, message.announcements)
-        # The observer alone gets this: it is rewritten to open the stand-ins. Nothing is hidden,
-        # since the observer would ask for that again and again.
+        # The discovery participant alone gets this: it is rewritten to open the stand-ins. Nothing
+        # is hidden, since the discovery participant would ask for that again and again.
         near = self.settings.proxy_address_for(outsider.address)
         lead = self._leading_in(outsider, near, message)
         return rewritten(message, lead, lambda _: False)
@@ -218,9 +218,9 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
 
         Of a peer without a port it goes where participants of the peer receive discovery, and to
         the next well-known ports, which participants take one after the other (DDSI-RTPS 2.5,
-        9.6.2.3). The observer announces itself to all ports of peers, so participants at other
-        ports are met nevertheless. As long as no participant of a peer is known, all its well-known
-        ports are used.
+        9.6.2.3). The discovery participant announces itself to all ports of peers, so participants
+        at other ports are met nevertheless. As long as no participant of a peer is known, all its
+        well-known ports are used.
         """
         sent = self.settings.to_lan(datagram)
         for peer in self.settings.peers:
@@ -262,14 +262,14 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         else:
             self.refused("not_a_peer", source, text)
 
-    def may_announce(self, message: DiscoveryMessage, source: str, observer: bytes) -> bool:
+    def may_announce(self, message: DiscoveryMessage, source: str, asked_by: bytes) -> bool:
         """Whether a participant outside may announce itself to the proxy directly.
 
-        One that names the ``observer`` has heard it: its prefix goes to peers and the LAN relay
-        alone.
+        A message that names ``asked_by``, the GUID prefix of the discovery participant, answers its
+        announcement, which goes to peers and the LAN relay alone.
         """
         is_met = self.find(message.prefix, source) is not None
-        is_named = is_destination(message.datagram, observer)
+        is_named = is_destination(message.datagram, asked_by)
         return is_met or is_named or self.settings.is_peer(source)
 
     def allowed_questions(

@@ -9,7 +9,7 @@ one allowance, as they do at the proxy.
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
+from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL
 from rosproxy.ros2.sources.address_proofs import MOST_ADDRESSES
 from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 

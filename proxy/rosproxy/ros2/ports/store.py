@@ -73,7 +73,7 @@ def halves(number: int, bits: int) -> tuple[int, int]:
 class PortStore:
     """Keeps ports of a range in participants; ``prefix`` is its own, ``key`` that of the proofs.
 
-    ``witness`` is the prefix of the participant that keeps the proofs, empty without a key.
+    ``proof_prefix`` is the prefix of the participant that keeps the proofs, empty without a key.
     ``unix_offset`` is Unix time less the time that the methods are given, in seconds.
     """
 
@@ -96,7 +96,7 @@ class PortStore:
         return cls(NO_VENDOR + digest, ports, key, unix_offset)
 
     @property
-    def witness(self) -> bytes:
+    def proof_prefix(self) -> bytes:
         """The GUID prefix of the participant that keeps the proofs; empty without a key."""
         if not self.key:
             return b""
@@ -120,7 +120,7 @@ class PortStore:
         wanted = self.numbers(prefix, ports)
         is_missing = {
             self.prefix: not self._has_kept(prefix, ports),
-            self.witness: not self._is_proven(prefix, ports),
+            self.proof_prefix: not self._is_proven(prefix, ports),
         }
         answers = self._answers.get(prefix, {})
         if any(is_missing[w[0]] and n < answers.get(w, 1) for w, n in wanted.items()):
@@ -159,7 +159,7 @@ class PortStore:
     def proven_count(self, prefix: bytes) -> int:
         """How many of these ports a participant has proved that it had."""
         ports = self.former_ports(prefix)
-        proof = self._answer(prefix, self.witness, HALF_BITS)
+        proof = self._answer(prefix, self.proof_prefix, HALF_BITS)
         count = (proof - 1 & _HALF_MASK) >> _HASH_BITS
         if not 0 < count <= len(ports):
             return 0
@@ -201,7 +201,7 @@ class PortStore:
 
     @property
     def _own_prefixes(self) -> list[bytes]:
-        return [self.prefix, self.witness] if self.key else [self.prefix]
+        return [self.prefix, self.proof_prefix] if self.key else [self.prefix]
 
     @property
     def _writers(self) -> list[_Writer]:

@@ -232,9 +232,9 @@ def rewritten(
 def participant_alone(message: DiscoveryMessage) -> bytes:
     """What a participant announces of itself, without what else the message holds, and for all.
 
-    Cyclone DDS answers the observer with an announcement that is for the observer alone
-    (ddsi_discovery_spdp.c, respond_to_spdp). Readers ask again for the readers and writers that
-    were announced beside it (DDSI-RTPS 2.5, 8.4.9).
+    Cyclone DDS answers the discovery participant with an announcement that is for this participant
+    alone (ddsi_discovery_spdp.c, respond_to_spdp). Readers ask again for the readers and writers
+    that were announced beside it (DDSI-RTPS 2.5, 8.4.9).
     """
     datagram = message.datagram
     spdp = message.of_participant

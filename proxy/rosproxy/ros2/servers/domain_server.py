@@ -79,8 +79,9 @@ class DomainServer:
         self._changed = changed
         self._told_changes = 0
         pool = PortPool(settings.ports.listen)
-        # A new prefix for each process: only to an observer that they don't know yet participants
-        # announce themselves at once, and send what they had told the former one.
+        # A new prefix for each process: participants announce themselves at once only to a
+        # discovery participant that they do not know. They send it what they had told the former
+        # one.
         self.domain = Domain(settings, pool, os.urandom(PREFIX), os.urandom(32), now(), time.time())
         self._selected = SelectedAddresses(now() + awaited)
         self._loop = asyncio.get_running_loop()
@@ -139,7 +140,7 @@ class DomainServer:
         On a network that it has left and joined again it has to join the group again, too.
         """
         for address in self._groups.join(addresses):
-            self._observe(address)
+            self._announce_on(address)
 
     def note_gateways(self, gateways: frozenset[str]) -> None:
         """Note the gateways of the proxy's default routes."""
@@ -149,12 +150,12 @@ class DomainServer:
         """Use these peers from now on; those that are new are asked to announce themselves."""
         if peers != self.domain.settings.peers:
             self.domain.settings.peers = peers
-            self._send(self.domain.own.announced_outside())
+            self._send(self.domain.proxy_participants.announced_outside())
 
     def move_to(self, hosts: tuple[str, ...]) -> None:
         """Have outside reach the range at these addresses of the host from now on."""
         self._send_and_go_on(self.domain.move_to(hosts, self._now()))
-        self._send(self.domain.own.announced_outside())
+        self._send(self.domain.proxy_participants.announced_outside())
 
     def apply_policy(self) -> None:
         """Have participants meet anew of which the policy says something else than before."""
@@ -165,7 +166,7 @@ class DomainServer:
         before = self._selected.selected or frozenset()
         self._selected.select(addresses)
         self._release()
-        self._ask((self._selected.selected or frozenset()) - before)
+        self._announce_to((self._selected.selected or frozenset()) - before)
 
     def note_former(self, former: Mapping[bytes, Sequence[int]]) -> None:
         """Take in which ports participants had at a proxy with another address."""
@@ -197,23 +198,25 @@ class DomainServer:
         self._sync_stand_ins()
         self._tell_changes()
 
-    async def observe(self) -> None:
-        """Announce the observer, by multicast and to those that may not get that; keep ports."""
+    async def announce(self) -> None:
+        """Announce the discovery participant to all, and have participants keep their ports."""
         for address in self._groups.joined:
-            self._observe(address)
+            self._announce_on(address)
         settings = self.domain.settings
         inside = list(self.domain.inside.by_prefix.values())
         self._send(
             Outgoing(
                 p.metatraffic,
-                self.domain.own.announced_inside(settings.proxy_address_for(p.address)),
+                self.domain.proxy_participants.announced_inside(
+                    settings.proxy_address_for(p.address)
+                ),
             )
             for p in inside
             if p.metatraffic
         )
-        self._ask(self._selected.selected or ())
-        self._send(self.domain.own.announced_outside())
-        self._send(self.domain.own.port_reminders(self._now()))
+        self._announce_to(self._selected.selected or ())
+        self._send(self.domain.proxy_participants.announced_outside())
+        self._send(self.domain.proxy_participants.port_reminders(self._now()))
         self._tell_relay()
 
     def close(self) -> None:
@@ -221,9 +224,8 @@ class DomainServer:
         self._reader.close()
         if self._next_part:
             self._next_part.cancel()
-        # The observer's alone: participants are not to forget the port store, by which they keep
-        # ports.
-        dispose_message = self.domain.own.observer.dispose_message()
+        # Participants must not forget the port store, by which they keep their ports.
+        dispose_message = self.domain.proxy_participants.discovery_participant.dispose_message()
         for address in self._groups.joined:
             self._multicast(address, dispose_message)
         self._send(self.domain.settings.to_outside(dispose_message))
@@ -269,15 +271,17 @@ class DomainServer:
         for source, datagram in self._selected.released(now):
             self._open_and_send(self.domain.heard_inside(datagram, source, now))
 
-    def _ask(self, addresses: Iterable[str]) -> None:
-        """Announce the observer to addresses inside whose network may not pass on multicast.
+    def _announce_to(self, addresses: Iterable[str]) -> None:
+        """Announce the discovery participant to addresses that may not get multicast.
 
         Docker's internal networks do not, where bridged packets are filtered (br_netfilter).
         """
         settings = self.domain.settings
         counts = self.domain.inside.count_by_address
         for address in addresses:
-            announcement = self.domain.own.announced_inside(settings.proxy_address_for(address))
+            announcement = self.domain.proxy_participants.announced_inside(
+                settings.proxy_address_for(address)
+            )
             count = counts.get(address, 0)
             # Participants of a machine take these ports one after the other (9.6.2.3): those that
             # have not been heard yet are at the next ones.
@@ -286,8 +290,8 @@ class DomainServer:
             )
             self._send(Outgoing(target, announcement) for target in targets)
 
-    def _observe(self, near: str) -> None:
-        self._multicast(near, self.domain.own.announced_inside(near))
+    def _announce_on(self, near: str) -> None:
+        self._multicast(near, self.domain.proxy_participants.announced_inside(near))
 
     def _multicast(self, near: str, datagram: bytes) -> None:
         """Send to the group on the network where the proxy has an address, if it still has it."""

@@ -64,7 +64,7 @@ def make_domain(
         relay=LanRelayLink(lan_relay, PROOF) if lan_relay else None,
         port_store_key=port_store_key,
     )
-    return Domain(settings, PortPool(ports.listen), b"the observer", b"a secret", 0.0)
+    return Domain(settings, PortPool(ports.listen), b"of the proxy", b"a secret", 0.0)
 
 
 def spdp(
@@ -128,7 +128,7 @@ def kept_number(
 
 
 def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
-    """What a participant answers both writers of the port store, or of the witness."""
+    """What a participant answers both writers of the port store, or of the port proof."""
     pairs = zip(WRITERS, halves(number, bits), strict=True)
     lower, upper = (kept_number(own, prefix, half, writer) for writer, half in pairs)
     return lower + upper[HEADER:]
@@ -136,13 +136,13 @@ def kept_halves(own: bytes, prefix: bytes, number: int, bits: int) -> bytes:
 
 def kept_answer(domain: Domain, prefix: bytes, number: int) -> bytes:
     """What a participant answers the port store of a domain."""
-    port_store = domain.own.port_store
+    port_store = domain.proxy_participants.port_store
     return kept_halves(port_store.prefix, prefix, number, port_store.port_bits)
 
 
 def proof_answer(domain: Domain, prefix: bytes, proof: int) -> bytes:
-    """What a participant answers the witness of a domain with a secret."""
-    return kept_halves(domain.own.port_store.witness, prefix, proof, HALF_BITS)
+    """What a participant answers the port proof of a domain with a secret."""
+    return kept_halves(domain.proxy_participants.port_store.proof_prefix, prefix, proof, HALF_BITS)
 
 
 def allowance_left(domain: Domain, source: str) -> float:

@@ -92,14 +92,16 @@ def test_no_locator_leads_to_another_host() -> None:
     assert reached_at(sent.datagram) == []
 
 
-def test_after_a_restart_the_observer_learns_which_ones_there_are() -> None:
+def test_after_a_restart_the_discovery_participant_learns_which_ones_there_are() -> None:
     before = both_ways()
     after = both_ways()
     (port,) = [
         p for p, (_, mapping) in before.inside.mappings.items() if mapping.target.port == 7410
     ]
     before.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
-    after.heard_outside(sedp(B, ROBOT, 7000, to=after.own.observer.prefix), ROBOT, NOW)
+    after.heard_outside(
+        sedp(B, ROBOT, 7000, to=after.proxy_participants.discovery_participant.prefix), ROBOT, NOW
+    )
     assert after.outside.stand_ins.keys() == before.outside.stand_ins.keys()
     (endpoint,) = after.outside.by_prefix[B].endpoints.values()
     assert endpoint.topic == "rt/chatter"

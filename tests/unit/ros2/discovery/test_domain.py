@@ -120,10 +120,10 @@ def test_an_address_of_a_link_outside_is_not_told_inside() -> None:
     assert {locator.host for locator in reached_at(told)} == {NEAR, "fd77::2"}
 
 
-def test_the_observer_is_reached_by_either_family() -> None:
+def test_the_discovery_participant_is_reached_by_either_family() -> None:
     domain = make_domain()
     domain.settings.hosts = (HOST, "fd77::1")
-    (told,) = to(domain.own.announced_outside(), LAN_RELAY.host)
+    (told,) = to(domain.proxy_participants.announced_outside(), LAN_RELAY.host)
     assert {locator.host for locator in reached_at(told)} == {HOST, "fd77::1"}
 
 
@@ -312,9 +312,11 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
 def test_a_participant_says_which_ports_it_had() -> None:
     domain = make_domain()
     domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
-    answer = kept_answer(domain, A, domain.own.port_store.number([45009, 45004]))
+    answer = kept_answer(domain, A, domain.proxy_participants.port_store.number([45009, 45004]))
     domain.heard_inside(answer, OTHER, 0.2)
-    assert not domain.own.port_store.prefixes  # from somewhere else it is nobody's word
+    assert (
+        not domain.proxy_participants.port_store.prefixes
+    )  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)
     settle(domain, SETTLING)
     ports = {mapping.target.port: port for port, (_, mapping) in domain.inside.mappings.items()}
@@ -349,7 +351,7 @@ def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
         ]
         return [beat.first for sent in told for beat in heartbeats(sent)]
 
-    port_store = domain.own.port_store
+    port_store = domain.proxy_participants.port_store
     numbers = reminded()
     assert numbers == [*port_store.numbers(A, domain.inside.by_prefix[A].ports).values()]
     assert reminded() == []  # not by each announcement
@@ -357,7 +359,7 @@ def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
 
 def reminded(domain: Domain) -> set[bytes]:
     """The participants that are told again which ports to keep."""
-    sent = [out.datagram for out in domain.own.port_reminders(NOW)]
+    sent = [out.datagram for out in domain.proxy_participants.port_reminders(NOW)]
     told = [destinations(datagram) for datagram in sent if any(heartbeats(datagram))]
     return set[bytes]().union(*told)
 
@@ -380,12 +382,12 @@ def test_one_participant_of_a_process_keeps_its_ports() -> None:
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
     domain = make_domain()
     meet(domain)
-    told, reminder = domain.own.port_reminders(NOW)
+    told, reminder = domain.proxy_participants.port_reminders(NOW)
     assert {told.target, reminder.target} == {HostPort(INSIDE, 7410)}
-    assert domain.own.port_reminders(NOW)
-    number = domain.own.port_store.number(domain.inside.by_prefix[A].ports)
+    assert domain.proxy_participants.port_reminders(NOW)
+    number = domain.proxy_participants.port_store.number(domain.inside.by_prefix[A].ports)
     domain.heard_inside(kept_answer(domain, A, number), INSIDE, NOW)
-    assert domain.own.port_reminders(NOW) == []
+    assert domain.proxy_participants.port_reminders(NOW) == []
 
 
 @given(st.binary(max_size=300), st.sampled_from([INSIDE, ROBOT, STRANGER, LAN_RELAY.host]))
@@ -478,7 +480,7 @@ def test_a_peer_with_many_participants_is_told_at_more_ports() -> None:
     domain.settings.peers = (HostPort(ROBOT, 0),)
 
     def ports_told() -> set[int]:
-        announced = domain.own.announced_outside()
+        announced = domain.proxy_participants.announced_outside()
         return {sent.target.port for sent in announced if sent.target.host == ROBOT}
 
     def meet_robots(count: int) -> None:
@@ -497,11 +499,15 @@ def test_a_peer_with_many_participants_is_told_at_more_ports() -> None:
 
 @pytest.mark.parametrize("outside", [False, True])
 def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
-    """Cyclone DDS answers the observer's announcement with its own, which names the observer."""
+    """Cyclone DDS answers with its own announcement, which names the discovery participant."""
     domain = make_domain()
     meet(domain)
     told = spdp(B, ROBOT if outside else OTHER)
-    answer = told[:20] + submessage(0x0E, 0, domain.own.observer.prefix) + told[20:]
+    answer = (
+        told[:20]
+        + submessage(0x0E, 0, domain.proxy_participants.discovery_participant.prefix)
+        + told[20:]
+    )
     if outside:
         sent = to(domain.heard_outside(answer, ROBOT, NOW), INSIDE)
     else:
@@ -509,7 +515,7 @@ def test_an_answer_to_the_proxy_is_told_to_all(outside: bool) -> None:
     assert [destination(datagram) for datagram in sent] == [None]
 
 
-def test_who_has_heard_the_observer_may_announce_itself() -> None:
+def test_who_has_heard_the_discovery_participant_may_announce_itself() -> None:
     """On a LAN, whose participants are nobody's peers, they answer it directly, where one of the
     same host was heard by the LAN relay."""
     domain = make_domain(peers=())
@@ -517,7 +523,11 @@ def test_who_has_heard_the_observer_may_announce_itself() -> None:
     neighbour = b"\x01\x10" + bytes(10)
     domain.heard_outside(carried(ROBOT, spdp(neighbour, ROBOT)), LAN_RELAY.host, NOW)
     answer = spdp(B, ROBOT)
-    named = answer[:20] + submessage(0x0E, 0, domain.own.observer.prefix) + answer[20:]
+    named = (
+        answer[:20]
+        + submessage(0x0E, 0, domain.proxy_participants.discovery_participant.prefix)
+        + answer[20:]
+    )
     assert domain.heard_outside(answer, ROBOT, NOW) == []
     assert to(domain.heard_outside(named, ROBOT, NOW), INSIDE)
     assert to(domain.heard_outside(answer, ROBOT, NOW), INSIDE)

@@ -316,10 +316,10 @@ def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
 def test_nobody_proves_anything_by_the_lan_relay() -> None:
     """Whoever can send as the LAN relay's host could have the proxy send to any address."""
     domain = make_domain(peers=())
-    domain.own.observer.prefix = bytes([7]) * 12
+    domain.proxy_participants.discovery_participant.prefix = bytes([7]) * 12
     meet(domain)
     domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), LAN_RELAY.host, NOW)
-    answer = sedp(B, ROBOT, 7411, to=domain.own.observer.prefix)
+    answer = sedp(B, ROBOT, 7411, to=domain.proxy_participants.discovery_participant.prefix)
     domain.heard_outside(carried(ROBOT, answer), LAN_RELAY.host, NOW)
     assert not domain.outside.by_prefix[B].has_answered
     domain.heard_outside(answer, ROBOT, NOW)

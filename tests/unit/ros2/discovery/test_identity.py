@@ -57,16 +57,16 @@ def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     yield domain.heard_outside(carried(ROBOT, outside), LAN_RELAY.host, NOW)
 
 
-@pytest.mark.parametrize("whose", ["observer", "port-store", "witness"])
+@pytest.mark.parametrize("whose", ["discovery-participant", "port-store", "port-proof"])
 def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> None:
     """The end of the port store, told by any machine on the LAN, had inside forget its ports."""
     domain = make_domain(port_store_key=b"a key")
     meet(domain)
-    port_store = domain.own.port_store
+    port_store = domain.proxy_participants.port_store
     own = {
-        "observer": domain.own.observer.prefix,
+        "discovery-participant": domain.proxy_participants.discovery_participant.prefix,
         "port-store": port_store.prefix,
-        "witness": port_store.witness,
+        "port-proof": port_store.proof_prefix,
     }
     prefix = own[whose]
     (port,) = [

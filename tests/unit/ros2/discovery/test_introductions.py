@@ -119,12 +119,12 @@ def test_an_introduction_follows_the_stand_in_and_the_announcement() -> None:
 
 
 def test_inside_is_told_what_a_participant_announces_of_itself_alone() -> None:
-    """Heartbeats for the observer went to all inside, as if they were for these."""
+    """Heartbeats for the discovery participant went to all inside, as if they were for these."""
     domain = met()
     stamp = submessage(0x09, 0, bytes(8))
     locator = pack_locator(HostPort(ROBOT, 9000), "<")
     announced = data(payload([(Pid.METATRAFFIC_UNICAST_LOCATOR, locator)]))
-    meant = submessage(0x0E, 0, domain.own.observer.prefix)
+    meant = submessage(0x0E, 0, domain.proxy_participants.discovery_participant.prefix)
     heartbeat = submessage(0x07, 0, bytes(28))
     datagram = message(meant, heartbeat, stamp, announced, heartbeat, prefix=B)
     (told,) = to(domain.heard_outside(datagram, ROBOT, NOW), INSIDE)

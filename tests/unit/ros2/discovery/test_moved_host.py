@@ -31,7 +31,7 @@ def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     domain.heard_outside(carried(ROBOT, spdp(B, ROBOT)), LAN_RELAY.host, NOW)
     moved = domain.move_to((MOVED,), NOW)
     dispose_messages = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
-    assert dispose_messages == [domain.own.observer.prefix, A]
+    assert dispose_messages == [domain.proxy_participants.discovery_participant.prefix, A]
     (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     assert {locator.host for locator in reached_at(again)} == {MOVED}
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
@@ -41,10 +41,10 @@ def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     assert repeated == again
 
 
-def test_the_observer_is_announced_where_the_host_is_now() -> None:
+def test_the_discovery_participant_is_announced_where_the_host_is_now() -> None:
     domain = make_domain()
     domain.move_to((MOVED,), NOW)
-    (announced,) = to(domain.own.announced_outside(), ROBOT)
+    (announced,) = to(domain.proxy_participants.announced_outside(), ROBOT)
     assert {locator.host for locator in reached_at(announced)} == {MOVED}
 
 

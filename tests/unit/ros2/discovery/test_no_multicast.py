@@ -137,7 +137,7 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     domain = moved()
 
     sent = meet(domain)
-    assert is_dispose_message(by(domain.own.port_store.prefix, to(sent, INSIDE))[0])
+    assert is_dispose_message(by(domain.proxy_participants.port_store.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
     parting = settle(domain, NOW)
     meeting = settle(domain, NOW + APART_TIME)
@@ -208,7 +208,11 @@ def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
     domain.former_ports.note_recorded({A: (*PORTS, port)}, {})
     meet(domain)
     settle(domain, NOW)
-    domain.heard_inside(sedp(A, INSIDE, 7000, to=domain.own.observer.prefix), INSIDE, NOW)
+    domain.heard_inside(
+        sedp(A, INSIDE, 7000, to=domain.proxy_participants.discovery_participant.prefix),
+        INSIDE,
+        NOW,
+    )
     assert tuple(domain.inside.by_prefix[A].ports) == (*PORTS, port)
 
 
@@ -232,7 +236,7 @@ def test_who_had_no_ports_was_not_there() -> None:
     domain.former_ports.note_recorded({A: ()}, domain.inside.by_prefix)
     sent = meet(domain)
     assert domain.inside.by_prefix[A].ports
-    told = by(domain.own.port_store.prefix, to(sent, INSIDE))
+    told = by(domain.proxy_participants.port_store.prefix, to(sent, INSIDE))
     assert told
     assert not any(map(is_dispose_message, told))
 

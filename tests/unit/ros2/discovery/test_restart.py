@@ -76,7 +76,7 @@ def number_of(ports: list[int]) -> int:
 
 
 def proof_of(prefix: bytes, ports: list[int], key: bytes = KEY) -> int:
-    """The number of the witness, by the key of a process of the proxy."""
+    """The number of the port proof, by the key of a process of the proxy."""
     return PortStore.of(HOST, RANGE.listen, 0, 0.0, key).proof(prefix, ports)
 
 
@@ -90,7 +90,7 @@ def come(
     """Have a participant announce itself inside, and answer with the numbers that it has seen."""
     domain.heard_inside(spdp(prefix, address), address, now)
     domain.heard_inside(kept_answer(domain, prefix, number), address, now)
-    if domain.own.port_store.key:
+    if domain.proxy_participants.port_store.key:
         domain.heard_inside(proof_answer(domain, prefix, proof), address, now)
 
 
@@ -277,7 +277,7 @@ def test_a_participant_keeps_its_ports_and_their_proof() -> None:
         assert not domain.is_kept(domain.inside.by_prefix[A])
         domain.heard_inside(answer, INSIDE, NOW)
     assert domain.is_kept(domain.inside.by_prefix[A])
-    assert domain.own.port_reminders(NOW) == []
+    assert domain.proxy_participants.port_reminders(NOW) == []
 
 
 def announce_from(domain: Domain, prefix: bytes, source: str, now: float) -> list[Outgoing]:
@@ -404,8 +404,8 @@ def test_nothing_is_kept_of_a_participant_inside_that_is_refused() -> None:
     domain = restarted()
     domain.heard_outside(carried(ROBOT, spdp(A, ROBOT)), LAN_RELAY.host, SETTLING)
     come(domain, A, INSIDE, 1, SETTLING)
-    assert A in domain.own.port_store.prefixes
+    assert A in domain.proxy_participants.port_store.prefixes
     settle(domain, SETTLING + ANSWER_TIME)
     assert A not in domain.inside.by_prefix
     assert reasons_of(domain)["prefix"]
-    assert A not in domain.own.port_store.prefixes
+    assert A not in domain.proxy_participants.port_store.prefixes

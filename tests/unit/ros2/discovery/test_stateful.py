@@ -112,7 +112,7 @@ class Neighbours(RuleBasedStateMachine):
             both_ways=True,
             port_store_key=b"a key",
         )
-        self.domain.own.observer.prefix = OWN
+        self.domain.proxy_participants.discovery_participant.prefix = OWN
         self.now = 0.0
         self.came = Counter[str]()
         self.went = Counter[str]()
@@ -182,7 +182,7 @@ class Neighbours(RuleBasedStateMachine):
     def a_participant_tells_which_ports_it_had(
         self, prefix: bytes, address: str, ports: list[int]
     ) -> None:
-        port_store = self.domain.own.port_store
+        port_store = self.domain.proxy_participants.port_store
         answers = kept_answer(self.domain, prefix, port_store.number(ports))
         answers += proof_answer(self.domain, prefix, port_store.proof(PREFIXES[0], ports))[20:]
         if address in NEAR_BY:
@@ -214,8 +214,11 @@ class Neighbours(RuleBasedStateMachine):
         self.check(self.domain.apply_policy(self.now))
 
     @rule()
-    def the_proxy_observes(self) -> None:
-        self.check(self.domain.own.port_reminders(self.now) + self.domain.own.announced_outside())
+    def the_proxy_announces(self) -> None:
+        self.check(
+            self.domain.proxy_participants.port_reminders(self.now)
+            + self.domain.proxy_participants.announced_outside()
+        )
 
     @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
     def another_program_has_a_port(self, port: int, for_good: bool) -> None:
@@ -291,9 +294,11 @@ class Neighbours(RuleBasedStateMachine):
             assert side.notes.size == side.notes.size_by_address.total()
         verdicts = [verdict for p in domain.inside.by_prefix.values() for verdict in p.verdicts]
         assert domain.inside.verdicts.count_by_address.total() == len(verdicts)
-        assert {prefix for prefix, _ in domain.own.observer._received} <= prefixes
+        assert {
+            prefix for prefix, _ in domain.proxy_participants.discovery_participant._received
+        } <= prefixes
         known = prefixes | domain.former_ports.waiting.keys()
-        assert {*domain.own.port_store.prefixes} <= known
+        assert {*domain.proxy_participants.port_store.prefixes} <= known
         assert domain.ports._ports_claimed.keys() <= known
         assert domain.fragments.by_prefix.keys() <= prefixes
         sizes = [store.size for store in domain.fragments.by_prefix.values()]

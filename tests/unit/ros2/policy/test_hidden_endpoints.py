@@ -121,9 +121,9 @@ def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
 
 
 def test_the_proxy_itself_is_told_of_what_is_denied() -> None:
-    """Its observer would ask for it again and again."""
+    """Its discovery participant would ask for it again and again."""
     domain = met(Rules(RuleKind.PUBLISH))
-    told = sedp(A, INSIDE, 7000, to=domain.own.observer.prefix)
+    told = sedp(A, INSIDE, 7000, to=domain.proxy_participants.discovery_participant.prefix)
     domain.heard_inside(told, INSIDE, NOW)
     assert len(domain.inside.by_prefix[A].endpoints) == 1
     assert HostPort(INSIDE, 7000) in domain.inside.by_prefix[A].mappings

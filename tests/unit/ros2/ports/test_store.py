@@ -41,7 +41,9 @@ def answered(port_store: PortStore, number: int, proof: int = 1, prefix: bytes =
     )
     assert port_store.has_answered(prefix) is not bool(port_store.key)
     if port_store.key:
-        assert port_store.take(prefix, kept_halves(port_store.witness, prefix, proof, HALF_BITS))
+        assert port_store.take(
+            prefix, kept_halves(port_store.proof_prefix, prefix, proof, HALF_BITS)
+        )
     assert port_store.has_answered(prefix)
     return port_store.proven_count(prefix)
 
@@ -131,7 +133,7 @@ def test_a_participant_forgets_a_number_that_is_greater(is_proof: bool) -> None:
     dispose_messages = port_store.reminders(PEER, [11405], BACK, 0.0)
     assert [source_prefix(told) for told in dispose_messages] == [
         port_store.prefix,
-        port_store.witness,
+        port_store.proof_prefix,
     ]
     assert not [beat for told in dispose_messages for beat in heartbeats(told)]
     assert len(port_store.reminders(PEER, [11405], BACK, 0.0)) == 4
@@ -143,7 +145,7 @@ def test_a_participant_of_the_version_before_gets_proofs_for_what_it_keeps() -> 
     (*_, proof) = port_store.reminders(PEER, [11405], BACK, 0.0)
     wanted = port_store.numbers(PEER, [11405])
     assert [beat.first for beat in heartbeats(proof)] == [
-        number for (own, _), number in wanted.items() if own == port_store.witness
+        number for (own, _), number in wanted.items() if own == port_store.proof_prefix
     ]
 
 
@@ -155,13 +157,16 @@ def test_all_ports_that_a_former_version_kept_by_one_writer_are_read() -> None:
     assert port_store.former_ports(PEER) == ports
 
 
-def test_another_secret_has_another_witness() -> None:
+def test_another_secret_has_another_prefix() -> None:
     port_store = make_port_store()
     other = make_port_store(key=b"another")
     without = make_port_store(key=b"")
     assert port_store.prefix == other.prefix == without.prefix
-    assert len({port_store.prefix, port_store.witness, other.witness, without.witness}) == 4
-    assert without.witness == b""
+    assert (
+        len({port_store.prefix, port_store.proof_prefix, other.proof_prefix, without.proof_prefix})
+        == 4
+    )
+    assert without.proof_prefix == b""
 
 
 def test_the_key_follows_from_the_secret() -> None:
@@ -233,7 +238,7 @@ def test_it_asks_and_reminds_by_heartbeats() -> None:
         for datagrams in (sent[::2], sent[1::2]):
             assert [source_prefix(told) for told in datagrams] == [
                 port_store.prefix,
-                port_store.witness,
+                port_store.proof_prefix,
             ]
 
 
@@ -244,7 +249,7 @@ def test_answers_to_both_in_one_message(is_first: bool) -> None:
     ports = [11405]
     answers = [
         kept_halves(port_store.prefix, PEER, port_store.number(ports), port_store.port_bits),
-        kept_halves(port_store.witness, PEER, port_store.proof(PEER, ports), HALF_BITS),
+        kept_halves(port_store.proof_prefix, PEER, port_store.proof(PEER, ports), HALF_BITS),
     ]
     first, second = answers if is_first else answers[::-1]
     assert port_store.take(PEER, first + second[HEADER:])

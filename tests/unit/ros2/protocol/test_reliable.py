@@ -28,7 +28,7 @@ def test_a_count_begins_anew(count: int) -> None:
 def test_a_participant_is_met_however_many_questions_were_asked() -> None:
     domain = make_domain(peers=())
     domain.proofs._count = 2**31 - 1
-    domain.own.observer._count = 2**31 - 1
+    domain.proxy_participants.discovery_participant._count = 2**31 - 1
     domain.heard_inside(spdp(A, "172.30.0.5"), "172.30.0.5", NOW)
     announced = carried("10.0.0.77", spdp(B, "10.0.0.77", padding=300))
     assert to(domain.heard_outside(announced, LAN_RELAY.host, NOW), "10.0.0.77")

@@ -129,7 +129,11 @@ def test_a_participant_that_is_not_introduced_reaches_nothing_inside() -> None:
     for said in (spdp(B, LAPTOP), sedp(B, LAPTOP, 7411, to=A)):
         assert to(domain.at_range_port(port, said, LAPTOP, NOW), INSIDE) == []
     assert not domain.outside.by_prefix[B].mappings
-    domain.heard_outside(sedp(B, LAPTOP, 7411, to=domain.own.observer.prefix), LAPTOP, NOW)
+    domain.heard_outside(
+        sedp(B, LAPTOP, 7411, to=domain.proxy_participants.discovery_participant.prefix),
+        LAPTOP,
+        NOW,
+    )
     assert not domain.outside.by_prefix[B].mappings
     prove(domain, LAPTOP)
     assert domain.outside.prove(LAPTOP) == ([domain.outside.by_prefix[B]], [])
@@ -204,7 +208,7 @@ def test_an_unproven_address_has_a_few_participants() -> None:
 
 
 def test_a_question_goes_to_one_address_alone() -> None:
-    """All on a LAN hear the prefix of the observer: a forger could answer for any address."""
+    """All on a LAN hear the prefix of this participant: a forger could answer for any address."""
     domain = make_domain(peers=())
     meet(domain)
     asked = [
@@ -212,7 +216,9 @@ def test_a_question_goes_to_one_address_alone() -> None:
         for number, address in enumerate((LAPTOP, STRANGER))
     ]
     assert source_prefix(asked[0]) != source_prefix(asked[1])
-    hearsay = sedp(named(0), LAPTOP, 7411, to=domain.own.observer.prefix)
+    hearsay = sedp(
+        named(0), LAPTOP, 7411, to=domain.proxy_participants.discovery_participant.prefix
+    )
     for forged in (hearsay, answer(asked[1], named(0))):
         domain.heard_outside(forged, LAPTOP, NOW)
         assert not domain.outside.by_prefix[named(0)].proven
@@ -270,7 +276,11 @@ def test_a_proxy_answers_for_the_participants_behind_it(known: bool) -> None:
 def exchange(proxies: dict[str, Domain]) -> Counter[str]:
     """Have proxies announce themselves until all is said; how many datagrams each has sent."""
     counts = Counter[str]()
-    sent = [(host, out) for host, p in proxies.items() for out in p.own.announced_outside()]
+    sent = [
+        (host, out)
+        for host, p in proxies.items()
+        for out in p.proxy_participants.announced_outside()
+    ]
     while sent:
         source, out = sent.pop(0)
         counts[source] += 1
@@ -292,14 +302,19 @@ def test_two_proxies_do_not_ask_each_other_without_end(peer_of_second: str) -> N
         domain = proxies[host]
         domain.settings.hosts = (host,)
         domain.settings.peers = (HostPort(peer, RANGE.advertised(RANGE.listen.first)),)
-        domain.own.observer.prefix = domain.proofs.secret = host.encode().ljust(PREFIX, b"-")
+        domain.proxy_participants.discovery_participant.prefix = domain.proofs.secret = (
+            host.encode().ljust(PREFIX, b"-")
+        )
         meet(domain, A if host == HOST else B)
     exchange(proxies)
     second = exchange(proxies)
-    observers = {host: domain.own.observer.prefix for host, domain in proxies.items()}
+    discovery_prefixes = {
+        host: domain.proxy_participants.discovery_participant.prefix
+        for host, domain in proxies.items()
+    }
     for host, other in ((HOST, LAPTOP), (LAPTOP, HOST)):
         outside = proxies[host].outside
-        assert outside.by_prefix.keys() <= {observers[other]}
+        assert outside.by_prefix.keys() <= {discovery_prefixes[other]}
         assert all(p.proven for p in outside.by_prefix.values())
     # All have answered: nothing but the announcements is left to say.
     assert second.total() <= 6

@@ -6,7 +6,7 @@ import tracemalloc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.ros2.discovery.observer import Observer
+from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.rtps import source_prefix, submessages
 from tests.unit.ros2.protocol.messages import data, message, submessage
@@ -33,23 +33,25 @@ def asked(answer: bytes) -> tuple[int, list[int], bool]:
 
 
 def test_it_asks_first_what_there_is() -> None:
-    observer = Observer(OWN)
-    assert [asked(question) for question in observer.first_question(PEER)] == [(1, [], False)] * 2
+    participant = DiscoveryParticipant(OWN)
+    assert [asked(question) for question in participant.first_question(PEER)] == [
+        (1, [], False)
+    ] * 2
 
 
 def test_who_has_nothing_gets_no_answer() -> None:
-    observer = Observer(OWN)
-    assert observer.take(PEER, message(heartbeat(1, 0), prefix=PEER)) == []
-    assert len(observer.first_question(PEER)) == 1  # the other writer has not been heard
+    participant = DiscoveryParticipant(OWN)
+    assert participant.take(PEER, message(heartbeat(1, 0), prefix=PEER)) == []
+    assert len(participant.first_question(PEER)) == 1  # the other writer has not been heard
 
 
 @given(st.sets(st.integers(1, 40)), st.integers(1, 40))
 def test_it_asks_for_what_it_lacks(got: set[int], last: int) -> None:
-    observer = Observer(OWN)
+    participant = DiscoveryParticipant(OWN)
     for number in got:
         sample = data(b"\0\3\0\0", writer=WRITERS, sequence=number)
-        assert observer.take(PEER, message(sample, prefix=PEER)) == []
-    (answer,) = observer.take(PEER, message(heartbeat(1, last), prefix=PEER))
+        assert participant.take(PEER, message(sample, prefix=PEER)) == []
+    (answer,) = participant.take(PEER, message(heartbeat(1, last), prefix=PEER))
     base, missing, final = asked(answer)
     lacking = [number for number in range(1, last + 1) if number not in got]
     assert (missing, final) == (lacking, True)
@@ -57,59 +59,59 @@ def test_it_asks_for_what_it_lacks(got: set[int], last: int) -> None:
 
 
 def test_it_asks_for_all_samples_of_a_writer_that_has_many() -> None:
-    observer = Observer(OWN)
+    participant = DiscoveryParticipant(OWN)
     got = set[int]()
     for _ in range(10):
-        (answer,) = observer.take(PEER, message(heartbeat(500, 3000), prefix=PEER))
+        (answer,) = participant.take(PEER, message(heartbeat(500, 3000), prefix=PEER))
         _, missing, _ = asked(answer)
         for number in missing:
-            observer.take(
+            participant.take(
                 PEER, message(data(b"\0\3\0\0", writer=WRITERS, sequence=number), prefix=PEER)
             )
         got |= {*missing}
     assert got == {*range(500, 3001)}
-    (answer,) = observer.take(PEER, message(heartbeat(500, 3000), prefix=PEER))
+    (answer,) = participant.take(PEER, message(heartbeat(500, 3000), prefix=PEER))
     assert asked(answer) == (3001, [], True)
 
 
 def test_a_forged_heartbeat_hides_no_samples() -> None:
-    observer = Observer(OWN)
-    observer.take(PEER, message(heartbeat(10**9, 10**9), prefix=PEER))
-    observer.take(PEER, message(heartbeat(1, 3), prefix=PEER))
+    participant = DiscoveryParticipant(OWN)
+    participant.take(PEER, message(heartbeat(10**9, 10**9), prefix=PEER))
+    participant.take(PEER, message(heartbeat(1, 3), prefix=PEER))
     for _ in range(3):
-        (answer,) = observer.take(PEER, message(heartbeat(1, 3), prefix=PEER))
+        (answer,) = participant.take(PEER, message(heartbeat(1, 3), prefix=PEER))
         assert asked(answer) == (1, [1, 2, 3], True)
 
 
 def test_little_is_remembered_of_a_writer() -> None:
     """1,000 samples of each writer took 70 MB for 384 participants, and a proxy may have 256 MB."""
-    observer = Observer(OWN)
+    participant = DiscoveryParticipant(OWN)
     numbers = range(10**9, 10**9 + 3000, 3)
     datagrams = [
         message(data(b"\0\3\0\0", writer=WRITERS, sequence=number), prefix=PEER)
         for number in numbers
     ]
-    observer.take(PEER, message(heartbeat(numbers[0] - 1, numbers[-1]), prefix=PEER))
+    participant.take(PEER, message(heartbeat(numbers[0] - 1, numbers[-1]), prefix=PEER))
     tracemalloc.start()
     for datagram in datagrams:
-        observer.take(PEER, datagram)
+        participant.take(PEER, datagram)
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert size < 10_000
 
 
 def test_a_participant_that_has_gone_is_forgotten() -> None:
-    observer = Observer(OWN)
+    participant = DiscoveryParticipant(OWN)
     sample = data(b"\0\3\0\0", writer=WRITERS, sequence=1)
-    observer.take(PEER, message(sample, prefix=PEER))
-    observer.forget(PEER)
-    (answer,) = observer.take(PEER, message(heartbeat(1, 1), prefix=PEER))
+    participant.take(PEER, message(sample, prefix=PEER))
+    participant.forget(PEER)
+    (answer,) = participant.take(PEER, message(heartbeat(1, 1), prefix=PEER))
     assert asked(answer)[1] == [1]
 
 
 def test_a_writer_gets_one_answer_to_a_datagram() -> None:
     """A datagram of 8 kB with 256 heartbeats led to 256 answers of 17 kB."""
-    observer = Observer(OWN)
+    participant = DiscoveryParticipant(OWN)
     many = message(*(heartbeat(1, number) for number in range(1, 200)), prefix=PEER)
-    (answer,) = observer.take(PEER, many)
+    (answer,) = participant.take(PEER, many)
     assert asked(answer)[1] == list(range(1, 200))

@@ -1,17 +1,18 @@
 """The proxy's own participants in a domain: what they send, and what they are told.
 
-The *observer* reads which readers and writers others have, on both sides; the *port store* has
-those inside keep their ports for the next process. Neither has any of its own, and neither is told
-to the other side: each side knows them as its own.
+The *discovery participant* reads which readers and writers others have, on both sides. The *port
+store* has participants inside keep their ports for the next process. Neither has a reader or writer
+for a topic, and the proxy announces neither on behalf of the other side: each side discovers them
+as participants of its own.
 """
 
 from dataclasses import dataclass
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.observer import Observer
 from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
 from rosproxy.ros2.ports.former_ports import FormerPorts
@@ -25,11 +26,11 @@ from rosproxy.ros2.sources.address_proofs import AddressProofs
 
 
 @dataclass(slots=True)
-class OwnParticipants:
-    """The observer and the port store of a domain, and the tables that they fill."""
+class ProxyParticipants:
+    """The discovery participant and the port store of a domain, and the tables that they fill."""
 
     settings: DomainSettings
-    observer: Observer
+    discovery_participant: DiscoveryParticipant
     port_store: PortStore
     inside: InsideParticipants
     outside: OutsideParticipants
@@ -37,21 +38,30 @@ class OwnParticipants:
     fragments: FragmentStores
     proofs: AddressProofs
 
-    def is_own(self, prefix: bytes) -> bool:
+    def is_of_proxy(self, prefix: bytes) -> bool:
         """Whether a GUID prefix is that of one of the proxy's own participants.
 
-        No other participant may use it. The port store's follows from what all can see, and
-        whatever ends the port store for those inside has them forget their ports.
+        No other participant may use it. The prefix of the port store follows from what all can see.
+        A dispose message for the port store makes participants inside forget their ports.
         """
-        return prefix in (self.observer.prefix, self.port_store.prefix, self.port_store.witness)
+        return prefix in (
+            self.discovery_participant.prefix,
+            self.port_store.prefix,
+            self.port_store.proof_prefix,
+        )
 
     def announced_inside(self, near: str) -> bytes:
-        """The observer's announcement for a network inside, where the proxy has an address."""
-        return self.observer.announcement(HostPort(near, self.settings.unicast_port))
+        """Announce the discovery participant on a network inside.
+
+        ``near`` is the address of the proxy there.
+        """
+        return self.discovery_participant.announcement(HostPort(near, self.settings.unicast_port))
 
     def announced_outside(self) -> list[Outgoing]:
-        """The observer's announcement for the LAN relay and the peers."""
-        return self.settings.to_outside(self.observer.announcement(*self._reached_from_outside()))
+        """The discovery participant's announcement for the LAN relay and the peers."""
+        return self.settings.to_outside(
+            self.discovery_participant.announcement(*self._reached_from_outside())
+        )
 
     def question_to_outside(self, outsider: OutsideParticipant) -> list[Outgoing]:
         """What asks a participant outside to prove that it receives, if that is to be."""
@@ -84,7 +94,9 @@ class OwnParticipants:
 
     def first_questions(self, participant: InsideParticipant) -> list[Outgoing]:
         """What asks a participant inside that has announced itself for its readers and writers."""
-        return sent_to(participant.metatraffic, self.observer.first_question(participant.prefix))
+        return sent_to(
+            participant.metatraffic, self.discovery_participant.first_question(participant.prefix)
+        )
 
     def port_store_dispose_message(self, participant: InsideParticipant) -> list[Outgoing]:
         """What makes a participant forget the port store, which it knows at a former address."""
@@ -98,7 +110,7 @@ class OwnParticipants:
         return [sent for p in participants for sent in self.former_ports.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
-        """Take in what a participant inside tells the port store or the observer. RtpsError."""
+        """Take in what a participant inside tells the proxy's participants. Raises RtpsError."""
         prefix = message.prefix
         insider = self.inside.find(prefix, source)
         # One that waits to be let in is in no table yet, and its answer is what it waits for.
@@ -113,14 +125,14 @@ class OwnParticipants:
         return sent_to(insider.metatraffic, self._ask(self.settings.unicast_port, message, rewrite))
 
     def told_outside(self, message: DiscoveryMessage, source: str, received: int) -> list[Outgoing]:
-        """Take in what a participant outside tells the observer. Raises RtpsError.
+        """Take in what a participant outside tells the discovery participant. Raises RtpsError.
 
         ``received`` is how many bytes came from the participant.
         """
         outsider = self.outside.find(message.prefix, source)
         if outsider is None:
             return []
-        outsider.note_received(message.datagram, received, self.observer.prefix)
+        outsider.note_received(message.datagram, received, self.discovery_participant.prefix)
         if not self.outside.may_introduce(outsider):
             return []
         rewrite = partial(self.outside.observed, outsider)
@@ -132,10 +144,10 @@ class OwnParticipants:
     ) -> list[Outgoing]:
         """The answer to another proxy that asks a participant to prove that it receives.
 
-        ``prefix`` is the GUID prefix of the observer, or of the participant inside at whose port
-        the question came. Nothing is sent if the question is for another participant. The proof
-        participant of a proxy is announced to no side: two proxies would ask each other without
-        end. The answer is shorter than the question. Raises RtpsError.
+        ``prefix`` is the GUID prefix of the discovery participant, or of the participant inside at
+        whose port the question came. Nothing is sent if the question is for another
+        participant. The participant that asks is announced to no side: two proxies would ask each
+        other without end. The answer is shorter than the question. Raises RtpsError.
         """
         spdp = message.of_participant
         target = first_metatraffic(spdp, message.datagram, source) if spdp else None
@@ -147,12 +159,14 @@ class OwnParticipants:
 
     def forget(self, prefix: bytes) -> None:
         """Forget what a participant that has gone has told."""
-        self.observer.forget(prefix)
+        self.discovery_participant.forget(prefix)
         self.former_ports.forget_participant(prefix)
 
     def _ask(self, port: int, message: DiscoveryMessage, rewrite: Rewrite) -> list[bytes]:
-        """Give the observer a message of discovery that came at a port; what it asks for then."""
-        passed, questions = self.fragments.rewritten(port, message, self.observer.prefix, rewrite)
+        """Give the discovery participant a message that came at a port; what it asks for then."""
+        passed, questions = self.fragments.rewritten(
+            port, message, self.discovery_participant.prefix, rewrite
+        )
         for datagram in passed:
-            questions += self.observer.take(message.prefix, datagram)
+            questions += self.discovery_participant.take(message.prefix, datagram)
         return questions

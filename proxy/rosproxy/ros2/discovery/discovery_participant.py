@@ -1,11 +1,11 @@
-"""The proxy's own participant: it reads which readers and writers others have, on both sides.
+"""The participant by which the proxy takes part in discovery, on both sides.
 
-It announces itself, and has the readers of discovery alone. So participants that announced
-themselves before the proxy started do it again, at once; and the proxy learns as well what they
-have told others long ago of their readers and writers: which locators they have, and which topics.
+The discovery participant announces itself, and has the readers of SPDP and SEDP alone. So
+participants that announced themselves before the proxy started do so again at once. The proxy also
+learns what they told others long ago of their readers and writers: the locators and the topics.
 
-It is a reliable reader in the plainest form: it asks for the samples that a writer has by its
-heartbeat, and that it has not got.
+It reads reliably in the plainest form: it asks for each sample that a writer has by its heartbeat
+and that has not come.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 LEASE_DURATION_S = 12.0
 """Seconds after which others that do not hear it forget it: the proxy may have been killed."""
 ANNOUNCE_INTERVAL = 3.0
-OBSERVED = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
+SEDP_WRITERS = (BuiltinWriter.PUBLICATIONS, BuiltinWriter.SUBSCRIPTIONS)
 
 
 @dataclass(slots=True)
@@ -65,8 +65,8 @@ class _Received:
 
 
 @dataclass(slots=True)
-class Observer:
-    """The samples that the proxy's participant has got; ``prefix`` is its own, which is random."""
+class DiscoveryParticipant:
+    """Asks participants for their readers and writers; ``prefix`` is its GUID prefix, random."""
 
     prefix: bytes
     _received: dict[tuple[bytes, int], _Received] = field(default_factory=dict)
@@ -82,7 +82,9 @@ class Observer:
 
     def first_question(self, prefix: bytes) -> list[bytes]:
         """What asks a participant's writers what they have."""
-        return [self._ask(prefix, w, 1, ()) for w in OBSERVED if (prefix, w) not in self._received]
+        return [
+            self._ask(prefix, w, 1, ()) for w in SEDP_WRITERS if (prefix, w) not in self._received
+        ]
 
     def take(self, prefix: bytes, datagram: bytes) -> list[bytes]:
         """Note a participant's message; what to ask it for. Raises RtpsError.
@@ -90,13 +92,13 @@ class Observer:
         Of samples in fragments the last comes when all are there (`FragmentStore`).
         """
         for sample in samples(datagram):
-            if sample.writer in OBSERVED and sample.prefix == prefix:
+            if sample.writer in SEDP_WRITERS and sample.prefix == prefix:
                 self._of_writer(prefix, sample.writer).note(sample.sequence)
         # One answer to each writer: a datagram has room for 256 heartbeats, all of one writer.
         by_writer = {heartbeat.writer: heartbeat for heartbeat in heartbeats(datagram)}
         answers = []
         for writer, heartbeat in by_writer.items():
-            if writer in OBSERVED:
+            if writer in SEDP_WRITERS:
                 received = self._of_writer(prefix, writer)
                 if heartbeat.last > 0:  # an empty writer would take an answer for a question
                     answers.append(self._answer(prefix, heartbeat, received))
@@ -104,7 +106,7 @@ class Observer:
 
     def forget(self, prefix: bytes) -> None:
         """Forget a participant that has gone."""
-        for writer in OBSERVED:
+        for writer in SEDP_WRITERS:
             self._received.pop((prefix, writer), None)
 
     def _of_writer(self, prefix: bytes, writer: int) -> _Received:
