@@ -1,26 +1,62 @@
-"""Which ports a participant has, kept where that outlasts the proxy: in the participant itself.
+"""The port store: participants inside remember their ports for the next process of the proxy.
 
-A reliable reader remembers, of each writer, the number of the next sample that it expects, and says
-so when it is asked by a heartbeat (DDSI-RTPS 2.5, 8.3.8.6 and 8.4.9). So the proxy has a
-participant, the *port store*, with a writer of SEDP that never writes: it tells each participant
-inside by a heartbeat that all samples before a number are gone, and the number holds its ports. The
-port store has the same GUID prefix in each process of the proxy, so that the next one asks, and is
-told.
+After a restart of the proxy each participant must get its former ports again. Participants outside
+go on sending there, and Fast DDS takes no new locators of a participant that it knows
+(PDPListener.cpp). The proxy writes no file: the file would be lost with the container. Instead the
+participant itself remembers its ports, in a number that each reliable reader keeps of a writer: the
+sequence number of the sample that it expects next (DDSI-RTPS 2.5, 8.3.8.6 and 8.4.9).
 
-The port store has two writers, one for each half of its number. The number is 1 for no ports; else
-it holds each port less the range's first, that of the first port in the lowest bits. A port that is
-added makes neither half smaller, as it has to be. A range that is made longer keeps its first port,
-and a port its bits, up to a length: so the port store stays the same.
+**What is written.** The proxy has a participant, the *port store*, with the two writers of SEDP.
+They never write a sample. A heartbeat tells the reader that all samples before a number are gone,
+so the reader expects that number next. The number holds the ports::
 
-Each participant can compute this number for the ports of another one. So a proxy with a secret has
-a second such participant, the *witness*, whose number proves that of the port store: how many ports
-there are, and a keyed hash of the participant's GUID prefix and these ports. The witness's own
-prefix follows from the secret, too: a proxy with another secret asks as another witness.
+    port store                                            participant inside
+      SPDP: participant, writers of SEDP       ------->   takes the port store into its memory
+      HEARTBEAT publications, first 98949      ------->   reader: next is 98949
+      HEARTBEAT subscriptions, first 1         ------->   reader: next is 1
+                                               <-------   ACKNACK: next is 98949; next is 1
 
-No half is longer than `HALF_BITS`. Fast DDS before 2.14.6, 3.2.4, 3.3.1 and 3.4.2 counts up to the
-number of a writer one by one, under a lock (StatefulReader.cpp, NotifyChanges). Up to 2^24 takes
-some hundredths of a second, up to 2^32 ten seconds, and up to 2^48 days. Cyclone DDS does not
-count: a heartbeat makes one gap there (ddsi_receive.c, handle_Heartbeat).
+    range 11400-11463, ports 11403 11404 11405: 4, 5 and 6 as distances from 11399, of 7 bits each
+
+      98949 - 1  =   0000110   0000101   0000100         lower half, of the writer of publications
+                     11405     11404     11403           upper half: 0, as no further port follows
+
+**Where it lies.** In the built-in readers of the participant, as long as the participant lives and
+`LEASE_DURATION_S` is not over. `FormerPorts.reminders` writes the numbers: as soon as a participant
+has a further port, and then with each announcement of the proxy until the participant confirms
+them.
+
+**How the next process reads it.** The GUID prefix of the port store follows from the advertised
+host, the range and the domain. So the next process is the same port store to the participant::
+
+    port store, next process                              participant inside
+      SPDP; HEARTBEAT with first 1             ------->   expects 98949, and heeds no smaller number
+                                               <-------   ACKNACK: next is 98949
+
+`FormerPorts.wait` asks before the participant is announced outside, `FormerPorts.take_answer` takes
+the answer, and `LocatorPorts.take` gives the ports again.
+
+**Why it is safe.**
+
+- *A number only grows.* A reader heeds no smaller number (8.4.12.1). The first port has the lowest
+  bits, so a further port makes neither half smaller. For a smaller number the participant first has
+  to forget the port store, by a dispose message (`reminders`).
+- *A lost datagram does no harm.* Each heartbeat is repeated until the participant has confirmed the
+  number (`keeps`).
+- *A former heartbeat does no harm.* A reader heeds only heartbeats with a greater count than the
+  last, which another process may have sent. So the count follows from the time (`_told`).
+- *A longer range keeps the ports.* Its first port stays, and a port takes the same bits up to a
+  length of the range. So the port store stays the same.
+- *A lie is worth less than a proof.* Each participant can compute the number for the ports of
+  another one. So a proxy with a secret has a second such participant, the *port proof*. Its number
+  has the count of the ports, and a keyed hash of the participant's GUID prefix and its ports. The
+  GUID prefix of the port proof follows from the secret, too: a proxy with another secret asks as
+  another port proof. `LocatorPorts` prefers a claim with a proof.
+- *No participant hangs.* No half is longer than `HALF_BITS`. Fast DDS before 2.14.6, 3.2.4, 3.3.1
+  and 3.4.2 counts up to the number of a writer one by one, under a lock (StatefulReader.cpp,
+  NotifyChanges). Up to 2^24 takes some hundredths of a second, up to 2^32 ten seconds, and up to
+  2^48 days. Cyclone DDS does not count: a heartbeat makes one gap there (ddsi_receive.c,
+  handle_Heartbeat).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -71,10 +107,10 @@ def halves(number: int, bits: int) -> tuple[int, int]:
 
 @dataclass(slots=True)
 class PortStore:
-    """Keeps ports of a range in participants; ``prefix`` is its own, ``key`` that of the proofs.
+    """Keeps ports of a range in participants; ``prefix`` is its GUID prefix.
 
-    ``proof_prefix`` is the prefix of the participant that keeps the proofs, empty without a key.
-    ``unix_offset`` is Unix time less the time that the methods are given, in seconds.
+    ``key`` makes the proofs; without a key there are none. ``unix_offset`` is Unix time less the
+    time that the methods are given, in seconds.
     """
 
     prefix: bytes
@@ -97,7 +133,7 @@ class PortStore:
 
     @property
     def proof_prefix(self) -> bytes:
-        """The GUID prefix of the participant that keeps the proofs; empty without a key."""
+        """The GUID prefix of the port proof; empty without a key."""
         if not self.key:
             return b""
         return NO_VENDOR + blake2b(self.prefix, key=self.key, digest_size=PREFIX - 2).digest()

@@ -48,6 +48,13 @@ def answered(port_store: PortStore, number: int, proof: int = 1, prefix: bytes =
     return port_store.proven_count(prefix)
 
 
+def test_the_example_of_the_module() -> None:
+    port_store = make_port_store(key=b"")
+    numbers = port_store.numbers(PEER, [11403, 11404, 11405])
+    assert list(numbers.values()) == [98949, 1]
+    assert f"{98949 - 1:021b}" == "0000110" + "0000101" + "0000100"
+
+
 @given(some_ports, keys)
 def test_numbers_hold_ports_and_prove_them(ports: list[int], key: bytes) -> None:
     port_store = make_port_store(key=key)
