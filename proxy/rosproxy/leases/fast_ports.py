@@ -17,7 +17,7 @@ class LeaseHolder(Protocol):
     """Who has a port that the kernel may forward, as the kernel plane needs it.
 
     An endpoint or stand-in of ROS 1 (`rosproxy.ros1.registry`), or a port of ROS 2
-    (`rosproxy.ros2.discovery.kernel_ports`), whose only port is its fast port as well.
+    (`rosproxy.ros2.ports.kernel_ports`), whose only port is its fast port as well.
 
     ``inside`` tells on which side its node is: who connects to it comes from the other one.
     """

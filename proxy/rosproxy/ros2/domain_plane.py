@@ -9,7 +9,7 @@ from prometheus_client.registry import Collector
 
 from rosproxy.admin import status_document as document
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.ros2.discovery.kernel_ports import KernelPorts
+from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     Participant,

@@ -37,10 +37,10 @@ from rosproxy.net.interfaces import (
 )
 from rosproxy.net.resolver import resolve
 from rosproxy.ros2.discovery.discovery_participant import ANNOUNCE_INTERVAL
-from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.domain_plane import DomainPlane
 from rosproxy.ros2.domain_settings import DomainSettings, LanRelayLink
 from rosproxy.ros2.domain_watch import DomainWatch
+from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.ports.locator_ports import REMEMBERED
 from rosproxy.ros2.ports.store import port_store_key
 from rosproxy.ros2.protocol.relay_proof import RelayProof
@@ -143,7 +143,7 @@ class Ros2:
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
             self.servers.append(server)
-            self._kernel_ports.domains.append(server.domain.inside)
+            self._kernel_ports.domains.append(server.domain.mappings)
             # Any proxy for ROS 2: these ports follow from the domain, not from the range.
             other_proxies = proxy_signs.overlapping_proxies("2", 1, 65535)
             with setting_error_if_taken(
@@ -362,7 +362,7 @@ class Ros2:
     async def _sample_rates(self) -> None:
         now = self._runtime.now()
         for server in self.servers:
-            for _, mapping in server.domain.inside.mappings.values():
+            for _, mapping in server.domain.mappings.by_port.values():
                 mapping.sample(now)
 
     async def _resolve_peer(self, peer: HostPort) -> list[HostPort]:

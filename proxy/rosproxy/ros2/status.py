@@ -106,9 +106,9 @@ class Ros2State(Collector):
         for server in self._servers:
             domain = server.domain
             number = str(server.domain.settings.number)
-            used.add_metric([number], len(domain.inside.mappings))
+            used.add_metric([number], len(domain.mappings.by_port))
             free.add_metric([number], domain.ports.pool.free)
-            lacking.add_metric([number], len(domain.inside.port_shortages))
+            lacking.add_metric([number], len(domain.mappings.shortages))
             dropped.add_metric([number], domain.refused.count)
             for (kind, inwards), size in domain.passed.items():
                 passed.add_metric([number, kind.value, "inward" if inwards else "outward"], size)
@@ -143,7 +143,7 @@ class Ros2State(Collector):
         discovery = settings.ports.advertised(settings.discovery_port)
         comparison = compare(domain.inside.by_prefix.values(), domain.outside.by_prefix.values())
         pairs = comparison.mismatched
-        shortages = domain.inside.port_shortages
+        shortages = domain.mappings.shortages
         shown_pairs = fair_choice(pairs, _address_inside, MOST_MISMATCHES)
         return document.DomainStatus(
             domain=settings.number,
@@ -151,7 +151,7 @@ class Ros2State(Collector):
             peers=tuple(peer.host if not peer.port else str(peer) for peer in settings.peers),
             lan_relay=str(settings.relay.address) if settings.relay else "",
             direction="both" if settings.both_ways else "out",
-            ports_used=len(domain.inside.mappings),
+            ports_used=len(domain.mappings.by_port),
             ports_free=domain.ports.pool.free,
             dropped=domain.refused.count,
             lost=server.lost,

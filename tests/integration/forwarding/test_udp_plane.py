@@ -12,11 +12,11 @@ from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases.ports import PortMap, PortPool, PortRange
 from rosproxy.net.addresses import HostPort, Route
-from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.domain_settings import DomainSettings, Refused
-from rosproxy.ros2.policy.verdicts import Verdicts
+from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts
+from rosproxy.ros2.ports.mappings import PortMappings
+from rosproxy.ros2.protocol.rtps import FAST_DDS
 from rosproxy.ros2.registry.participants import InsideParticipant, PortMapping, TrafficKind
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 from rosproxy.runtime import Runtime
@@ -30,7 +30,7 @@ OTHER = HostPort("192.0.2.6", 7411)
 
 
 class Bench:
-    """A plane for UDP over a made-up kernel, and the mappings of one domain; nothing listens."""
+    """A plane for UDP over a made-up kernel, and the ports of one domain; nothing listens."""
 
     def __init__(self, tools: FakeTools | None = None) -> None:
         told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": str(RANGE)}
@@ -50,14 +50,13 @@ class Bench:
         )
         refused = Refused(domain.note)
         proofs = AddressProofs(b"a secret")
-        verdicts = Verdicts(domain.judge)
-        self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused, proofs, verdicts)
-        self.mappings = KernelPorts(pool)
-        self.mappings.domains.append(self.inside)
+        self.mappings = PortMappings(domain, LocatorPorts(pool, 0.0), refused, proofs)
+        self.kernel_ports = KernelPorts(pool)
+        self.kernel_ports.domains.append(self.mappings)
         table = KernelTable(DatagramTable(RANGE), self.tools)
         self.plane = KernelPlane(
             runtime.settings,
-            self.mappings,
+            self.kernel_ports,
             runtime.tasks,
             runtime.problems,
             lambda: runtime.now() + self.later,
@@ -66,20 +65,17 @@ class Bench:
 
     async def start(self) -> None:
         await self.plane.start()
-        self.mappings.note_former(self.plane.forwards)
+        self.kernel_ports.note_former(self.plane.forwards)
         self.plane.recovered([])
 
-    def lend(self, locator: HostPort = LOCATOR, port: int = 45001) -> InsideParticipant:
-        participant = InsideParticipant(bytes(12), locator.host, b"", 0.0)
-        mapping = participant.mappings[locator] = PortMapping(port, locator, TrafficKind.USER_DATA)
-        self.inside.by_prefix[participant.prefix] = participant
-        self.inside.mappings[port] = participant, mapping
-        self.inside.changes += 1
+    def map(self, locator: HostPort = LOCATOR, port: int = 45001) -> InsideParticipant:
+        participant = InsideParticipant(bytes(12), locator.host, FAST_DDS, 0.0)
+        self.mappings.add(participant, PortMapping(port, locator, TrafficKind.USER_DATA))
         self.plane.syncer.note_change()
         return participant
 
     def end(self, participant: InsideParticipant) -> None:
-        self.inside.forget(participant)
+        self.mappings.end(participant)
         self.plane.syncer.note_change()
 
     async def forwarding(self, forwards: dict[int, HostPort]) -> None:
@@ -115,9 +111,9 @@ async def bench(sound: None) -> AsyncIterator[Bench]:
 
 
 async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
-    participant = bench.lend()
+    participant = bench.map()
     await bench.forwarding({45001: LOCATOR})
-    (mapping,) = bench.mappings
+    (mapping,) = bench.kernel_ports
     await until(lambda: bench.plane.status_of(mapping)["plane"] == "kernel", "it is told")
     assert bench.sources == {(LOCATOR.host, LOCATOR.port): OWN}
     bench.end(participant)
@@ -126,10 +122,10 @@ async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
 
 
 async def test_a_port_follows_to_another_locator(bench: Bench) -> None:
-    participant = bench.lend()
+    participant = bench.map()
     await bench.forwarding({45001: LOCATOR})
     bench.end(participant)
-    bench.lend(OTHER)
+    bench.map(OTHER)
     await bench.forwarding({45001: OTHER})
     assert bench.sources == {(OTHER.host, OTHER.port): OWN}
 
@@ -137,7 +133,7 @@ async def test_a_port_follows_to_another_locator(bench: Bench) -> None:
 async def test_another_address_of_the_proxy_is_followed(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench.lend()
+    bench.map()
     await bench.forwarding({45001: LOCATOR})
     monkeypatch.setattr(syncer, "route_towards", lambda address: Route("192.0.2.9", 1500))
     bench.later = syncer.ROUTE_TTL
@@ -150,8 +146,8 @@ async def test_a_locator_behind_a_shorter_mtu_stays_with_the_proxy(
 ) -> None:
     monkeypatch.setattr(syncer, "read_forwarding", lambda: HostForwarding(longest_packet=9000))
     bench.plane.syncer.look_around()
-    bench.lend()
-    (mapping,) = bench.mappings
+    bench.map()
+    (mapping,) = bench.kernel_ports
     assert "same MTU" in bench.plane.status_of(mapping)["reason"]
     assert bench.plane.status_of(mapping)["plane"] == "copy"
 
@@ -171,7 +167,7 @@ class NftAlone(FakeTools):
 async def test_datagrams_need_no_conntrack(sound: None, caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench(NftAlone())
     await bench.start()
-    bench.lend()
+    bench.map()
     await bench.forwarding({45001: LOCATOR})
     await bench.plane.look()
     await bench.close()
@@ -180,13 +176,13 @@ async def test_datagrams_need_no_conntrack(sound: None, caplog: pytest.LogCaptur
 
 
 async def test_datagrams_are_counted_and_need_no_answer(bench: Bench) -> None:
-    bench.lend()
+    bench.map()
     await bench.forwarding({45001: LOCATOR})
     bench.tools.counted = {"sent": 0, "received": 2028}
     for _ in range(4):
         await bench.plane.look()
         bench.tools.counted["received"] += 1000
-    (mapping,) = bench.mappings
+    (mapping,) = bench.kernel_ports
     told = bench.plane.status_of(mapping)
     assert (told["plane"], told["received"], told["received_packets"]) == ("kernel", 5028, 1)
     assert bench.plane.total.received == 5028
@@ -194,7 +190,7 @@ async def test_datagrams_are_counted_and_need_no_answer(bench: Bench) -> None:
 
 
 async def test_a_graceful_stop_resets_nobody_and_leaves_nothing(bench: Bench) -> None:
-    bench.lend()
+    bench.map()
     await bench.forwarding({45001: LOCATOR})
     await bench.close()
     assert bench.tools.table is None
@@ -202,16 +198,16 @@ async def test_a_graceful_stop_resets_nobody_and_leaves_nothing(bench: Bench) ->
 
 
 async def test_what_a_killed_process_left_goes_on_for_a_while(bench: Bench) -> None:
-    bench.lend()
-    bench.lend(OTHER, 45002)
+    bench.map()
+    bench.map(OTHER, 45002)
     await bench.forwarding({45001: LOCATOR, 45002: OTHER})
     later = Bench(bench.tools)
     await later.start()
-    later.lend(LOCATOR, 45003)
+    later.map(LOCATOR, 45003)
     await later.forwarding({45001: LOCATOR, 45002: OTHER, 45003: LOCATOR})
-    later.lend(LOCATOR, 45002)
+    later.map(LOCATOR, 45002)
     await later.forwarding({45001: LOCATOR, 45002: LOCATOR, 45003: LOCATOR})
-    later.mappings.note_former({})
+    later.kernel_ports.note_former({})
     later.plane.syncer.note_change()
     await later.forwarding({45002: LOCATOR, 45003: LOCATOR})
     await later.runtime.tasks.cancel()
@@ -219,7 +215,7 @@ async def test_what_a_killed_process_left_goes_on_for_a_while(bench: Bench) -> N
 
 async def test_a_plane_that_is_lost_is_told_apart_from_that_for_topics(bench: Bench) -> None:
     bench.tools.failing = 2
-    bench.lend()
+    bench.map()
     await until(lambda: not bench.plane.syncer.usable, "the plane is lost")
     (problem,) = bench.runtime.problems.all()
     assert problem.subject == "data plane for UDP"

@@ -8,8 +8,8 @@ import pytest
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.domain_plane import DomainPlane
+from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from tests.unit.ros2.discovery.domains import (
     INSIDE,
     NOW,
@@ -48,7 +48,7 @@ def test_why_the_kernel_does_not_forward_a_port(
     elif prefix == B:
         domain.heard_inside(spdp(B, INSIDE), INSIDE, NOW)
     mappings = KernelPorts(PortPool(domain.settings.ports.listen))
-    mappings.domains.append(domain.inside)
+    mappings.domains.append(domain.mappings)
     table = domain.inside if address == INSIDE else domain.outside
     participant = table.by_prefix[prefix]
     mapping = participant.mappings[HostPort(address, port)]

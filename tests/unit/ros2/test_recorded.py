@@ -57,7 +57,9 @@ def passed(domain: Domain, datagram: Datagram) -> list[Outgoing]:
         return [out for p in stand_ins for out in domain.at_stand_in(p, content, PUBLISHER, NOW)]
     if host != PUBLISHER:
         return domain.heard_outside(content, SUBSCRIBER, NOW)
-    mappings = [p for p, (_, mapping) in domain.inside.mappings.items() if mapping.target == target]
+    mappings = [
+        p for p, (_, mapping) in domain.mappings.by_port.items() if mapping.target == target
+    ]
     return [out for p in mappings for out in domain.at_range_port(p, content, SUBSCRIBER, NOW)]
 
 
@@ -163,7 +165,7 @@ def test_nothing_made_of_it_breaks_the_proxy(
     domain.heard_inside(bytes(content), PUBLISHER, NOW)
     domain.heard_outside(bytes(content), SUBSCRIBER, NOW)
     domain.heard_outside(spdp(B, SUBSCRIBER), SUBSCRIBER, NOW)
-    for port in list(domain.inside.mappings):
+    for port in list(domain.mappings.by_port):
         domain.at_range_port(port, bytes(content), SUBSCRIBER, NOW)
     for port in list(domain.outside.stand_ins):
         domain.at_stand_in(port, bytes(content), PUBLISHER, NOW)

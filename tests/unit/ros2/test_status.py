@@ -90,7 +90,9 @@ def announce(domain: Domain, reliability: int) -> None:
     ):
         domain.at_stand_in(stand_in, sedp(A, writer, topic, kind, 1), INSIDE, NOW)
     port = next(
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     )
     domain.at_range_port(port, sedp(B, SUBSCRIPTIONS, "rt/scan", string, reliability), ROBOT, NOW)
 
@@ -146,7 +148,7 @@ def test_who_does_not_match() -> None:
 def test_the_rate_of_a_port() -> None:
     domain = make_domain()
     announce(domain, 1)
-    (_, mapping), *_ = domain.inside.mappings.values()
+    (_, mapping), *_ = domain.mappings.by_port.values()
     mapping.sample(NOW)
     mapping.bytes += 3000
     mapping.sample(NOW + 2)
@@ -160,7 +162,7 @@ def test_metrics_tell_the_ports_that_are_left() -> None:
     state = Ros2State([cast(DomainServer, Served(domain))], cast(DomainPlane, Copied()))
     values = {sample.name: sample.value for family in state.collect() for sample in family.samples}
     used, free = (values[f"rosproxy_ros2_leases_{use}"] for use in ("used", "free"))
-    assert (used, free) == (len(domain.inside.mappings), domain.ports.pool.free)
+    assert (used, free) == (len(domain.mappings.by_port), domain.ports.pool.free)
     assert used > 0
     assert values["rosproxy_ros2_participants_without_port"] == 0
 
@@ -189,7 +191,7 @@ def test_outside_comes_in_or_may_still_do_so() -> None:
         domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + seconds)
         (outside,) = told(domain).outside
         assert outside.proven is is_proven
-    port = next(iter(domain.inside.mappings))
+    port = next(iter(domain.mappings.by_port))
     domain.at_range_port(port, spdp(B, ROBOT), ROBOT, NOW + COMES_IN_WITHIN_S)
     (outside,) = told(domain).outside
     assert outside.proven

@@ -9,7 +9,7 @@ inside through the range, to outside without the proxy. Discovery that a sender 
 read like any other where the receiver would read it (`Participant.reads_discovery_at`).
 
 Nothing here does I/O: each method takes a datagram, where it came from and the time, and gives the
-datagrams to send. After each, `mappings` and `stand_ins` tell which ports have to be open.
+datagrams to send. After each, `stand_ins` tells which ports have to be open.
 
 Every datagram may be forged. So
 
@@ -48,6 +48,7 @@ from rosproxy.ros2.domain_settings import (
 from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
+from rosproxy.ros2.ports.mappings import PortMappings
 from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import (
     destinations,
@@ -116,8 +117,9 @@ class Domain:
         self.rates = DiscoveryRates()
         self.passed = Counter[tuple[TrafficKind, bool]]()
         self.ports = LocatorPorts(pool, now)
+        self.mappings = PortMappings(settings, self.ports, refused, proofs)
         verdicts = Verdicts(settings.judge)
-        self.inside = InsideParticipants(settings, self.ports, refused, proofs, verdicts)
+        self.inside = InsideParticipants(settings, self.mappings, refused, proofs, verdicts)
         self.outside = OutsideParticipants(settings, refused, proofs, verdicts)
         settings.participants_at = self.outside.count_by_address.__getitem__
         port_store = PortStore.of(
@@ -230,7 +232,7 @@ class Domain:
 
     def is_read_at_range_port(self, port: int, datagram: bytes, source: str) -> bool:
         """Whether `at_range_port` reads a datagram, which takes long, and does not just pass it."""
-        mapped = self.inside.mappings.get(port)
+        mapped = self.mappings.by_port.get(port)
         if mapped is None:
             return False
         _, mapping = mapped
@@ -245,7 +247,7 @@ class Domain:
 
     def at_range_port(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What outside sends to a port of the range."""
-        mapped = self.inside.mappings.get(port)
+        mapped = self.mappings.by_port.get(port)
         try:
             if mapped is None:  # outside may mean a participant of before the start
                 self._note_former_use(port, datagram, source, now)
@@ -399,7 +401,7 @@ class Domain:
         if spdp.ended:
             return self._end_inside(message, source, now)
         is_new = prefix not in self.inside.by_prefix
-        if is_new and (self.ports.is_restoring(now) or self.inside.lacks_proof(prefix, source)):
+        if is_new and (self.ports.is_restoring(now) or self.mappings.lacks_proof(prefix, source)):
             return self._wait(message, source, now)
         return self._admitted_inside(message, source, now)
 
@@ -513,7 +515,7 @@ class Domain:
         """Note what a participant inside announces of itself, and tell outside."""
         prefix = message.prefix
         is_new = prefix not in self.inside.by_prefix
-        if is_new and self.inside.lacks_proof(prefix, source):
+        if is_new and self.mappings.lacks_proof(prefix, source):
             # It is announced with all of its ports or not at all: outside takes up no new locators
             # of a participant that it knows. It announces itself again.
             return self.proxy_participants.question_to_announced(message, source)

@@ -1,31 +1,27 @@
-"""The participants inside, and the ports of the range that lead to their locators."""
+"""The participants inside: which of them the proxy serves."""
 
 import contextlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
-    MOST_MAPPINGS,
     MOST_PER_ADDRESS,
     DomainSettings,
     Outgoing,
     Refused,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
-from rosproxy.ros2.ports.locator_ports import LocatorPorts
+from rosproxy.ros2.ports.mappings import PortMappings
 from rosproxy.ros2.protocol.addressing import for_all
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     ParticipantTable,
-    PortMapping,
-    PortShortage,
-    ShortageKind,
     TrafficKind,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
@@ -36,36 +32,22 @@ from rosproxy.ros2.rewriting.announced_participant import (
     traits,
 )
 from rosproxy.ros2.rewriting.discovery import (
-    Announcement,
     DiscoveryMessage,
     require_rewritable,
     rewritten,
 )
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
-PART_FOR_PROVEN = 4
-"""One of so many parts of the range is for addresses that have proved to receive."""
-PART_FOR_OTHERS = 8
-"""One of so many parts of the range is out of reach for a single address: a container that takes
-all that it can get leaves something for others."""
-
 
 @dataclass(slots=True)
 class InsideParticipants(ParticipantTable[InsideParticipant]):
-    """The participants inside; ``mappings`` by port of the range, each with its participant.
-
-    ``port_shortages`` tells why a locator got no port, by its participant's prefix. ``changes``
-    counts how often the mappings have changed.
-    """
+    """The participants inside, with their port mappings and the verdicts of the policy."""
 
     settings: DomainSettings
-    ports: LocatorPorts
+    mappings: PortMappings
     refused: Refused
     proofs: AddressProofs
     verdicts: Verdicts
-    mappings: dict[int, tuple[InsideParticipant, PortMapping]] = field(default_factory=dict)
-    port_shortages: dict[bytes, PortShortage] = field(default_factory=dict)
-    changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
         """The participant that announces itself from an address; None if it is not accepted.
@@ -89,19 +71,14 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             participant.proxy_address = self.settings.proxy_address_for(source)
             self.add(participant)
             self.settings.settled(source)
-        self._make_room(participant, spdp, datagram)
+        self.mappings.make_room(participant, spdp, datagram)
         if participant.note_vendor(source_vendor(datagram)):
-            self._mark_read(source)
+            self.mappings.mark_read(source)
         participant.until = now + lease_duration(spdp, datagram)
         participant.next_number = spdp.sample.sequence + 1
         participant.metatraffic = first_metatraffic(spdp, datagram, source)
         participant.traits = traits(spdp, datagram, source)
         return participant
-
-    def lacks_proof(self, prefix: bytes, address: str) -> bool:
-        """Whether a participant gets no port before it has answered: ports are scarce."""
-        kept = len(self.settings.ports.listen) // PART_FOR_PROVEN
-        return self.ports.pool.free <= kept and not self.proofs.has_answered(address, prefix)
 
     def gives_place(self, prefix: bytes, source: str) -> InsideParticipant | None:
         """The participant that ends for a new one at an address; None if there is none.
@@ -218,42 +195,9 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
 
     def forget(self, participant: InsideParticipant) -> None:
         """Forget a participant that has gone, and take its ports back."""
-        for mapping in participant.mappings.values():
-            self._take_back(mapping)
+        self.mappings.end(participant)
         self.remove(participant)
         self.verdicts.forget(participant)
-        self._mark_read(participant.address)
-        self.port_shortages.pop(participant.prefix, None)
-
-    def _make_room(
-        self, participant: InsideParticipant, spdp: Announcement, datagram: bytes
-    ) -> None:
-        """Take back ports of locators that a participant no longer names, if it has too many.
-
-        A forged announcement may have named them.
-        """
-        address = participant.address
-        named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
-        if len(named) <= MOST_MAPPINGS < len(named | participant.mappings.keys()):
-            for locator in participant.mappings.keys() - named:
-                self._take_back(participant.mappings.pop(locator))
-            self.port_shortages.pop(participant.prefix, None)
-            self._mark_read(address)
-
-    def _take_back(self, mapping: PortMapping) -> None:
-        del self.mappings[mapping.port]
-        self.ports.give_back(mapping.port)
-
-    def _mark_read(self, address: str) -> None:
-        """Mark the mappings to locators at which a participant at an address reads discovery.
-
-        A participant may name the locator of another participant at the same address.
-        """
-        mappings = [(p, mapping) for p in self.at(address) for mapping in p.mappings.values()]
-        read = {mapping.target for p, mapping in mappings if p.reads_discovery_at(mapping)}
-        for _, mapping in mappings:
-            mapping.is_read = mapping.target in read
-        self.changes += 1
 
     def _lead_out(
         self,
@@ -264,79 +208,6 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
         locator: HostPort,
     ) -> HostPort | None:
         """The address and port at which outside reaches a locator; None if it does not."""
-        if locator.host != participant.address or self._is_own(locator):
-            return None
         is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
         kind = TrafficKind.METATRAFFIC if is_metatraffic else TrafficKind.USER_DATA
-        mapping = participant.mappings.get(locator)
-        if mapping is None:
-            # Ports are kept in the order in which they were lent (`ports` of a participant).
-            index = len(participant.mappings)
-            former_port = kept[index] if index < len(kept) else None
-            mapping = self._lend(participant, locator, kind, former_port, now)
-        if mapping is None:
-            return None
-        if is_metatraffic and mapping.kind is not kind:
-            mapping.kind = kind  # Cyclone DDS has one locator for both
-            self._mark_read(participant.address)
-        host = self.settings.host_for(locator.host)
-        return HostPort(host, self.settings.ports.advertised(mapping.port))
-
-    def _is_own(self, locator: HostPort) -> bool:
-        """Whether a locator is a port of the range itself: a datagram there would never end."""
-        in_range = locator.port in self.settings.ports.listen
-        return in_range and locator.host == self.settings.proxy_address_for(locator.host)
-
-    def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
-        """Have a participant meet all outside anew, which knows it by a port that it lost."""
-        participant.parting_from = now
-        text = f"participant {participant.guid_prefix} gets another port than {former_port}, which "
-        text += "another participant claims as well; outside discovers the participant anew"
-        self.refused("port_claim", participant.address, text)
-
-    def _has_its_share(self, address: str) -> bool:
-        """Whether those at an address have as many ports as they may together.
-
-        That does not depend on what others have: so all get the same again after a restart,
-        whoever comes first.
-        """
-        size = len(self.settings.ports.listen)
-        at_address = (p for p in self.by_prefix.values() if p.address == address)
-        return sum(len(p.mappings) for p in at_address) >= size - size // PART_FOR_OTHERS
-
-    def _lend(
-        self,
-        participant: InsideParticipant,
-        locator: HostPort,
-        kind: TrafficKind,
-        former_port: int | None,
-        now: float,
-    ) -> PortMapping | None:
-        if len(participant.mappings) >= MOST_MAPPINGS:
-            text = f"{locator} got no port: the participant has more than {MOST_MAPPINGS} locators"
-            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.BOUND, text)
-            return None
-        ports = self.settings.ports.listen
-        if self._has_its_share(participant.address):
-            text = f"{locator} got no port: {participant.address} already has as many ports of "
-            text += f"{ports} as one address may have"
-            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
-            return None
-        if self.lacks_proof(participant.prefix, participant.address):
-            text = (
-                f"{locator} got no port: the participant does not answer the proxy, and the last "
-            )
-            text += f"free ports of {ports} are for participants that answer"
-            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
-            return None
-        port = self.ports.take(participant.prefix, locator, kind, now, former_port)
-        if port is None:
-            text = f"{locator} got no port: no port of {ports} is free"
-            self.port_shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
-            return None
-        if former_port not in (None, port) and self.ports.is_restoring(now):
-            self._lose(participant, former_port, now)
-        mapping = participant.mappings[locator] = PortMapping(port, locator, kind)
-        self.mappings[port] = participant, mapping
-        self._mark_read(participant.address)
-        return mapping
+        return self.mappings.advertised(participant, locator, kind, kept, now)

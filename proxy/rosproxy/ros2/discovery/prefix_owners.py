@@ -49,5 +49,5 @@ class PrefixOwners:
             return False
         insider = self.inside.by_prefix.get(prefix)
         if insider is not None:
-            return not insider.was_inside and self.inside.ports.is_restoring(now)
+            return not insider.was_inside and self.inside.mappings.ports.is_restoring(now)
         return not self.former_ports.was_inside(prefix)

@@ -428,7 +428,7 @@ class DomainServer:
 
     def _tell_changes(self) -> None:
         """Tell that mappings have changed, if they have."""
-        changes = self.domain.inside.changes
+        changes = self.domain.mappings.changes
         if changes != self._told_changes:
             self._told_changes = changes
             self._changed()

@@ -55,7 +55,7 @@ def told_of_participant(domain: Domain, *hosts: str) -> list[str]:
 
 def told_of_writer(domain: Domain, *hosts: str) -> list[str]:
     domain.heard_outside(participant(ROBOT, ROBOT), ROBOT, NOW)
-    (port,) = [port for port, (_, le) in domain.inside.mappings.items() if le.target.port == 7410]
+    (port,) = [port for port, (_, le) in domain.mappings.by_port.items() if le.target.port == 7410]
     (sent,) = domain.at_range_port(port, writer(*hosts), ROBOT, NOW)
     return [locator.host for locator in reached_at(sent.datagram)]
 

@@ -58,7 +58,7 @@ def data_port(domain: Domain) -> int:
     """The port that leads to where A receives user data."""
     (port,) = [
         p
-        for p, (_, mapping) in domain.inside.mappings.items()
+        for p, (_, mapping) in domain.mappings.by_port.items()
         if mapping.kind is TrafficKind.USER_DATA
     ]
     return port
@@ -129,7 +129,7 @@ def test_a_peers_discovery_in_fragments_is_policed() -> None:
 def test_fragments_at_both_ports_of_a_participant_do_not_make_a_whole() -> None:
     """Cyclone DDS joins fragments from all sockets."""
     domain = met()
-    (meta,) = domain.inside.mappings.keys() - {data_port(domain)}
+    (meta,) = domain.mappings.by_port.keys() - {data_port(domain)}
     first, second = in_fragments(B)
     assert domain.at_range_port(meta, first, ROBOT, NOW) == []
     assert domain.at_range_port(data_port(domain), second, ROBOT, NOW) == []

@@ -63,7 +63,9 @@ def test_inside_is_told_of_stand_ins_alone() -> None:
 def test_locators_of_readers_and_writers_get_one_too() -> None:
     domain = both_ways()
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     (sent,) = domain.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     (locator,) = reached_at(sent.datagram)
@@ -85,7 +87,9 @@ def test_no_locator_leads_to_another_host() -> None:
     datagram = spdp(B, ROBOT).replace(bytes([10, 0, 0, 9]), bytes([10, 0, 0, 8]))
     domain.heard_outside(datagram, ROBOT, NOW)
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     (sent,) = domain.at_range_port(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
@@ -96,7 +100,7 @@ def test_after_a_restart_the_discovery_participant_learns_which_ones_there_are()
     before = both_ways()
     after = both_ways()
     (port,) = [
-        p for p, (_, mapping) in before.inside.mappings.items() if mapping.target.port == 7410
+        p for p, (_, mapping) in before.mappings.by_port.items() if mapping.target.port == 7410
     ]
     before.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
     after.heard_outside(

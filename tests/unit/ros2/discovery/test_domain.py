@@ -67,7 +67,7 @@ def test_a_participant_inside_is_told_outside_with_ports_of_the_range() -> None:
     assert told == carried
     meta, user = reached_at(told)
     assert {meta.host, user.host} == {HOST}
-    mappings = {mapping.target.port: mapping for _, mapping in domain.inside.mappings.values()}
+    mappings = {mapping.target.port: mapping for _, mapping in domain.mappings.by_port.values()}
     assert (meta.port - 1000, user.port - 1000) == (mappings[7410].port, mappings[7411].port)
     assert [mappings[7410].kind, mappings[7411].kind] == [
         TrafficKind.METATRAFFIC,
@@ -131,13 +131,13 @@ def test_a_participant_at_two_networks_is_served_at_the_first() -> None:
     domain = make_domain()
     meet(domain)
     assert domain.heard_inside(spdp(A, OTHER), OTHER, NOW) == []
-    assert {mapping.target.host for _, mapping in domain.inside.mappings.values()} == {INSIDE}
+    assert {mapping.target.host for _, mapping in domain.mappings.by_port.values()} == {INSIDE}
 
 
 def test_nobody_gets_a_way_to_somebody_elses_address() -> None:
     domain = make_domain()
     sent = domain.heard_inside(spdp(A, OTHER), INSIDE, NOW)
-    assert not domain.inside.mappings
+    assert not domain.mappings.by_port
     assert reached_at(to(sent, ROBOT)[0]) == []
 
 
@@ -145,7 +145,9 @@ def test_what_outside_sends_goes_to_the_locator() -> None:
     domain = make_domain()
     meet(domain)
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7411
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7411
     ]
     datagram = message(submessage(0x07, 0, bytes(28)), prefix=B)
     assert domain.at_range_port(port, datagram, STRANGER, NOW) == [
@@ -157,7 +159,9 @@ def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
     domain = make_domain()
     meet(domain)
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     (sent,) = domain.at_range_port(port, spdp(B, ROBOT), ROBOT, NOW)
     assert sent.target == HostPort(INSIDE, 7410)
@@ -181,7 +185,9 @@ def test_loopback_is_for_those_on_this_machine(near: str, robot: str, told: list
     meet(domain)
     domain.heard_outside(spdp(B, robot), robot, NOW)
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     (sent,) = domain.at_range_port(port, sedp(B, "127.0.1.10", 7000), robot, NOW)
     assert reached_at(sent.datagram) == told
@@ -204,7 +210,7 @@ def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
     assert {reminder.target for reminder in reminders} == {HostPort(INSIDE, 7410)}
     (locator,) = reached_at(sent.datagram)
     assert locator.host == HOST
-    assert domain.inside.mappings[locator.port - 1000][1].target.port == 7000
+    assert domain.mappings.by_port[locator.port - 1000][1].target.port == 7000
     (endpoint,) = domain.inside.by_prefix[A].endpoints.values()
     assert (endpoint.topic, endpoint.type_name) == ("rt/chatter", "Str")
 
@@ -213,7 +219,9 @@ def test_a_stranger_is_not_answered() -> None:
     domain = make_domain()
     meet(domain)
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     assert domain.at_range_port(port, spdp(B, STRANGER), STRANGER, NOW) == []
     assert domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW) == []
@@ -231,13 +239,13 @@ def test_nobody_takes_the_prefix_of_another() -> None:
     domain = make_domain()
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    before = dict(domain.inside.mappings)
+    before = dict(domain.mappings.by_port)
     assert domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW) == []
     assert domain.heard_inside(spdp(B, OTHER), OTHER, NOW) == []
     assert domain.heard_inside(spdp(A, OTHER, 9000), OTHER, NOW) == []
     assert domain.heard_inside(dispose_message(A), OTHER, NOW) == []
     assert domain.heard_outside(carried(STRANGER, dispose_message(B)), LAN_RELAY.host, NOW) == []
-    assert domain.inside.mappings == before
+    assert domain.mappings.by_port == before
     assert domain.outside.by_prefix.keys() == {B}
 
 
@@ -253,7 +261,9 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
             sent += len(outgoing.datagram) if outgoing.target.host == ROBOT else 0
     assert 0 < sent <= len(heard)
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     domain.at_range_port(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
     assert domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
@@ -275,11 +285,11 @@ def test_a_range_that_is_too_short_is_told() -> None:
         address = f"172.30.0.{number}"
         prove(domain, address, prefixes=[prefix])
         domain.heard_inside(spdp(prefix, address), address, NOW)
-    assert len(domain.inside.mappings) == 15  # of sixteen, one is for discovery
-    shortages = domain.inside.port_shortages.values()
+    assert len(domain.mappings.by_port) == 15  # of sixteen, one is for discovery
+    shortages = domain.mappings.shortages.values()
     assert all("got no port: no port of" in shortage.text for shortage in shortages)
     assert {shortage.kind for shortage in shortages} == {ShortageKind.RANGE}
-    assert domain.inside.port_shortages
+    assert domain.mappings.shortages
 
 
 def test_who_has_gone_gives_everything_back() -> None:
@@ -290,7 +300,7 @@ def test_who_has_gone_gives_everything_back() -> None:
     domain.expire(NOW + 21)
     assert not domain.inside.by_prefix
     assert not domain.outside.by_prefix
-    assert not domain.inside.mappings
+    assert not domain.mappings.by_port
     assert not domain.outside.stand_ins
     assert domain.ports.pool.free == free + 2
     meet(domain)
@@ -304,9 +314,9 @@ def test_ports_are_given_once_it_is_known_who_had_which() -> None:
     told, *asked = domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     assert {told.target, *(out.target for out in asked)} == {HostPort(INSIDE, 7410)}
     assert len(to(settle(domain, 0.5), INSIDE)) == 2  # asked again
-    assert not domain.inside.mappings
+    assert not domain.mappings.by_port
     assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
-    assert domain.inside.mappings
+    assert domain.mappings.by_port
 
 
 def test_a_participant_says_which_ports_it_had() -> None:
@@ -319,7 +329,7 @@ def test_a_participant_says_which_ports_it_had() -> None:
     )  # from somewhere else it is nobody's word
     domain.heard_inside(answer, INSIDE, 0.2)
     settle(domain, SETTLING)
-    ports = {mapping.target.port: port for port, (_, mapping) in domain.inside.mappings.items()}
+    ports = {mapping.target.port: port for port, (_, mapping) in domain.mappings.by_port.items()}
     assert ports == {7410: 45009, 7411: 45004}
 
 
@@ -334,7 +344,7 @@ def test_what_a_peer_says_of_a_port_counts_more_than_what_others_do() -> None:
     settle(domain, SETTLING + ANSWER_TIME)
     ports = {
         participant.prefix: port
-        for port, (participant, mapping) in domain.inside.mappings.items()
+        for port, (participant, mapping) in domain.mappings.by_port.items()
         if mapping.kind is TrafficKind.METATRAFFIC
     }
     assert ports[A] in {45002, 45005}
@@ -608,8 +618,8 @@ def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -
     assert read_discovery(ended).announcements[0].ended
     (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
     ports = {RANGE.listen.first + p.port - RANGE.advertise.first for p in reached_at(again)}
-    assert {domain.inside.mappings[port][1].target.port for port in ports} == {7410, 7411}
-    assert len(domain.inside.mappings) <= MOST_MAPPINGS
+    assert {domain.mappings.by_port[port][1].target.port for port in ports} == {7410, 7411}
+    assert len(domain.mappings.by_port) <= MOST_MAPPINGS
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 3)
     assert not domain.inside.by_prefix[A].is_apart
 

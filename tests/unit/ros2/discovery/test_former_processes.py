@@ -59,12 +59,12 @@ def outside(domain: Domain, prefix: bytes, answers: bool = True) -> list[Outgoin
 def test_inside_a_new_process_ends_the_former_one() -> None:
     domain = make_domain()
     inside(domain, FORMER)
-    ports = set(domain.inside.mappings)
+    ports = set(domain.mappings.by_port)
     told = ended(inside(domain, NEXT), ROBOT)
     assert told == [FORMER]
     assert list(domain.inside.by_prefix) == [NEXT]
-    assert not ports & domain.inside.mappings.keys()
-    assert len(domain.inside.mappings) == len(ports)
+    assert not ports & domain.mappings.by_port.keys()
+    assert len(domain.mappings.by_port) == len(ports)
 
 
 def test_outside_a_new_process_ends_the_former_one() -> None:
@@ -130,4 +130,4 @@ def test_a_former_process_ends_for_one_that_waited_for_ports() -> None:
         inside(domain, life)
         domain.heard_inside(spdp(life, INSIDE), INSIDE, NOW)
         assert list(domain.inside.by_prefix) == [life]
-    assert len(domain.inside.mappings) == 2
+    assert len(domain.mappings.by_port) == 2

@@ -42,7 +42,7 @@ def denying() -> Domain:
 
 
 def metatraffic(domain: Domain) -> int:
-    (port,) = [port for port, (_, le) in domain.inside.mappings.items() if le.target.port == 7410]
+    (port,) = [port for port, (_, le) in domain.mappings.by_port.items() if le.target.port == 7410]
     return port
 
 

@@ -173,7 +173,7 @@ def test_an_unproven_participant_has_no_credit_for_copies(
     domain = make_domain(peers=[])
     domain.heard_outside(carried(STRANGER, spdp(B, STRANGER)), LAN_RELAY.host, NOW)
     meet(domain)
-    (port, *_) = domain.inside.mappings
+    (port, *_) = domain.mappings.by_port
     info_dst = submessage(0x0E, 0, bytes([7]) * size)
     datagram = shared_message([B] * 100, info_dst, to_each=heartbeat(1, 0))
     if is_at_range_port:
@@ -215,7 +215,7 @@ def test_one_address_leaves_ports_for_others() -> None:
     for number, prefix in enumerate(prefixes):
         domain.heard_inside(spdp(prefix, INSIDE, 7410 + 10 * number), INSIDE, NOW)
     assert domain.ports.pool.free == 1  # of 16 the first is the proxy's own, and two are for others
-    assert "as many" in domain.inside.port_shortages[prefixes[-1]].text
+    assert "as many" in domain.mappings.shortages[prefixes[-1]].text
     meet(domain, B, OTHER)
     assert len(domain.inside.by_prefix[B].mappings) == 1
 
@@ -224,9 +224,9 @@ def test_no_port_of_the_range_leads_to_the_range() -> None:
     """A datagram there never ended: a process on the proxy's own machine could do that."""
     domain = make_domain()
     domain.heard_inside(spdp(A, NEAR, RANGE.listen.first + 2), NEAR, NOW)
-    assert not domain.inside.mappings
+    assert not domain.mappings.by_port
     domain.heard_inside(spdp(B, NEAR, 7410), NEAR, NOW)
-    assert len(domain.inside.mappings) == 2
+    assert len(domain.mappings.by_port) == 2
 
 
 def test_users_data_of_before_a_restart_is_not_charged() -> None:
@@ -375,7 +375,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
     domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
     domain.heard_outside(carried(STRANGER, spdp(EVIL, STRANGER) + behind), LAN_RELAY.host, NOW)
-    assert (domain.refused.count, domain.inside.mappings) == (3, {})
+    assert (domain.refused.count, domain.mappings.by_port) == (3, {})
     assert EVIL not in {*domain.inside.by_prefix, *domain.outside.by_prefix}
     meet(domain, A, OTHER)
     assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), OTHER)
@@ -396,7 +396,7 @@ def test_who_can_not_be_rewritten_is_not_taken_in(monkeypatch: pytest.MonkeyPatc
     domain.heard_inside(spdp(EVIL, INSIDE) + behind, INSIDE, NOW)
     domain.heard_outside(spdp(EVIL, ROBOT) + behind, ROBOT, NOW)
     assert not domain.inside.by_prefix
-    assert not domain.inside.mappings
+    assert not domain.mappings.by_port
     assert not domain.outside.by_prefix
     assert meet(domain)
     assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
@@ -461,6 +461,6 @@ def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     meet(domain)
     monkeypatch.setattr(discovery_domain, "read_messages", None)
     domain.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
-    for port in domain.inside.mappings:
+    for port in domain.mappings.by_port:
         domain.at_range_port(port, message(prefix=B), STRANGER, NOW)
     assert STRANGER not in domain.rates._by_source

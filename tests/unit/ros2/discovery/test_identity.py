@@ -70,7 +70,7 @@ def test_no_participant_has_the_prefix_of_one_of_the_proxys_own(whose: str) -> N
     }
     prefix = own[whose]
     (port,) = [
-        p for p, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        p for p, (_, mapping) in domain.mappings.by_port.items() if mapping.target.port == 7410
     ]
     sent = list[Outgoing]()
     for said in (spdp(prefix, ROBOT), dispose_message(prefix)):

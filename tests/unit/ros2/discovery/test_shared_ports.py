@@ -59,9 +59,9 @@ def shared() -> tuple[Domain, int, int]:
     domain = make_domain(both_ways=True)
     domain.heard_inside(message(announcement(A, INSIDE), prefix=A), INSIDE, NOW)
     domain.heard_outside(message(announcement(B, ROBOT), prefix=B), ROBOT, NOW)
-    (port,) = domain.inside.mappings
+    (port,) = domain.mappings.by_port
     (stand_in,) = domain.outside.stand_ins
-    assert domain.inside.mappings[port][1].kind is TrafficKind.METATRAFFIC
+    assert domain.mappings.by_port[port][1].kind is TrafficKind.METATRAFFIC
     return domain, port, stand_in
 
 

@@ -140,7 +140,7 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(datagram=datagrams(), source=ADDRESS, port=st.integers(45001, 45015))
     def a_port_gets_something(self, datagram: bytes, source: str, port: int) -> None:
-        mapped = self.domain.inside.mappings.get(port)
+        mapped = self.domain.mappings.by_port.get(port)
         self.came[source] += len(datagram)
         sent = self.domain.at_range_port(port, datagram, source, self.now)
         target = mapped[1].target if mapped else None
@@ -248,22 +248,26 @@ class Neighbours(RuleBasedStateMachine):
     def mappings_are_of_those_inside(self) -> None:
         inside = self.domain.inside
         pool = self.domain.ports.pool
-        assert pool.free + len(inside.mappings) + 1 == len(pool.range)
+        by_port = self.domain.mappings.by_port
+        assert pool.free + len(by_port) + 1 == len(pool.range)
         mappings = [
             mapping
             for participant in inside.by_prefix.values()
             for mapping in participant.mappings.values()
         ]
-        assert len(mappings) == len(inside.mappings)
-        for port, (participant, mapping) in inside.mappings.items():
+        assert len(mappings) == len(by_port)
+        for port, (participant, mapping) in by_port.items():
             assert inside.by_prefix[participant.prefix] is participant
             assert participant.mappings[mapping.target] is mapping
             assert (mapping.port, mapping.target.host) == (port, participant.address)
             assert not pool.is_free(port)
+        by_address = self.domain.mappings._by_address
+        assert {port: pair for at in by_address.values() for port, pair in at.items()} == by_port
+        assert all(by_address.values())
         assert inside.count_by_address == Counter(
             participant.address for participant in inside.by_prefix.values()
         )
-        assert inside.port_shortages.keys() <= inside.by_prefix.keys()
+        assert self.domain.mappings.shortages.keys() <= inside.by_prefix.keys()
 
     @invariant()
     def stand_ins_are_of_those_outside(self) -> None:

@@ -61,7 +61,9 @@ def outwards(domain: Domain) -> list[Outgoing]:
 
 def inwards(domain: Domain) -> list[Outgoing]:
     (port,) = [
-        port for port, (_, mapping) in domain.inside.mappings.items() if mapping.target.port == 7410
+        port
+        for port, (_, mapping) in domain.mappings.by_port.items()
+        if mapping.target.port == 7410
     ]
     return domain.at_range_port(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
 

@@ -8,7 +8,6 @@ import pytest
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.inside_participants import PART_FOR_PROVEN
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE_UNPROVEN,
     MOST_INTRODUCED_UNPROVEN,
@@ -21,6 +20,7 @@ from rosproxy.ros2.domain_settings import (
     Outgoing,
 )
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.mappings import PART_FOR_PROVEN
 from rosproxy.ros2.protocol.addressing import destination
 from rosproxy.ros2.protocol.reliable import acknowledged
 from rosproxy.ros2.protocol.rtps import HEADER, PREFIX, source_prefix
@@ -125,7 +125,7 @@ def test_a_participant_that_is_not_introduced_reaches_nothing_inside() -> None:
     meet(domain)
     forge(domain, 0, MOST_INTRODUCED_UNPROVEN)
     hear(domain, B, LAPTOP)
-    (port, *_) = domain.inside.mappings
+    (port, *_) = domain.mappings.by_port
     for said in (spdp(B, LAPTOP), sedp(B, LAPTOP, 7411, to=A)):
         assert to(domain.at_range_port(port, said, LAPTOP, NOW), INSIDE) == []
     assert not domain.outside.by_prefix[B].mappings
@@ -233,7 +233,7 @@ def test_a_participant_that_only_answers_is_sent_three_times_as_much() -> None:
     meet(domain)
     hear(domain, B, LAPTOP)
     outsider = domain.outside.by_prefix[B]
-    (port, *_) = domain.inside.mappings
+    (port, *_) = domain.mappings.by_port
     before = outsider.credit
     said = sedp(B, LAPTOP, 7411, to=A)
     domain.at_range_port(port, said, LAPTOP, NOW)

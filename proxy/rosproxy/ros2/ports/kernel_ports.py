@@ -1,9 +1,9 @@
-"""Which ports of the range the kernel may forward, and to which locators: those of user data.
+"""The ports of the range that the kernel may forward, each with its locator: those of user data.
 
-The proxy reads and rewrites discovery. So the kernel forwards a port only if discovery
-is ignored there: a port for user data of Fast DDS (`Participant.reads_discovery_at`). All that
-arrives at such a port goes to one locator. A port that the kernel forwarded before the proxy
-started is here until the proxy lends the port, or until no participant is left that could claim the
+The proxy reads and rewrites discovery. So the kernel forwards a port only if the participant
+ignores discovery there: a port for user data of Fast DDS (`Participant.reads_discovery_at`). All
+that arrives at such a port goes to one locator. A port that the kernel forwarded before the proxy
+started is here until the proxy maps the port, or until no participant is left that could claim the
 port. Meanwhile the kernel goes on forwarding as the former process had told it to.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.inside_participants import InsideParticipants
+from rosproxy.ros2.ports.mappings import PortMappings
 
 
 @dataclass(eq=False, slots=True)
@@ -54,14 +54,14 @@ class ForwardedPort:
 
 
 class KernelPorts:
-    """The mappings of user data of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
+    """The kernel ports of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
 
-    ``domains`` are the participants inside of each; ``pool`` are the ports of all.
+    ``domains`` are the port mappings of each; ``pool`` are the ports of all.
     """
 
     def __init__(self, pool: PortPool) -> None:
         self.pool = pool
-        self.domains: list[InsideParticipants] = []
+        self.domains: list[PortMappings] = []
         self._former: dict[int, ForwardedPort] = {}
         self._cached: dict[int, ForwardedPort] = {}
         self._cached_changes = -1
@@ -69,12 +69,12 @@ class KernelPorts:
     @property
     def by_port(self) -> Mapping[int, ForwardedPort]:
         """All of them by their ports."""
-        changes = sum(inside.changes for inside in self.domains)
+        changes = sum(mappings.changes for mappings in self.domains)
         if changes != self._cached_changes:
             self._cached_changes = changes
-            self._cached = {mapping.port: mapping for mapping in self._mappings()}
-            lent_ports = {port for inside in self.domains for port in inside.mappings}
-            for port in lent_ports & self._former.keys():
+            self._cached = {forwarded.port: forwarded for forwarded in self._mapped()}
+            mapped_ports = {port for mappings in self.domains for port in mappings.by_port}
+            for port in mapped_ports & self._former.keys():
                 del self._former[port]
             self._cached |= self._former
         return self._cached
@@ -91,15 +91,15 @@ class KernelPorts:
         }
         self._cached_changes = -1  # none: all is looked at anew
 
-    def _mappings(self) -> Iterator[ForwardedPort]:
-        """The mappings that are lent, each the same object for as long as it leads to the same."""
-        for inside in self.domains:
-            for port, (participant, mapping) in inside.mappings.items():
+    def _mapped(self) -> Iterator[ForwardedPort]:
+        """The mapped ports, each the same object for as long as it leads to the same locator."""
+        for mappings in self.domains:
+            for port, (participant, mapping) in mappings.by_port.items():
                 if mapping.is_read:
                     continue
                 label = f"{participant.guid_prefix} at {participant.address}"
                 cached = self._cached.get(port)
-                # The kernel plane takes another object for another mapping (`ForwardSyncer`).
+                # The kernel plane takes another object for another lease (`ForwardSyncer`).
                 if cached is not None and (cached.target, cached.label) == (mapping.target, label):
                     yield cached
                 else:

@@ -4,8 +4,8 @@ from rosproxy.forwarding.kernel.decisions import HostForwarding, destination
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort, Route
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.kernel_ports import KernelPorts
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
+from rosproxy.ros2.ports.kernel_ports import KernelPorts
 from rosproxy.ros2.ports.locator_ports import SETTLING
 from rosproxy.ros2.registry.participants import TrafficKind
 from tests.unit.ros2.discovery.domains import (
@@ -26,7 +26,7 @@ LOCATOR = HostPort(INSIDE, 7411)
 
 def kernel_ports_of(domain: Domain) -> KernelPorts:
     kernel_ports = KernelPorts(PortPool(domain.settings.ports.listen))
-    kernel_ports.domains.append(domain.inside)
+    kernel_ports.domains.append(domain.mappings)
     return kernel_ports
 
 
@@ -41,7 +41,7 @@ def test_only_user_data_is_forwarded() -> None:
     meet(domain)
     ((port, target),) = led(kernel_ports).items()
     assert target == LOCATOR
-    assert domain.inside.mappings[port][1].kind is TrafficKind.USER_DATA
+    assert domain.mappings.by_port[port][1].kind is TrafficKind.USER_DATA
     (forwarded,) = kernel_ports
     assert destination(forwarded, HostForwarding(), Route("172.30.0.2", 1500), False) == LOCATOR
     assert destination(forwarded, HostForwarding(), Route(INSIDE, 1500), False) != LOCATOR
@@ -93,7 +93,7 @@ def test_a_port_at_which_discovery_is_read_is_not_forwarded() -> None:
     domain = make_domain()
     kernel_ports = kernel_ports_of(domain)
     domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 100)
-    assert [forwarded.kind for _, forwarded in domain.inside.mappings.values()] == [*TrafficKind]
+    assert [forwarded.kind for _, forwarded in domain.mappings.by_port.values()] == [*TrafficKind]
     assert led(kernel_ports) == {}
 
 
@@ -115,5 +115,5 @@ def test_what_an_older_process_forwarded_to_such_a_port_ends_with_the_participan
     assert led(kernel_ports) == {port: LOCATOR}
     domain.heard_inside(of_vendor(spdp(A, INSIDE)), INSIDE, 0.0)
     settle(domain, SETTLING + ANSWER_TIME)
-    assert domain.inside.mappings[port][1].target == LOCATOR
+    assert domain.mappings.by_port[port][1].target == LOCATOR
     assert led(kernel_ports) == {}

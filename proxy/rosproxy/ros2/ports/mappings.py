@@ -1,0 +1,192 @@
+"""The port mappings of a domain: which port of the range leads to which locator inside.
+
+A participant inside gets a port for each of its locators at the address that it sends from, and for
+no other: no announcement makes the proxy a way to another host. Outside sees these ports in place
+of the locators. `rosproxy.ros2.ports.locator_ports` chooses the port.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.domain_settings import MOST_MAPPINGS, DomainSettings, Refused
+from rosproxy.ros2.ports.locator_ports import LocatorPorts
+from rosproxy.ros2.registry.participants import (
+    InsideParticipant,
+    PortMapping,
+    PortShortage,
+    ShortageKind,
+    TrafficKind,
+)
+from rosproxy.ros2.rewriting.discovery import Announcement
+from rosproxy.ros2.sources.address_proofs import AddressProofs
+
+PART_FOR_PROVEN = 4
+"""One of so many parts of the range is for addresses that have proved to receive."""
+PART_FOR_OTHERS = 8
+"""One of so many parts of the range is out of reach for a single address: a container that takes
+all that it can get leaves something for others."""
+
+Holder = tuple[InsideParticipant, PortMapping]
+"""A participant, and one of its port mappings."""
+
+
+@dataclass(slots=True)
+class PortMappings:
+    """The port mappings, ``by_port``, each with its participant.
+
+    ``shortages`` tells why a locator got no port, by the GUID prefix of its participant.
+    ``changes`` counts how often the mappings have changed.
+    """
+
+    settings: DomainSettings
+    ports: LocatorPorts
+    refused: Refused
+    proofs: AddressProofs
+    by_port: dict[int, Holder] = field(default_factory=dict)
+    shortages: dict[bytes, PortShortage] = field(default_factory=dict)
+    changes: int = 0
+    _by_address: dict[str, dict[int, Holder]] = field(default_factory=dict)
+
+    def lacks_proof(self, prefix: bytes, address: str) -> bool:
+        """Whether a participant gets no port before it has answered: ports are scarce."""
+        kept = len(self.settings.ports.listen) // PART_FOR_PROVEN
+        return self.ports.pool.free <= kept and not self.proofs.has_answered(address, prefix)
+
+    def advertised(
+        self,
+        participant: InsideParticipant,
+        locator: HostPort,
+        kind: TrafficKind,
+        former_ports: Sequence[int],
+        now: float,
+    ) -> HostPort | None:
+        """Return where outside reaches a locator; None if it does not. Maps a port if necessary.
+
+        ``former_ports`` are the ports that the participant is known to have had before the proxy
+        started, in the order of its locators.
+        """
+        if locator.host != participant.address or self._is_own(locator):
+            return None
+        mapping = participant.mappings.get(locator)
+        if mapping is None:
+            # Ports are kept in the order in which they were mapped (`ports` of a participant).
+            index = len(participant.mappings)
+            former_port = former_ports[index] if index < len(former_ports) else None
+            mapping = self._map(participant, locator, kind, former_port, now)
+        if mapping is None:
+            return None
+        if kind is TrafficKind.METATRAFFIC and mapping.kind is not kind:
+            mapping.kind = kind  # Cyclone DDS has one locator for both
+            self.mark_read(participant.address)
+        host = self.settings.host_for(locator.host)
+        return HostPort(host, self.settings.ports.advertised(mapping.port))
+
+    def add(self, participant: InsideParticipant, mapping: PortMapping) -> None:
+        """Have a port lead to a locator of a participant."""
+        participant.mappings[mapping.target] = mapping
+        self.by_port[mapping.port] = participant, mapping
+        self._by_address.setdefault(participant.address, {})[mapping.port] = participant, mapping
+        self.mark_read(participant.address)
+
+    def end(self, participant: InsideParticipant) -> None:
+        """Take back all ports of a participant that has gone."""
+        for mapping in participant.mappings.values():
+            self._take_back(participant.address, mapping)
+        self.shortages.pop(participant.prefix, None)
+        self.mark_read(participant.address)
+
+    def make_room(
+        self, participant: InsideParticipant, spdp: Announcement, datagram: bytes
+    ) -> None:
+        """Take back ports of locators that a participant no longer names, if it has too many.
+
+        A forged announcement may have named them.
+        """
+        address = participant.address
+        named = {locator for _, locator in spdp.reached_at(datagram) if locator.host == address}
+        if len(named) <= MOST_MAPPINGS < len(named | participant.mappings.keys()):
+            for locator in participant.mappings.keys() - named:
+                self._take_back(address, participant.mappings.pop(locator))
+            self.shortages.pop(participant.prefix, None)
+            self.mark_read(address)
+
+    def mark_read(self, address: str) -> None:
+        """Mark the mappings to locators at which a participant at an address reads discovery.
+
+        A participant may name the locator of another participant at the same address.
+        """
+        holders = self._by_address.get(address, {}).values()
+        read = {mapping.target for p, mapping in holders if p.reads_discovery_at(mapping)}
+        for _, mapping in holders:
+            mapping.is_read = mapping.target in read
+        self.changes += 1
+
+    def _map(
+        self,
+        participant: InsideParticipant,
+        locator: HostPort,
+        kind: TrafficKind,
+        former_port: int | None,
+        now: float,
+    ) -> PortMapping | None:
+        """Map a port to a locator; None, with a shortage, if the locator gets none."""
+        if shortage := self._shortage(participant, locator):
+            self.shortages[participant.prefix] = shortage
+            return None
+        port = self.ports.take(participant.prefix, locator, kind, now, former_port)
+        if port is None:
+            text = f"{locator} got no port: no port of {self.settings.ports.listen} is free"
+            self.shortages[participant.prefix] = PortShortage(ShortageKind.RANGE, text)
+            return None
+        if former_port not in (None, port) and self.ports.is_restoring(now):
+            self._lose(participant, former_port, now)
+        mapping = PortMapping(port, locator, kind)
+        self.add(participant, mapping)
+        return mapping
+
+    def _shortage(self, participant: InsideParticipant, locator: HostPort) -> PortShortage | None:
+        """Return why a locator may get no port; None if it may."""
+        if len(participant.mappings) >= MOST_MAPPINGS:
+            text = f"{locator} got no port: the participant has more than {MOST_MAPPINGS} locators"
+            return PortShortage(ShortageKind.BOUND, text)
+        ports = self.settings.ports.listen
+        if self._has_its_share(participant.address):
+            text = f"{locator} got no port: {participant.address} already has as many ports of "
+            text += f"{ports} as one address may have"
+            return PortShortage(ShortageKind.RANGE, text)
+        if self.lacks_proof(participant.prefix, participant.address):
+            text = (
+                f"{locator} got no port: the participant does not answer the proxy, and the last "
+            )
+            text += f"free ports of {ports} are for participants that answer"
+            return PortShortage(ShortageKind.RANGE, text)
+        return None
+
+    def _has_its_share(self, address: str) -> bool:
+        """Whether the participants at an address have as many ports as they may together.
+
+        That does not depend on what others have. So after a restart all get the same again, in
+        whichever order they come.
+        """
+        size = len(self.settings.ports.listen)
+        return len(self._by_address.get(address, ())) >= size - size // PART_FOR_OTHERS
+
+    def _is_own(self, locator: HostPort) -> bool:
+        """Whether a locator is a port of the range itself: a datagram there would never end."""
+        in_range = locator.port in self.settings.ports.listen
+        return in_range and locator.host == self.settings.proxy_address_for(locator.host)
+
+    def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
+        """Have all outside rediscover a participant, which they know by a port that it lost."""
+        participant.parting_from = now
+        text = f"participant {participant.guid_prefix} gets another port than {former_port}, which "
+        text += "another participant claims as well; outside discovers the participant anew"
+        self.refused("port_claim", participant.address, text)
+
+    def _take_back(self, address: str, mapping: PortMapping) -> None:
+        del self.by_port[mapping.port]
+        del self._by_address[address][mapping.port]
+        if not self._by_address[address]:
+            del self._by_address[address]
+        self.ports.give_back(mapping.port)
