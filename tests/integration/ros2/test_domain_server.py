@@ -14,7 +14,8 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import DomainSettings
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
-from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING, stand_in_port
+from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING
+from rosproxy.ros2.ports.stand_ins import stand_in_port
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT, DomainServer
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
@@ -86,7 +87,7 @@ def outsider_without_a_port(server: DomainServer) -> Iterator[tuple[socket.socke
         while True:
             sock = stack.enter_context(participant(OUTSIDE))
             locator = HostPort(OUTSIDE, sock.getsockname()[1])
-            wanted = stand_in_port(f"{B.hex()} {locator}", lambda _: 0, domain.outside._is_taken)
+            wanted = stand_in_port(f"{B.hex()} {locator}", lambda _: 0, domain.stand_ins._is_taken)
             assert wanted is not None
             with suppress(OSError):  # another program has that already
                 stack.enter_context(bind(PROXY, wanted))
@@ -105,12 +106,12 @@ async def test_no_stand_in_is_announced_that_can_not_be_opened(
         outsider.sendto(spdp(B, OUTSIDE, outside_port), discovery)
         insider.sendto(spdp(A, INSIDE, inside_port), well_known)
         await announcement(outsider, A)  # what names no such port goes on
-        await until(lambda: wanted in server.domain.outside.blocked, "it can't be opened")
+        await until(lambda: wanted in server.domain.stand_ins.blocked, "it can't be opened")
         outsider.sendto(spdp(B, OUTSIDE, outside_port), discovery)
 
         told, *_ = reached_at(await announcement(insider, B))
 
-        (opened,) = server.domain.outside.stand_ins
+        (opened,) = server.domain.stand_ins.by_port
         assert told == HostPort(PROXY, opened)
         assert opened != wanted
 

@@ -52,7 +52,7 @@ def passed(domain: Domain, datagram: Datagram) -> list[Outgoing]:
         if host != SUBSCRIBER:
             return domain.heard_inside(content, PUBLISHER, NOW)
         stand_ins = [
-            p for p, users in domain.outside.stand_ins.items() if users[0][1].target == target
+            p for p, users in domain.stand_ins.by_port.items() if users[0][1].target == target
         ]
         return [out for p in stand_ins for out in domain.at_stand_in(p, content, PUBLISHER, NOW)]
     if host != PUBLISHER:
@@ -167,7 +167,7 @@ def test_nothing_made_of_it_breaks_the_proxy(
     domain.heard_outside(spdp(B, SUBSCRIBER), SUBSCRIBER, NOW)
     for port in list(domain.mappings.by_port):
         domain.at_range_port(port, bytes(content), SUBSCRIBER, NOW)
-    for port in list(domain.outside.stand_ins):
+    for port in list(domain.stand_ins.by_port):
         domain.at_stand_in(port, bytes(content), PUBLISHER, NOW)
     with suppress(RtpsError):
         exported(read_discovery(bytes(content)))

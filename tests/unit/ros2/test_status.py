@@ -81,7 +81,7 @@ def announce(domain: Domain, reliability: int) -> None:
     """A publisher inside that is not reliable, a server there, and a subscriber outside."""
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     string = "std_msgs::msg::dds_::String_"
     trigger = "std_srvs::srv::dds_::Trigger_Request_"
     for writer, topic, kind in (

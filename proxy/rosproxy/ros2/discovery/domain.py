@@ -49,6 +49,7 @@ from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.ports.mappings import PortMappings
+from rosproxy.ros2.ports.stand_ins import LocatorStandIns, StandInUser
 from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import (
     destinations,
@@ -87,8 +88,6 @@ ENDED_AT_ONCE = 64
 ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
 
-_StandInUsers = Sequence[tuple[OutsideParticipant, PortMapping]]
-"""Participants outside that a stand-in leads to, each with the mapping of its locator."""
 _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams that go on, and what goes back to where they came from."""
 
@@ -118,9 +117,10 @@ class Domain:
         self.passed = Counter[tuple[TrafficKind, bool]]()
         self.ports = LocatorPorts(pool, now)
         self.mappings = PortMappings(settings, self.ports, refused, proofs)
+        self.stand_ins = LocatorStandIns(settings, refused)
         verdicts = Verdicts(settings.judge)
         self.inside = InsideParticipants(settings, self.mappings, refused, proofs, verdicts)
-        self.outside = OutsideParticipants(settings, refused, proofs, verdicts)
+        self.outside = OutsideParticipants(settings, self.stand_ins, refused, proofs, verdicts)
         settings.participants_at = self.outside.count_by_address.__getitem__
         port_store = PortStore.of(
             settings.host,
@@ -241,7 +241,7 @@ class Domain:
 
     def is_read_at_stand_in(self, port: int, datagram: bytes, _: str) -> bool:
         """Whether `at_stand_in` reads a datagram, which takes long, and does not just pass it."""
-        users = self.outside.stand_ins.get(port, ())
+        users = self.stand_ins.by_port.get(port, ())
         may_be_read = any(outsider.reads_discovery_at(mapping) for outsider, mapping in users)
         return may_be_read and may_be_discovery(datagram)
 
@@ -271,7 +271,7 @@ class Domain:
 
     def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         """What inside sends to a port that stands for locators outside."""
-        users = list(self.outside.stand_ins.get(port, ()))
+        users = list(self.stand_ins.by_port.get(port, ()))
         sent = list[Outgoing]()
         if not self.is_read_at_stand_in(port, datagram, source):
             is_of_participant = source in self.inside.count_by_address
@@ -581,7 +581,12 @@ class Domain:
         return self.settings.to_outside(exported)
 
     def _exported(
-        self, port: int, source: str, users: _StandInUsers, message: DiscoveryMessage, now: float
+        self,
+        port: int,
+        source: str,
+        users: Sequence[StandInUser],
+        message: DiscoveryMessage,
+        now: float,
     ) -> list[Outgoing]:
         """Metatraffic from inside as outside gets it, and what goes back. Raises RtpsError."""
         insider = self.inside.find(message.prefix, source)
@@ -669,7 +674,7 @@ class Domain:
             self._forget_outside(outsider)
         return passed, back
 
-    def _to_outside(self, users: _StandInUsers, datagram: bytes) -> list[Outgoing]:
+    def _to_outside(self, users: Sequence[StandInUser], datagram: bytes) -> list[Outgoing]:
         """A datagram that goes to participants outside, as far as they may be sent any."""
         sent = list[Outgoing]()
         for target, mapping in users:
@@ -810,7 +815,7 @@ class Domain:
         return []
 
 
-def _meant(users: _StandInUsers, datagram: bytes) -> _StandInUsers:
+def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUser]:
     """Those of a stand-in that a message names; all if it is for everybody. Raises RtpsError.
 
     One that stands for a single participant takes everything, as that one does itself.

@@ -8,7 +8,7 @@ inside: those of its own container networks may be the very gateway of the reade
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from math import inf
 
@@ -16,7 +16,6 @@ from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
 from rosproxy.ros2.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
-    MOST_MAPPINGS,
     MOST_OUTSIDE,
     MOST_OUTSIDE_UNPROVEN,
     MOST_PER_HOST,
@@ -29,7 +28,7 @@ from rosproxy.ros2.domain_settings import (
     sent_to,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
-from rosproxy.ros2.ports.locator_ports import stand_in_port
+from rosproxy.ros2.ports.stand_ins import LocatorStandIns
 from rosproxy.ros2.protocol.addressing import is_destination
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.parameters import Pid
@@ -38,7 +37,6 @@ from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     OutsideParticipant,
     ParticipantTable,
-    PortMapping,
     TrafficKind,
 )
 from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
@@ -56,7 +54,6 @@ from rosproxy.ros2.rewriting.discovery import (
     rewritten,
 )
 from rosproxy.ros2.sources.address_proofs import AddressProofs
-from rosproxy.ros2.sources.claimed_addresses import is_proxy_port
 
 HIDDEN_SOURCE = (
     "this address is the gateway of the proxy's own network: the engine forwards datagrams from "
@@ -68,18 +65,13 @@ DISPOSE_MESSAGE_INTERVAL = 2.0
 
 @dataclass(slots=True)
 class OutsideParticipants(ParticipantTable[OutsideParticipant]):
-    """The participants outside; ``stand_ins`` by port, each with those that it leads to.
-
-    ``blocked`` are ports that other programs hold. ``changes`` counts those of ``stand_ins``.
-    """
+    """The participants outside, with their stand-ins."""
 
     settings: DomainSettings
+    stand_ins: LocatorStandIns
     refused: Refused
     proofs: AddressProofs
     verdicts: Verdicts
-    stand_ins: dict[int, list[tuple[OutsideParticipant, PortMapping]]] = field(default_factory=dict)
-    blocked: set[int] = field(default_factory=set)
-    changes: int = 0
 
     def meet(self, message: DiscoveryMessage, source: str, now: float) -> OutsideParticipant | None:
         """The participant that announces itself or its end at an address; None if not accepted.
@@ -102,7 +94,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
             text = f"the participant announces no locator for discovery at {source} ({fault})"
             self.refused("no_locator", source, text)
             return None
-        if self._is_own_port(metatraffic):
+        if self.stand_ins.is_own_port(metatraffic):
             text = (
                 f"the participant announces {metatraffic} for discovery, a port of the proxy itself"
             )
@@ -130,7 +122,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         if spdp is None or spdp.ended:
             return None
         metatraffic = first_metatraffic(spdp, message.datagram, source)
-        if metatraffic is None or self._is_own_port(metatraffic):
+        if metatraffic is None or self.stand_ins.is_own_port(metatraffic):
             return None
         claimant = OutsideParticipant(
             message.prefix, source, source_vendor(message.datagram), now, metatraffic=metatraffic
@@ -283,18 +275,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
     def forget(self, participant: OutsideParticipant) -> None:
         """Forget a participant that has gone."""
         self.remove(participant)
-        for locator in list(participant.mappings):
-            self._close(participant, locator)
-
-    def block(self, port: int, for_good: bool = True) -> None:
-        """Note that a port can't be opened; its locators get one by the next announcement.
-
-        It is another one if this is ``for_good``, not where the process has no more sockets.
-        """
-        if for_good:
-            self.blocked.add(port)
-        for participant, mapping in list(self.stand_ins.get(port, ())):
-            self._close(participant, mapping.target)
+        self.stand_ins.close(participant)
 
     def gives_place(self, source: str) -> OutsideParticipant | None:
         """The participant that ends for a new one at an address; None if there is none.
@@ -394,61 +375,17 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         """Where inside reaches a locator of a participant outside; None if it does not."""
         if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
             # Whichever locator it is, discovery goes to the one at the address that it sends from.
-            mapping = outsider.metatraffic and self._mapping(
+            mapping = outsider.metatraffic and self.stand_ins.open(
                 outsider, outsider.metatraffic, TrafficKind.METATRAFFIC
             )
         elif not self.settings.both_ways:
             return None if _leads_elsewhere(outsider, near, only_heard, locator) else locator
         else:
-            is_led = locator.host == outsider.address and not self._is_own_port(locator)
-            mapping = self._mapping(outsider, locator, TrafficKind.USER_DATA) if is_led else None
+            is_led = locator.host == outsider.address and not self.stand_ins.is_own_port(locator)
+            mapping = (
+                self.stand_ins.open(outsider, locator, TrafficKind.USER_DATA) if is_led else None
+            )
         return HostPort(near, mapping.port) if mapping else None
-
-    def _mapping(
-        self, outsider: OutsideParticipant, locator: HostPort, kind: TrafficKind
-    ) -> PortMapping | None:
-        """The stand-in for a locator, which is opened if there is none; None if there are too many.
-
-        Where Cyclone DDS has one locator for both, it is of metatraffic, whichever comes first.
-        """
-        mapping = outsider.mappings.get(locator)
-        if mapping is None and len(outsider.mappings) < MOST_MAPPINGS:
-            users = partial(self._users, outsider.is_known)
-            port = stand_in_port(f"{outsider.prefix.hex()} {locator}", users, self._is_taken)
-            if port is not None:
-                mapping = outsider.mappings[locator] = PortMapping(port, locator, kind)
-                self.stand_ins.setdefault(port, []).append((outsider, mapping))
-                self.changes += 1
-        if mapping is None:
-            text = f"participant {outsider.guid_prefix}: no stand-in port is left for {locator}"
-            self.refused("stand_ins", outsider.address, text)
-        elif kind is TrafficKind.METATRAFFIC:
-            mapping.kind = kind
-        return mapping
-
-    def _is_own_port(self, locator: HostPort) -> bool:
-        """Whether a locator is a port of the proxy itself: a stand-in there would lead inside."""
-        return is_proxy_port(locator, self.stand_ins, self.settings)
-
-    def _users(self, for_known: bool, port: int) -> int:
-        """How many participants keep one more from a port; ``for_known`` is what that one is.
-
-        A forger can choose prefixes that lead to the port of another participant. If that one lost
-        the port after a restart, Fast DDS inside would go on sending there (PDPListener.cpp).
-        """
-        users = self.stand_ins.get(port, ())
-        return sum(outsider.is_known or not for_known for outsider, _ in users)
-
-    def _is_taken(self, port: int) -> bool:
-        return port in self.blocked or port in self.settings.ports.listen
-
-    def _close(self, participant: OutsideParticipant, locator: HostPort) -> None:
-        mapping = participant.mappings.pop(locator)
-        participant.introduction = None
-        remaining = [pair for pair in self.stand_ins.pop(mapping.port) if pair[1] is not mapping]
-        if remaining:
-            self.stand_ins[mapping.port] = remaining
-        self.changes += 1
 
 
 def _user_hosts(message: DiscoveryMessage) -> Iterator[str]:

@@ -18,27 +18,21 @@ equal evidence both get other ports: one of the two lies, and the proxy can't te
 participant that comes later with a proof gets its port back from one without.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
 from hashlib import blake2b
-from itertools import chain, islice
+from itertools import chain
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.protocol.addressing import destination, of_built_in_writer
 from rosproxy.ros2.registry.participants import TrafficKind
 
-STAND_INS = PortRange(20_000, 32_767)
-"""Where ports for participants outside are chosen from: below those that Linux gives away."""
-TRIES = 32
-"""How many ports are tried for a locator outside."""
 MOST_NAMED = 8
 """Participants that may be named at one port; more tell nothing. One that is named for both kinds
 counts twice."""
-MOST_SHARING = 3
-"""Locators outside that one port may stand for; as many of forged participants do not count."""
 SETTLING = 1.0
 """Seconds from the start in which no port is given, to hear first whom outside means by each."""
 REMEMBERED = 30.0
@@ -309,15 +303,3 @@ class LocatorPorts:
         """Take a port back."""
         self._lent.pop(port, None)
         self.pool.give_back(port)
-
-
-def stand_in_port(key: str, users: Callable[[int], int], busy: Callable[[int], bool]) -> int | None:
-    """A port for a locator outside; None if there are too many of them.
-
-    ``users`` tells how many locators a port stands for already. It may be several: so the port
-    follows from the locator alone, and a proxy that starts again chooses the same. Each of these
-    gets users' data that is meant for the others as well, and skips it, as with multicast.
-    ``busy`` tells which ports can't be had; they don't count as tries, as there may be many.
-    """
-    order = (port for port in order_for(key, STAND_INS) if not busy(port))
-    return next((port for port in islice(order, TRIES) if users(port) < MOST_SHARING), None)

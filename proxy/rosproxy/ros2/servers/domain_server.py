@@ -435,12 +435,12 @@ class DomainServer:
 
     def _sync_stand_ins(self) -> list[int]:
         """Open and close the ports for participants outside; those that can't be opened."""
-        outside = self.domain.outside
+        stand_ins = self.domain.stand_ins
         closed = list[int]()
-        if outside.changes == self._synced_changes:
+        if stand_ins.changes == self._synced_changes:
             return closed
-        self._synced_changes = outside.changes
-        wanted = outside.stand_ins
+        self._synced_changes = stand_ins.changes
+        wanted = stand_ins.by_port
         for port in self._stand_ins.keys() - wanted.keys():
             self._stop_reading(self._stand_ins.pop(port))
         for port in wanted.keys() - self._stand_ins.keys():
@@ -448,7 +448,7 @@ class DomainServer:
                 sock = datagrams.bind(self._bind, port)
             except OSError as error:
                 log.debug("port %d can't be opened as a stand-in: %s", port, error)
-                outside.block(port, error.errno == errno.EADDRINUSE)
+                stand_ins.block(port, error.errno == errno.EADDRINUSE)
                 closed.append(port)
                 continue
             self._stand_ins[port] = sock

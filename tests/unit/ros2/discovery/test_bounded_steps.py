@@ -56,7 +56,7 @@ def crowd(policy: Policy) -> Domain:
     for number in range(INSIDE_COUNT):
         domain.heard_inside(spdp(inside(number), INSIDE, 7000 + 2 * number), INSIDE, NOW)
     meet(domain, A, OTHER)
-    (stand_in, *_) = domain.outside.stand_ins
+    (stand_in, *_) = domain.stand_ins.by_port
     for prefix, insider in domain.inside.by_prefix.items():
         domain.at_stand_in(stand_in, sedp(prefix, insider.address, 7000), insider.address, NOW)
     return domain

@@ -232,7 +232,7 @@ def test_one_participant_that_reads_discovery_has_a_shared_stand_in_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        "rosproxy.ros2.ports.locator_ports.order_for",
+        "rosproxy.ros2.ports.stand_ins.order_for",
         lambda key, _: iter([20_000 + key.endswith("1")]),
     )
     domain = met(FAST_DDS, both_ways=True)

@@ -166,7 +166,7 @@ def test_a_participant_outside_is_told_inside_with_a_stand_in() -> None:
     (sent,) = domain.at_range_port(port, spdp(B, ROBOT), ROBOT, NOW)
     assert sent.target == HostPort(INSIDE, 7410)
     meta, user = reached_at(sent.datagram)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     assert (meta, user) == (HostPort(NEAR, stand_in), HostPort(ROBOT, 7411))
 
 
@@ -204,7 +204,7 @@ def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
     domain = make_domain()
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     meet(domain)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     *reminders, sent = domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
     assert sent.target == HostPort(ROBOT, 7410)
     assert {reminder.target for reminder in reminders} == {HostPort(INSIDE, 7410)}
@@ -254,7 +254,7 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
     meet(domain)
     heard = spdp(B, ROBOT)
     domain.heard_outside(carried(ROBOT, heard), LAN_RELAY.host, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     sent = 0
     for _ in range(20):
         for outgoing in domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW):
@@ -301,7 +301,7 @@ def test_who_has_gone_gives_everything_back() -> None:
     assert not domain.inside.by_prefix
     assert not domain.outside.by_prefix
     assert not domain.mappings.by_port
-    assert not domain.outside.stand_ins
+    assert not domain.stand_ins.by_port
     assert domain.ports.pool.free == free + 2
     meet(domain)
     assert to(domain.heard_inside(dispose_message(A), INSIDE, NOW), ROBOT)
@@ -407,7 +407,7 @@ def test_nothing_that_is_sent_breaks_it(start: bytes, rest: bytes, source: str) 
     datagram = start + rest
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     domain.heard_inside(datagram, source, NOW)
     domain.heard_outside(datagram, source, NOW)
     domain.at_stand_in(stand_in, datagram, source, NOW)
@@ -678,12 +678,12 @@ def test_no_port_of_the_range_stands_in() -> None:
     domain = make_domain()
     domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW)
     meet(domain, B)
-    (free,) = domain.outside.stand_ins
+    (free,) = domain.stand_ins.by_port
 
     ports = PortRange(free - 8, free + 7)
     domain = make_domain(ports=PortMap(ports, ports))
     domain.heard_outside(spdp(A, ROBOT), ROBOT, NOW)
     meet(domain, B)
 
-    (port,) = domain.outside.stand_ins
+    (port,) = domain.stand_ins.by_port
     assert port not in ports

@@ -48,7 +48,7 @@ def metatraffic(domain: Domain) -> int:
 
 def crossing(domain: Domain, submessages: bytes) -> Iterator[list[Outgoing]]:
     """What goes on of a message from inside, and of one from outside."""
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     yield domain.at_stand_in(stand_in, message(submessages, prefix=A), INSIDE, NOW)
     yield domain.at_range_port(metatraffic(domain), message(submessages, prefix=B), ROBOT, NOW)
 

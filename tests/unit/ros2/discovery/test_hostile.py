@@ -69,7 +69,7 @@ def test_a_number_that_has_no_next_one_is_malformed() -> None:
     domain = make_domain(judge=lambda kind, *_: kind is not RuleKind.PUBLISH)
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     last = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER)
     over = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER + 1)
     below = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=-1)
@@ -128,7 +128,7 @@ def test_fragments_are_judged_anew_by_another_policy() -> None:
     domain = make_domain(judge=lambda *_: allowed)
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     whole = payload([TOPIC, (0x8000, bytes(100))])
     data_frag = fragment(whole, 1, 200, len(whole), writer=SEDP_WRITERS)
     datagram = message(data_frag, prefix=A)
@@ -155,7 +155,7 @@ def test_what_is_split_is_not_multiplied() -> None:
     domain = make_domain()
     meet(domain)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     info_dst = submessage(0x0E, 0, B + bytes(55_000))
     datagram = shared_message([A] * 120, info_dst, to_each=heartbeat(1, 2))
     sent = domain.at_stand_in(stand_in, datagram, INSIDE, NOW)
@@ -379,7 +379,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     assert EVIL not in {*domain.inside.by_prefix, *domain.outside.by_prefix}
     meet(domain, A, OTHER)
     assert to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), OTHER)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     domain.at_stand_in(stand_in, sedp(A, OTHER, 7000), OTHER, NOW)
     denied.append("/chatter")
     assert domain.apply_policy(NOW)
@@ -411,7 +411,7 @@ def test_one_whose_announcement_is_bad_keeps_no_policy_from_others() -> None:
     meet(domain, EVIL, INSIDE)
     meet(domain, A, OTHER)
     domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     domain.at_stand_in(stand_in, sedp(EVIL, INSIDE, 7000), INSIDE, NOW)
     domain.at_stand_in(stand_in, sedp(A, OTHER, 7000), OTHER, NOW)
     domain.inside.by_prefix[EVIL].announcement = b"no RTPS message"

@@ -44,7 +44,7 @@ def met() -> Domain:
 
 def crossing(domain: Domain, said: bytes) -> Iterator[list[Outgoing]]:
     """What goes on of what A says inside, and B outside, by each way that there is."""
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     (mapping,) = [
         le for le in domain.inside.by_prefix[A].mappings.values() if le.target.port == 7410
     ]
@@ -126,7 +126,7 @@ def test_nobody_is_ended_by_a_key_that_is_no_parameter_list() -> None:
 @pytest.mark.parametrize("pid", IDENTITIES)
 def test_everybody_speaks_for_himself(how: str, pid: int) -> None:
     domain = met()
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     said = said_of(A, pid, BuiltinWriter.PUBLICATIONS)[how]
     sent = domain.at_stand_in(stand_in, message(said, prefix=A), INSIDE, NOW)
     assert bool(sent) is (how != "half a name")

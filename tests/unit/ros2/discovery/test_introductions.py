@@ -111,7 +111,7 @@ def test_an_introduction_follows_the_stand_in_and_the_announcement() -> None:
     domain = met()
     first, *_ = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     (blocked, _) = reached_at(first)
-    domain.outside.block(blocked.port)
+    domain.stand_ins.block(blocked.port)
     second, *_ = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     assert reached_at(second)[0].port != blocked.port
     third, *_ = to(domain.heard_outside(spdp(B, ROBOT, 9300), ROBOT, NOW), INSIDE)

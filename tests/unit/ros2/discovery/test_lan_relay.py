@@ -82,7 +82,7 @@ def test_a_process_at_the_relays_address_is_not_the_relay(how: str) -> None:
     assert domain.heard_outside(datagram, LAN_RELAY.host, NOW) == []
     assert reasons == [reason]
     assert not domain.outside.by_prefix
-    assert not domain.outside.stand_ins
+    assert not domain.stand_ins.by_port
     assert not domain.rediscovery.lan_relay_heard
 
 
@@ -156,7 +156,7 @@ def test_a_claimed_address_is_not_inside_nor_the_proxys(address: str) -> None:
     assert domain.heard_outside(carried(address, spdp(B, address, 9999)), LAN_RELAY.host, NOW) == []
     assert reasons == ["claimed_address"]
     assert not domain.outside.by_prefix
-    assert not domain.outside.stand_ins
+    assert not domain.stand_ins.by_port
     assert domain.rediscovery.lan_relay_heard
 
 
@@ -207,7 +207,7 @@ def test_no_stand_in_leads_to_a_port_of_the_proxy(
     """Where the advertised host is the proxy's own machine: the range, and what inside uses."""
     domain = make_domain(peers=(HOST,), both_ways=True)
     domain.settings.proxy_address_for = lambda _: HOST
-    domain.outside.stand_ins[20001] = []
+    domain.stand_ins.by_port[20001] = []
     meet(domain)
     reasons = watched(domain)
     way(domain, HOST, port)

@@ -197,7 +197,7 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
 
     assert told(DISPOSE_MESSAGE_INTERVAL - 0.1) == [False]
     assert told(DISPOSE_MESSAGE_INTERVAL) == [True, False]
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + DISPOSE_MESSAGE_INTERVAL)
     assert told(3 * DISPOSE_MESSAGE_INTERVAL) == [False]
 

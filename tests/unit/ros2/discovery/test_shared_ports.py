@@ -60,7 +60,7 @@ def shared() -> tuple[Domain, int, int]:
     domain.heard_inside(message(announcement(A, INSIDE), prefix=A), INSIDE, NOW)
     domain.heard_outside(message(announcement(B, ROBOT), prefix=B), ROBOT, NOW)
     (port,) = domain.mappings.by_port
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     assert domain.mappings.by_port[port][1].kind is TrafficKind.METATRAFFIC
     return domain, port, stand_in
 

@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from rosproxy.access.rules import RuleKind
 from rosproxy.ros2.discovery import fragments
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, Outgoing
-from rosproxy.ros2.ports.locator_ports import MOST_SHARING, STAND_INS
+from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS
 from rosproxy.ros2.protocol.rtps import LAST_NUMBER, source_prefix
 from rosproxy.ros2.registry.participants import ANSWERED_FACTOR
 from rosproxy.ros2.sources.rates import BURST, MOST_SOURCES
@@ -149,7 +149,7 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(datagram=datagrams(), source=ADDRESS, index=st.integers(0, 9))
     def a_stand_in_gets_something(self, datagram: bytes, source: str, index: int) -> None:
-        ports = sorted(self.domain.outside.stand_ins) or [STAND_INS.first]
+        ports = sorted(self.domain.stand_ins.by_port) or [STAND_INS.first]
         sent = self.domain.at_stand_in(ports[index % len(ports)], datagram, source, self.now)
         assert not sent or source in self.domain.inside.count_by_address
         self.check(sent)
@@ -198,7 +198,7 @@ class Neighbours(RuleBasedStateMachine):
             if participant.address == address
         ]
         for participant in speakers:
-            for stand_in in 8 * list(self.domain.outside.stand_ins):
+            for stand_in in 8 * list(self.domain.stand_ins.by_port):
                 said = sedp(participant.prefix, address, port)
                 self.check(self.domain.at_stand_in(stand_in, said, address, self.now))
 
@@ -222,8 +222,8 @@ class Neighbours(RuleBasedStateMachine):
 
     @rule(port=st.integers(STAND_INS.first, STAND_INS.last), for_good=st.booleans())
     def another_program_has_a_port(self, port: int, for_good: bool) -> None:
-        ports = sorted(self.domain.outside.stand_ins)
-        self.domain.outside.block(ports[0] if ports and port % 8 == 0 else port, for_good)
+        ports = sorted(self.domain.stand_ins.by_port)
+        self.domain.stand_ins.block(ports[0] if ports and port % 8 == 0 else port, for_good)
 
     def check(self, sent: list[Outgoing]) -> None:
         """Hold to whom something may go: outside is sent no more than came from there."""
@@ -272,15 +272,16 @@ class Neighbours(RuleBasedStateMachine):
     @invariant()
     def stand_ins_are_of_those_outside(self) -> None:
         outside = self.domain.outside
-        for port, users in outside.stand_ins.items():
-            assert port not in outside.blocked
+        stand_ins = self.domain.stand_ins
+        for port, users in stand_ins.by_port.items():
+            assert port not in stand_ins.blocked
             assert 0 < len(users) <= 2 * MOST_SHARING
             for participant, mapping in users:
                 assert outside.by_prefix[participant.prefix] is participant
                 assert participant.mappings[mapping.target] is mapping
                 assert (mapping.port, mapping.target.host) == (port, participant.address)
         mapping_count = sum(len(participant.mappings) for participant in outside.by_prefix.values())
-        assert mapping_count == sum(map(len, outside.stand_ins.values()))
+        assert mapping_count == sum(map(len, stand_ins.by_port.values()))
         assert outside.count_by_address == Counter(
             participant.address for participant in outside.by_prefix.values()
         )

@@ -55,7 +55,7 @@ def met(rules: Rules) -> Domain:
 
 
 def outwards(domain: Domain) -> list[Outgoing]:
-    (stand_in,) = domain.outside.stand_ins
+    (stand_in,) = domain.stand_ins.by_port
     return domain.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
 
 

@@ -1,21 +1,16 @@
 """Ports for locators: the same again after a restart, and those first who are meant there."""
 
-from collections.abc import Callable
-
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.ports.locator_ports import (
-    MOST_SHARING,
     REMEMBERED,
     SETTLING,
-    STAND_INS,
     LocatorPorts,
     NamedBy,
     order_for,
-    stand_in_port,
 )
 from rosproxy.ros2.registry.participants import TrafficKind
 
@@ -185,31 +180,6 @@ def test_what_was_heard_is_forgotten_after_a_time() -> None:
     pool.note_former_user(first, other_prefix, DATA, PEER, 0.5)
     pool.note_former_user(45000, other_prefix, DATA, PEER, REMEMBERED + 1)
     assert pool.take(prefix, locator(0), DATA, REMEMBERED) == first
-
-
-@given(st.text(max_size=40))
-def test_a_stand_in_follows_from_what_it_stands_for(key: str) -> None:
-    """Whoever else there is, as long as they are not too many at one port."""
-
-    def chosen(users: Callable[[int], int]) -> int | None:
-        return stand_in_port(key, users, lambda _: False)
-
-    port = chosen(lambda _: 0)
-    assert port is not None
-    assert port in STAND_INS
-    assert chosen(lambda _: MOST_SHARING - 1) == port
-    assert chosen(lambda candidate: MOST_SHARING if candidate == port else 0) not in (None, port)
-    assert chosen(lambda _: MOST_SHARING) is None
-
-
-@given(st.text(max_size=40), st.integers(0, 2000))
-def test_a_stand_in_is_found_behind_a_long_range_that_is_held(key: str, length: int) -> None:
-    """The proxy's own range may lie where stand-ins do, and be longer than it tries ports."""
-    wanted = stand_in_port(key, lambda _: 0, lambda _: False)
-    assert wanted is not None
-    port = stand_in_port(key, lambda _: 0, lambda candidate: wanted <= candidate < wanted + length)
-    assert port is not None
-    assert not wanted <= port < wanted + length
 
 
 @given(prefixes, prefixes, st.integers(45000, 45019))

@@ -1,0 +1,33 @@
+"""The port of a stand-in follows from the locator outside."""
+
+from collections.abc import Callable
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.ros2.ports.stand_ins import MOST_SHARING, STAND_INS, stand_in_port
+
+
+@given(st.text(max_size=40))
+def test_a_stand_in_follows_from_what_it_stands_for(key: str) -> None:
+    """Other locators do not matter, as long as they are not too many at one port."""
+
+    def chosen(users: Callable[[int], int]) -> int | None:
+        return stand_in_port(key, users, lambda _: False)
+
+    port = chosen(lambda _: 0)
+    assert port is not None
+    assert port in STAND_INS
+    assert chosen(lambda _: MOST_SHARING - 1) == port
+    assert chosen(lambda candidate: MOST_SHARING if candidate == port else 0) not in (None, port)
+    assert chosen(lambda _: MOST_SHARING) is None
+
+
+@given(st.text(max_size=40), st.integers(0, 2000))
+def test_a_stand_in_is_found_behind_a_long_range_that_is_held(key: str, length: int) -> None:
+    """The proxy's own range may lie where stand-ins do, and be longer than it tries ports."""
+    wanted = stand_in_port(key, lambda _: 0, lambda _: False)
+    assert wanted is not None
+    port = stand_in_port(key, lambda _: 0, lambda candidate: wanted <= candidate < wanted + length)
+    assert port is not None
+    assert not wanted <= port < wanted + length
