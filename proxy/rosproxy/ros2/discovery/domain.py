@@ -33,9 +33,9 @@ from functools import partial
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.fragments import FragmentStores
-from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
-from rosproxy.ros2.discovery.prefix_owners import PrefixOwners
+from rosproxy.ros2.discovery.participants.inside import InsideParticipants
+from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
+from rosproxy.ros2.discovery.participants.prefix_owners import PrefixOwners
 from rosproxy.ros2.discovery.proxy_participants import ProxyParticipants
 from rosproxy.ros2.discovery.rediscovery import Rediscovery
 from rosproxy.ros2.domain_settings import (

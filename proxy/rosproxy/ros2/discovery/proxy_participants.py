@@ -12,8 +12,8 @@ from functools import partial
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
-from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
+from rosproxy.ros2.discovery.participants.inside import InsideParticipants
+from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing, sent_to
 from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.ports.store import PortStore

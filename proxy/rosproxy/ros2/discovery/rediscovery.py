@@ -24,8 +24,8 @@ from itertools import islice
 from math import inf
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
+from rosproxy.ros2.discovery.participants.inside import InsideParticipants
+from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing
 from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.rtps import RtpsError

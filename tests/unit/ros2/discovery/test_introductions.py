@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery import outside_participants
 from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.participants import outside
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -35,7 +35,7 @@ ELSEWHERE = "172.31.0.2"
 INSIDERS = ((A, INSIDE), (b"\x01\x0f" + bytes([6] * 10), OTHER))
 
 
-def outside(number: int) -> bytes:
+def named(number: int) -> bytes:
     return b"\x01\x0f\x55" + number.to_bytes(9, "big")
 
 
@@ -45,20 +45,20 @@ def met() -> Domain:
     for prefix, address in INSIDERS:
         meet(domain, prefix, address)
     for number in range(2):
-        domain.heard_outside(spdp(outside(number), ROBOT, 9000 + number), ROBOT, NOW)
+        domain.heard_outside(spdp(named(number), ROBOT, 9000 + number), ROBOT, NOW)
     return domain
 
 
 def count_calls(monkeypatch: pytest.MonkeyPatch, name: str) -> Counter[str]:
     """Count how often the part for outside calls a function."""
     calls = Counter[str]()
-    function = getattr(outside_participants, name)
+    function = getattr(outside, name)
 
     def counted(*args: Any) -> Any:
         calls[name] += 1
         return function(*args)
 
-    monkeypatch.setattr(outside_participants, name, counted)
+    monkeypatch.setattr(outside, name, counted)
     return calls
 
 
@@ -66,9 +66,9 @@ def speaking(count: int) -> bytes:
     """A datagram in which so many participants announce themselves."""
     parts = list[bytes]()
     for number in range(count):
-        source = bytes(4) + VERSION + FAST_DDS + outside(number)
+        source = bytes(4) + VERSION + FAST_DDS + named(number)
         parts.append(submessage(0x0C, 0, source))
-        parts.append(spdp(outside(number), ROBOT, 9000 + number)[HEADER:])
+        parts.append(spdp(named(number), ROBOT, 9000 + number)[HEADER:])
     return message(*parts, prefix=B)
 
 
@@ -92,7 +92,7 @@ def test_a_change_of_policy_reads_no_announcement_again(monkeypatch: pytest.Monk
     finished(domain, [])
     sent = finished(domain, domain.settle(NOW + APART_TIME), NOW + APART_TIME)
     told = [source_prefix(datagram) for datagram in to(sent, INSIDE)]
-    assert set(told) == {outside(0), outside(1)}
+    assert set(told) == {named(0), named(1)}
     assert not calls
 
 

@@ -6,7 +6,7 @@ from rosproxy.admin.requests import BodyError, ContainerUpdate, read_body
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.outside_participants import DISPOSE_MESSAGE_INTERVAL
+from rosproxy.ros2.discovery.participants.outside import DISPOSE_MESSAGE_INTERVAL
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, LAN_RELAY_TIME
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.protocol.rtps import source_prefix

@@ -13,6 +13,7 @@ from functools import partial
 from math import inf
 
 from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
+from rosproxy.ros2.discovery.participants.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.domain_settings import (
     MOST_AT_PEERS,
     MOST_INTRODUCED_UNPROVEN,
@@ -39,7 +40,6 @@ from rosproxy.ros2.registry.participants import (
     ParticipantTable,
     TrafficKind,
 )
-from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.announced_participant import (
     first_metatraffic,
     lease_duration,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.participants.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
@@ -24,7 +25,6 @@ from rosproxy.ros2.registry.participants import (
     ParticipantTable,
     TrafficKind,
 )
-from rosproxy.ros2.registry.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.rewriting.announced_participant import (
     first_metatraffic,
     lease_duration,

@@ -16,8 +16,8 @@ these seconds it may have come before the participant outside whose prefix it co
 
 from dataclasses import dataclass
 
-from rosproxy.ros2.discovery.inside_participants import InsideParticipants
-from rosproxy.ros2.discovery.outside_participants import OutsideParticipants
+from rosproxy.ros2.discovery.participants.inside import InsideParticipants
+from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings
 from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.sources.address_proofs import AddressProofs
