@@ -36,7 +36,7 @@ MOST_PER_HOST = 256
 """Participants at one address inside, and outside, where another proxy may be."""
 MOST_PER_UNPROVEN = 16
 """Participants at one address outside that has not proved to receive."""
-MOST_INTRODUCED_UNPROVEN = 64
+MOST_ANNOUNCED_UNPROVEN = 64
 """While so many participants outside are at unproven addresses, inside is told of these, too."""
 MOST_MAPPINGS = 16
 """Ports of the range for one participant; Fast DDS takes three for one address."""

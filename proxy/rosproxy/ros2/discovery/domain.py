@@ -31,6 +31,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 
 from rosproxy.leases.ports import PortPool
+from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside, ForInside
+from rosproxy.ros2.discovery.announcements.to_outside import AnnouncementsToOutside, ForOutside
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
@@ -85,8 +87,6 @@ from rosproxy.ros2.sources.rates import DiscoveryRates, Standing, cost
 
 ENDED_AT_ONCE = 64
 """Participants of a side that are forgotten at a time. The proxy looks twice a second."""
-ANNOUNCED_AGAIN = 0.5
-"""Seconds in which outside is told the same announcement only once."""
 
 _Passing = tuple[list[bytes], list[Outgoing]]
 """Datagrams that go on, and what goes back to where they came from."""
@@ -122,6 +122,8 @@ class Domain:
         self.inside = InsideParticipants(settings, self.mappings, refused, proofs, verdicts)
         self.outside = OutsideParticipants(settings, self.stand_ins, refused, proofs, verdicts)
         settings.participants_at = self.outside.count_by_address.__getitem__
+        self.to_inside = AnnouncementsToInside(settings, self.inside, self.outside)
+        self.to_outside = AnnouncementsToOutside(settings, self.outside)
         port_store = PortStore.of(
             settings.host,
             settings.ports.listen,
@@ -131,7 +133,7 @@ class Domain:
         )
         self.former_ports = FormerPorts(settings, self.ports, port_store, proofs)
         self.owners = PrefixOwners(settings, self.inside, self.outside, self.former_ports, proofs)
-        self.rediscovery = Rediscovery(settings, self.inside, self.outside)
+        self.rediscovery = Rediscovery(settings, self.inside, self.outside, self.to_inside)
         self.fragments = FragmentStores()
         self.proxy_participants = ProxyParticipants(
             settings,
@@ -477,7 +479,7 @@ class Domain:
             told, ended = self.outside.prove(source)
             inside = self.inside.by_prefix.values()
             sent += [out for outsider in ended for out in self._end_outside(outsider, inside)]
-            sent += self.outside.introduced(told, inside, now)
+            sent += self.to_inside.of_outside(told, inside, now)
         return sent + self.proxy_participants.told_outside(message, source, received)
 
     def _announced_outside(
@@ -488,7 +490,7 @@ class Domain:
         if outsider is None:
             return sent
         outsider.credit += received
-        sent += self.outside.introduced([outsider], self.inside.by_prefix.values(), now)
+        sent += self.to_inside.of_outside([outsider], self.inside.by_prefix.values(), now)
         if message.of_participant is None or not message.of_participant.ended:
             return sent + self.proxy_participants.question_to_outside(outsider)
         self._forget_outside(outsider)  # those inside are told of that, too
@@ -532,8 +534,9 @@ class Domain:
             holders = self.ports.displaced_by(prefix, now)
             sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
         mapping_count = len(insider.mappings)
-        exported = self.inside.exported(insider, message, now, self.former_ports.of(prefix))
-        sent += self.inside.introduced(insider, message)
+        for_outside = ForOutside(self.inside, insider, now, self.former_ports.of(prefix))
+        exported = for_outside.rewritten(message)
+        sent += self.to_inside.of_neighbour(insider, message)
         # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
         if is_new and self.former_ports.must_be_rediscovered(prefix):
             sent += self.proxy_participants.port_store_dispose_message(insider)
@@ -542,33 +545,14 @@ class Domain:
             sent += self._reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
             insider.parting_from = now  # outside takes up no new locators of it
-        sent += self._tell_outside(
-            insider, for_all(exported), now
-        )  # it may answer the discovery participant
+        # For all: it may be an answer to the discovery participant.
+        sent += self.to_outside.of_inside(insider, for_all(exported), now)
         if is_new:
-            sent += self.outside.introduced(self.outside.by_prefix.values(), [insider], now)
+            sent += self.to_inside.of_outside(self.outside.by_prefix.values(), [insider], now)
         sent += self.proxy_participants.question_to_inside(
             insider.address, prefix, insider.metatraffic
         )
         return sent + self.proxy_participants.first_questions(insider)
-
-    def _tell_outside(
-        self, insider: InsideParticipant, announcement: bytes, now: float
-    ) -> list[Outgoing]:
-        """What tells outside of a participant inside, unless that was told the same just now.
-
-        Participants repeat themselves while many meet, and each time it goes to all ports of peers.
-        """
-        if announcement == insider.announcement and now - insider.announced_at < ANNOUNCED_AGAIN:
-            return []
-        is_first = not insider.announcement
-        insider.announcement = announcement
-        insider.announced_at = now
-        if insider.apart_until:
-            return []
-        if is_first:
-            return self.settings.to_outside(announcement)
-        return self.outside.to_met(announcement)
 
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         self.former_ports.end(message.prefix, source)
@@ -576,7 +560,8 @@ class Domain:
         if insider is None:
             return []
         require_rewritable(message)
-        exported = self.inside.exported(insider, message, now)  # it may tell other things as well
+        # It may tell other things as well.
+        exported = ForOutside(self.inside, insider, now).rewritten(message)
         self._forget_inside(insider)
         return self.settings.to_outside(exported)
 
@@ -604,8 +589,8 @@ class Domain:
                 self.rediscovery.note_met(insider, reader)
         reader = readers[0] if readers else users[0][0].prefix
         count = len(insider.mappings)
-        exported = partial(self.inside.exported, insider, now=now)
-        passed, questions = self.fragments.rewritten(port, message, reader, exported)
+        for_outside = ForOutside(self.inside, insider, now)
+        passed, questions = self.fragments.rewritten(port, message, reader, for_outside.rewritten)
         back = sent_to(insider.metatraffic, questions) + self._reminders(insider, count, now)
         return back + [sent for d in passed for sent in self._to_outside(_meant(users, d), d)]
 
@@ -617,7 +602,9 @@ class Domain:
         The proxy may be killed before the next round; what is lost on its way comes again then.
         """
         has_more = len(insider.mappings) > former_count
-        if not has_more or insider not in self.inside.port_keepers(self.inside.at(insider.address)):
+        if not has_more or insider not in self.former_ports.keepers(
+            self.inside.at(insider.address)
+        ):
             return []
         return self.former_ports.reminders(insider, now)
 
@@ -665,10 +652,13 @@ class Domain:
         if outsider is None:
             return [], back
         outsider.note_received(message.datagram, received, insider.prefix)
-        if not self.outside.may_introduce(outsider):
+        if not self.outside.may_be_announced(outsider):
             return [], back
-        imported = partial(self.outside.imported, outsider, insider)
-        passed, questions = self.fragments.rewritten(port, message, insider.prefix, imported)
+        near = self.settings.proxy_address_for(insider.address)
+        for_inside = ForInside(self.outside, outsider, near, insider)
+        passed, questions = self.fragments.rewritten(
+            port, message, insider.prefix, for_inside.rewritten
+        )
         back += self.outside.allowed_questions(outsider, questions)
         if spdp is not None and spdp.ended:
             self._forget_outside(outsider)
@@ -755,7 +745,7 @@ class Domain:
     ) -> list[Outgoing]:
         """Forget a participant outside, and tell some inside that it has ended."""
         ended = _dispose_message_of(outsider)
-        told = list(inside) if outsider.is_introduced else []
+        told = list(inside) if outsider.is_announced else []
         self._forget_outside(outsider)
         return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
 

@@ -7,9 +7,10 @@ as participants of its own.
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announcements.to_inside import ForInside
+from rosproxy.ros2.discovery.announcements.to_outside import ForOutside
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
 from rosproxy.ros2.discovery.fragments import FragmentStores, Rewrite
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
@@ -106,7 +107,7 @@ class ProxyParticipants:
 
     def port_reminders(self, now: float) -> list[Outgoing]:
         """What makes participants inside keep the ports that they have now."""
-        participants = self.inside.port_keepers(self.inside.by_prefix.values())
+        participants = self.former_ports.keepers(self.inside.by_prefix.values())
         return [sent for p in participants for sent in self.former_ports.reminders(p, now)]
 
     def told_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
@@ -121,8 +122,11 @@ class ProxyParticipants:
             return []
         if insider is None:
             return []
-        rewrite = partial(self.inside.observed, insider, now=now, kept=self.former_ports.of(prefix))
-        return sent_to(insider.metatraffic, self._ask(self.settings.unicast_port, message, rewrite))
+        for_proxy = ForOutside(
+            self.inside, insider, now, self.former_ports.of(prefix), is_hiding=False
+        )
+        questions = self._ask(self.settings.unicast_port, message, for_proxy.rewritten)
+        return sent_to(insider.metatraffic, questions)
 
     def told_outside(self, message: DiscoveryMessage, source: str, received: int) -> list[Outgoing]:
         """Take in what a participant outside tells the discovery participant. Raises RtpsError.
@@ -133,10 +137,11 @@ class ProxyParticipants:
         if outsider is None:
             return []
         outsider.note_received(message.datagram, received, self.discovery_participant.prefix)
-        if not self.outside.may_introduce(outsider):
+        if not self.outside.may_be_announced(outsider):
             return []
-        rewrite = partial(self.outside.observed, outsider)
-        questions = self._ask(self.settings.discovery_port, message, rewrite)
+        near = self.settings.proxy_address_for(outsider.address)
+        for_proxy = ForInside(self.outside, outsider, near)
+        questions = self._ask(self.settings.discovery_port, message, for_proxy.rewritten)
         return self.outside.allowed_questions(outsider, questions)
 
     def answer_to_proxy(

@@ -24,6 +24,7 @@ from itertools import islice
 from math import inf
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
 from rosproxy.ros2.domain_settings import DomainSettings, Outgoing
@@ -49,6 +50,7 @@ class Rediscovery:
     settings: DomainSettings
     inside: InsideParticipants
     outside: OutsideParticipants
+    to_inside: AnnouncementsToInside
     lan_relay_heard: bool = False
     _waiting: dict[str, deque[Iterator[list[Outgoing]]]] = field(default_factory=dict)
     """What is sent inwards, by the address of the participant inside."""
@@ -62,7 +64,7 @@ class Rediscovery:
         insider.parting_from = None
         insider.apart_until = inf  # until the last dispose message
         insider.dispose_message_times = {}  # it was not told to forget anybody yet
-        outsiders = [o for o in self.outside.by_prefix.values() if o.is_introduced]
+        outsiders = [o for o in self.outside.by_prefix.values() if o.is_announced]
         self._put(insider, self._dispose_messages(insider, outsiders))
         return self.settings.to_outside(datagram)
 
@@ -104,7 +106,7 @@ class Rediscovery:
         if insider.apart_until is None or now < insider.apart_until:
             return []
         insider.apart_until = None
-        self._put(insider, self._introductions(insider, list(self.outside.by_prefix.values())))
+        self._put(insider, self._announcements(insider, list(self.outside.by_prefix.values())))
         return self.settings.to_outside(insider.announcement)
 
     def note_met(self, insider: InsideParticipant, prefix: bytes) -> None:
@@ -143,18 +145,18 @@ class Rediscovery:
         self, insider: InsideParticipant, outsiders: Iterable[OutsideParticipant]
     ) -> Iterator[list[Outgoing]]:
         for outsider in outsiders:
-            yield self.outside.dispose_message_to(outsider, insider, self._now)
+            yield self.to_inside.dispose_message(outsider, insider, self._now)
         if insider.apart_until == inf:
             insider.apart_until = self._now + APART_TIME
 
-    def _introductions(
+    def _announcements(
         self, insider: InsideParticipant, outsiders: Iterable[OutsideParticipant]
     ) -> Iterator[list[Outgoing]]:
         for outsider in outsiders:
             if self.outside.by_prefix.get(outsider.prefix) is not outsider:
                 continue  # it has gone meanwhile
             try:
-                yield self.outside.introduced([outsider], [insider], self._now)
+                yield self.to_inside.of_outside([outsider], [insider], self._now)
             except RtpsError as error:
                 self.outside.refused("malformed", outsider.address, str(error))
 

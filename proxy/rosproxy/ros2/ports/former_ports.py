@@ -8,7 +8,7 @@ reminders make participants remember the ports that they have now.
 """
 
 from collections import Counter
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
@@ -183,6 +183,21 @@ class FormerPorts:
             participant.prefix, participant.ports, self._reply_target(participant.address), now
         )
         return [Outgoing(participant.metatraffic, datagram) for datagram in datagrams]
+
+    def keepers(self, participants: Iterable[InsideParticipant]) -> list[InsideParticipant]:
+        """The participants that can keep their ports: one of each process of Cyclone DDS.
+
+        The participants of a process have the same locator for metatraffic, and the same number of
+        the sample that they expect next of a writer, whichever of them a heartbeat is for
+        (ddsi_receive.c, handle_Heartbeat). The first that has answered keeps its ports; one that
+        has not may have been forged.
+        """
+        ordered = list(participants)
+        keepers = dict[tuple[str, HostPort | None], InsideParticipant]()
+        for participant in ordered:
+            if self.proofs.has_answered(participant.address, participant.prefix):
+                keepers.setdefault((participant.address, participant.metatraffic), participant)
+        return [p for p in ordered if keepers.get((p.address, p.metatraffic), p) is p]
 
     def _forget_waiting(self, prefix: bytes) -> None:
         self._counts -= Counter((self.waiting.pop(prefix)[0],))

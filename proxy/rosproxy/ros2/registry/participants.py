@@ -310,8 +310,8 @@ class OutsideParticipant(Participant):
     ``proven`` to receive. All others are sent no more bytes than came from there; ``credit`` is how
     many are left. ``has_answered``: it has named the proxy's participant, or one inside, and may be
     sent `ANSWERED_FACTOR` times as much. ``has_come_in``: discovery from it has arrived at a port
-    of the range. ``is_introduced``: participants inside are told of it. ``introduction`` is the
-    announcement as inside gets it, with the proxy's address inside for which it is made.
+    of the range. ``is_announced``: participants inside are told of it. ``announcement_inside`` is
+    the announcement as inside gets it, with the proxy's address inside for which it is made.
     ``met_at`` and ``heard_at`` are when it announced itself for the first and for the last time.
     """
 
@@ -319,8 +319,8 @@ class OutsideParticipant(Participant):
     proven: bool = False
     has_answered: bool = False
     has_come_in: bool = False
-    is_introduced: bool = False
-    introduction: tuple[str, bytes] | None = None
+    is_announced: bool = False
+    announcement_inside: tuple[str, bytes] | None = None
     credit: int = 0
     met_at: float = 0.0
     heard_at: float = 0.0

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN, Domain
-from rosproxy.ros2.discovery.participants import outside
+from rosproxy.ros2.discovery.announcements import to_inside
+from rosproxy.ros2.discovery.announcements.to_outside import ANNOUNCED_AGAIN
+from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
@@ -451,7 +452,7 @@ def test_nothing_is_read_for_a_participant_that_is_told_nothing(
     def read(_: bytes) -> DiscoveryMessage:
         raise AssertionError("an announcement was read")
 
-    monkeypatch.setattr(outside, "read_discovery", read)
+    monkeypatch.setattr(to_inside, "read_discovery", read)
     guid = A + bytes([0, 0, 1, 0xC1])
     without_locator = message(data(payload([(Pid.PARTICIPANT_GUID, guid)])), prefix=A)
     domain.heard_inside(without_locator, INSIDE, NOW)

@@ -3,7 +3,6 @@
 import struct
 from collections.abc import Iterator
 from sys import getsizeof
-from typing import Any
 
 import pytest
 
@@ -11,8 +10,8 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
+from rosproxy.ros2.discovery.announcements.to_outside import ForOutside
 from rosproxy.ros2.discovery.domain import ENDED_AT_ONCE
-from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.ports import locator_ports
@@ -25,7 +24,6 @@ from rosproxy.ros2.registry.participants import (
     DdsEndpoint,
     EndpointKind,
     EndpointNotes,
-    InsideParticipant,
     Participant,
 )
 from rosproxy.ros2.rewriting import discovery
@@ -443,14 +441,14 @@ def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(
     domain = make_domain()
     domain.heard_inside(spdp(EVIL, INSIDE), INSIDE, 0.1)
     domain.heard_inside(spdp(A, OTHER), OTHER, 0.1)
-    exported = domain.inside.exported
+    rewritten = ForOutside.rewritten
 
-    def refusing(insider: InsideParticipant, *rest: Any) -> bytes:
-        if insider.prefix == EVIL:
+    def refusing(for_outside: ForOutside, told: discovery.DiscoveryMessage) -> bytes:
+        if for_outside.insider.prefix == EVIL:
             raise RtpsError("malformed")
-        return exported(insider, *rest)
+        return rewritten(for_outside, told)
 
-    monkeypatch.setattr(InsideParticipants, "exported", lambda _, *rest: refusing(*rest))
+    monkeypatch.setattr(ForOutside, "rewritten", refusing)
     assert to(settle(domain, 0.1 + ANSWER_TIME), ROBOT)
     assert domain.inside.by_prefix[A].mappings
 

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announcements import to_inside
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.participants import outside
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
@@ -52,13 +52,13 @@ def met() -> Domain:
 def count_calls(monkeypatch: pytest.MonkeyPatch, name: str) -> Counter[str]:
     """Count how often the part for outside calls a function."""
     calls = Counter[str]()
-    function = getattr(outside, name)
+    function = getattr(to_inside, name)
 
     def counted(*args: Any) -> Any:
         calls[name] += 1
         return function(*args)
 
-    monkeypatch.setattr(outside, name, counted)
+    monkeypatch.setattr(to_inside, name, counted)
     return calls
 
 

@@ -1,6 +1,6 @@
 """The advertised host has another address: outside meets the participants inside anew."""
 
-from rosproxy.ros2.discovery.domain import ANNOUNCED_AGAIN
+from rosproxy.ros2.discovery.announcements.to_outside import ANNOUNCED_AGAIN
 from rosproxy.ros2.discovery.rediscovery import APART_TIME
 from rosproxy.ros2.protocol.rtps import source_prefix
 from tests.unit.ros2.discovery.domains import (

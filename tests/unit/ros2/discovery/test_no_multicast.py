@@ -5,8 +5,8 @@ import pytest
 from rosproxy.admin.requests import BodyError, ContainerUpdate, read_body
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announcements.to_inside import DISPOSE_MESSAGE_INTERVAL
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.participants.outside import DISPOSE_MESSAGE_INTERVAL
 from rosproxy.ros2.discovery.rediscovery import APART_TIME, LAN_RELAY_TIME
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.protocol.rtps import source_prefix
@@ -72,7 +72,7 @@ def test_processes_of_one_pod_are_introduced_to_each_other() -> None:
     assert by(B, to(heard, INSIDE)) == []
 
 
-def test_nobody_is_introduced_to_himself() -> None:
+def test_nobody_is_announced_to_himself() -> None:
     """Nor participants of one process, which have one locator in Cyclone DDS."""
     domain = make_domain()
     for prefix in (A, B, A, B):

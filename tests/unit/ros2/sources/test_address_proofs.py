@@ -9,8 +9,8 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
 from rosproxy.ros2.domain_settings import (
+    MOST_ANNOUNCED_UNPROVEN,
     MOST_INSIDE_UNPROVEN,
-    MOST_INTRODUCED_UNPROVEN,
     MOST_OUTSIDE,
     MOST_OUTSIDE_UNPROVEN,
     MOST_PER_ADDRESS,
@@ -116,14 +116,14 @@ def test_inside_is_told_of_so_many_unproven_participants() -> None:
     meet(domain)
     told = to(forge(domain, 0, 1200), INSIDE)
     ended = {source_prefix(d) for d in told if read_discovery(d).announcements[0].ended}
-    assert len(told) == 2 * MOST_INTRODUCED_UNPROVEN
-    assert ended == {named(number) for number in range(MOST_INTRODUCED_UNPROVEN)}
+    assert len(told) == 2 * MOST_ANNOUNCED_UNPROVEN
+    assert ended == {named(number) for number in range(MOST_ANNOUNCED_UNPROVEN)}
 
 
 def test_a_participant_that_is_not_introduced_reaches_nothing_inside() -> None:
     domain = make_domain()
     meet(domain)
-    forge(domain, 0, MOST_INTRODUCED_UNPROVEN)
+    forge(domain, 0, MOST_ANNOUNCED_UNPROVEN)
     hear(domain, B, LAPTOP)
     (port, *_) = domain.mappings.by_port
     for said in (spdp(B, LAPTOP), sedp(B, LAPTOP, 7411, to=A)):
@@ -177,7 +177,7 @@ def test_a_place_that_is_given_up_is_told_inside() -> None:
     domain = make_domain()
     meet(domain)
     forge(domain, 0, MOST_OUTSIDE_UNPROVEN)
-    assert domain.outside.by_prefix[named(0)].is_introduced
+    assert domain.outside.by_prefix[named(0)].is_announced
     (told,) = to(hear(domain, B, LAPTOP), INSIDE)
     (announcement,) = read_discovery(told).announcements
     assert (source_prefix(told), announcement.ended) == (named(0), True)

@@ -1,40 +1,31 @@
 """The participants inside: which of them the proxy serves."""
 
 import contextlib
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
-from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.participants.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.domain_settings import (
     MOST_INSIDE,
     MOST_INSIDE_UNPROVEN,
     MOST_PER_ADDRESS,
     DomainSettings,
-    Outgoing,
     Refused,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.ports.mappings import PortMappings
-from rosproxy.ros2.protocol.addressing import for_all
-from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source, source_prefix, source_vendor
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     ParticipantTable,
-    TrafficKind,
 )
 from rosproxy.ros2.rewriting.announced_participant import (
     first_metatraffic,
     lease_duration,
-    note_endpoints,
     traits,
 )
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     require_rewritable,
-    rewritten,
 )
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
@@ -114,55 +105,6 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
             if self.proofs.has_answered(p.address, p.prefix) is has_answered
         ]
 
-    def port_keepers(self, participants: Iterable[InsideParticipant]) -> list[InsideParticipant]:
-        """The participants that can keep their ports: one of each process of Cyclone DDS.
-
-        The participants of a process have the same locator for metatraffic, and the same number of
-        the sample that they expect next of a writer, whichever of them a heartbeat is for
-        (ddsi_receive.c, handle_Heartbeat). The first that has answered keeps its ports; one that
-        has not may have been forged.
-        """
-        ordered = list(participants)
-        keepers = dict[tuple[str, HostPort | None], InsideParticipant]()
-        for participant in ordered:
-            if self.proofs.has_answered(participant.address, participant.prefix):
-                keepers.setdefault((participant.address, participant.metatraffic), participant)
-        return [p for p in ordered if keepers.get((p.address, p.metatraffic), p) is p]
-
-    def exported(
-        self,
-        participant: InsideParticipant,
-        message: DiscoveryMessage,
-        now: float,
-        kept: Sequence[int] = (),
-    ) -> bytes:
-        """A message of a participant's, as outside gets it. Raises RtpsError.
-
-        ``kept`` are the ports that it is known to have had before the proxy started, in the order
-        of its locators.
-        """
-        datagram = message.datagram
-        note_endpoints(self.notes, participant, datagram, message.announcements)
-        return rewritten(
-            message,
-            partial(self._lead_out, participant, now, kept),
-            lambda a: self.verdicts.is_hidden(participant, a, datagram, is_own=True),
-        )
-
-    def observed(
-        self,
-        participant: InsideParticipant,
-        message: DiscoveryMessage,
-        now: float,
-        kept: Sequence[int] = (),
-    ) -> bytes:
-        """Note what one inside tells the proxy itself: what it has, and where. RtpsError."""
-        note_endpoints(self.notes, participant, message.datagram, message.announcements)
-        lead = partial(self._lead_out, participant, now, kept)
-        # The discovery participant alone gets this: it is rewritten to map the ports. Nothing is
-        # hidden, since the discovery participant would ask for that again and again.
-        return rewritten(message, lead, lambda _: False)
-
     def note_in_group(self, datagram: bytes, source: str) -> None:
         """Note the participants that were heard from an address by multicast."""
         with contextlib.suppress(RtpsError):
@@ -170,44 +112,8 @@ class InsideParticipants(ParticipantTable[InsideParticipant]):
                 if participant := self.find(source_prefix(message), source):
                     participant.is_in_group = True
 
-    def introduced(self, newcomer: InsideParticipant, message: DiscoveryMessage) -> list[Outgoing]:
-        """A participant's announcement for others on its network, if that passes on no multicast.
-
-        It goes on as it is: they reach each other without the proxy. So do those at one address, as
-        the processes of a pod are: Fast DDS sends no multicast where it has peers. What one names
-        as its own may be where the proxy itself hears announcements: nothing goes there.
-        """
-        if newcomer.is_in_group:
-            return []
-        near = newcomer.proxy_address
-        settings = self.settings
-        own = {HostPort(near, p) for p in (settings.unicast_port, settings.multicast_port)}
-        announcement = for_all(message.datagram)
-        return [
-            Outgoing(p.metatraffic, announcement)
-            for p in self.by_prefix.values()
-            if p.proxy_address == near
-            and p is not newcomer
-            # Cyclone DDS has one locator for all participants of a process, which know each other.
-            and p.metatraffic
-            and p.metatraffic not in {newcomer.metatraffic, *own}
-        ]
-
     def forget(self, participant: InsideParticipant) -> None:
         """Forget a participant that has gone, and take its ports back."""
         self.mappings.end(participant)
         self.remove(participant)
         self.verdicts.forget(participant)
-
-    def _lead_out(
-        self,
-        participant: InsideParticipant,
-        now: float,
-        kept: Sequence[int],
-        pid: int,
-        locator: HostPort,
-    ) -> HostPort | None:
-        """The address and port at which outside reaches a locator; None if it does not."""
-        is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
-        kind = TrafficKind.METATRAFFIC if is_metatraffic else TrafficKind.USER_DATA
-        return self.mappings.advertised(participant, locator, kind, kept, now)

@@ -1,57 +1,38 @@
-"""The participants outside, and the ports that stand for their locators inside.
+"""The participants outside: which of them the proxy knows, and which it announces inside."""
 
-Their discovery passes the proxy always: its locators are led to *stand-ins*, ports of the proxy's
-that those inside reach. What users send goes there directly, unless the direction is both: then the
-locators of user data are led to stand-ins as well, and inside needs no route. Of several addresses
-inside gets the one that a participant was heard from. Each machine has others that mean another one
-inside: those of its own container networks may be the very gateway of the reader's.
-"""
-
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
-from math import inf
 
-from rosproxy.net.addresses import HostPort, is_loopback, is_of_link, subnet
+from rosproxy.net.addresses import subnet
 from rosproxy.ros2.discovery.participants.places import fairer_place, oldest_unproven, surplus
 from rosproxy.ros2.domain_settings import (
+    MOST_ANNOUNCED_UNPROVEN,
     MOST_AT_PEERS,
-    MOST_INTRODUCED_UNPROVEN,
     MOST_OUTSIDE,
     MOST_OUTSIDE_UNPROVEN,
     MOST_PER_HOST,
     MOST_PER_UNPROVEN,
-    MOST_TRIED,
-    NEXT_PORTS,
     DomainSettings,
     Outgoing,
     Refused,
-    sent_to,
 )
 from rosproxy.ros2.policy.verdicts import Verdicts
 from rosproxy.ros2.ports.stand_ins import LocatorStandIns
 from rosproxy.ros2.protocol.addressing import is_destination
-from rosproxy.ros2.protocol.announcement import dispose_message
-from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import source_vendor
 from rosproxy.ros2.registry.participants import (
-    InsideParticipant,
     OutsideParticipant,
     ParticipantTable,
-    TrafficKind,
 )
 from rosproxy.ros2.rewriting.announced_participant import (
     first_metatraffic,
     lease_duration,
-    note_endpoints,
     traits,
 )
 from rosproxy.ros2.rewriting.discovery import (
     DiscoveryMessage,
     participant_alone,
-    read_discovery,
     require_rewritable,
-    rewritten,
 )
 from rosproxy.ros2.sources.address_proofs import AddressProofs
 
@@ -59,8 +40,6 @@ HIDDEN_SOURCE = (
     "this address is the gateway of the proxy's own network: the engine forwards datagrams from "
     "outside with this address, so the proxy does not know the real sender"
 )
-DISPOSE_MESSAGE_INTERVAL = 2.0
-"""Seconds after which a participant inside is told again to forget one outside, until they meet."""
 
 
 @dataclass(slots=True)
@@ -131,43 +110,6 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         claimant.credit = received
         return claimant
 
-    def imported(
-        self, outsider: OutsideParticipant, insider: InsideParticipant, message: DiscoveryMessage
-    ) -> bytes:
-        """A message of discovery as a participant inside gets it. Raises RtpsError."""
-        note_endpoints(self.notes, outsider, message.datagram, message.announcements)
-        return self._imported(outsider, insider, message)
-
-    def observed(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> bytes:
-        """Note what one outside tells the proxy itself: what it has, and where. RtpsError."""
-        note_endpoints(self.notes, outsider, message.datagram, message.announcements)
-        # The discovery participant alone gets this: it is rewritten to open the stand-ins. Nothing
-        # is hidden, since the discovery participant would ask for that again and again.
-        near = self.settings.proxy_address_for(outsider.address)
-        lead = self._leading_in(outsider, near, message)
-        return rewritten(message, lead, lambda _: False)
-
-    def introduced(
-        self,
-        outside: Iterable[OutsideParticipant],
-        inside: Collection[InsideParticipant],
-        now: float,
-    ) -> list[Outgoing]:
-        """The announcements of participants outside for some inside, as far as these may know."""
-        sent = list[Outgoing]()
-        by_near = dict[str, list[InsideParticipant]]()
-        for insider in inside:
-            if insider.metatraffic and not insider.is_apart:
-                near = self.settings.proxy_address_for(insider.address)
-                by_near.setdefault(near, []).append(insider)
-        for outsider in filter(self.may_introduce, outside):
-            for near, told in by_near.items():
-                datagram = self._introduction(outsider, near)
-                for insider in told:
-                    sent += self.dispose_message_to(outsider, insider, now)
-                    sent += sent_to(insider.metatraffic, [datagram])
-        return sent
-
     def prove(self, address: str) -> tuple[list[OutsideParticipant], list[OutsideParticipant]]:
         """Note that an address has proved to receive.
 
@@ -176,60 +118,20 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         for outsider in self.at(address):
             outsider.proven = True
         ended = surplus(self._proven_strangers(), MOST_OUTSIDE, subnet)
-        told = [p for p in self.at(address) if not p.is_introduced and p not in ended]
+        told = [p for p in self.at(address) if not p.is_announced and p not in ended]
         return told, ended
 
-    def may_introduce(self, outsider: OutsideParticipant) -> bool:
+    def may_be_announced(self, outsider: OutsideParticipant) -> bool:
         """Whether inside is told of a participant.
 
         Where many have not proved to receive, inside is told of no more of these: a forger may have
         made them up, and each participant inside would remember all of them.
         """
-        if not outsider.is_introduced:
-            outsider.is_introduced = (
-                outsider.is_known or len(self._unproven_strangers()) <= MOST_INTRODUCED_UNPROVEN
+        if not outsider.is_announced:
+            outsider.is_announced = (
+                outsider.is_known or len(self._unproven_strangers()) <= MOST_ANNOUNCED_UNPROVEN
             )
-        return outsider.is_introduced
-
-    def dispose_message_to(
-        self, outsider: OutsideParticipant, insider: InsideParticipant, now: float
-    ) -> list[Outgoing]:
-        """What makes one inside forget one outside, if it has to and was not told just now."""
-        if (
-            insider.dispose_message_times is None
-            or now - insider.dispose_message_times.get(outsider.prefix, -inf)
-            < DISPOSE_MESSAGE_INTERVAL
-        ):
-            return []
-        insider.dispose_message_times[outsider.prefix] = now
-        datagram = dispose_message(outsider.prefix, outsider.vendor, outsider.next_number)
-        return sent_to(insider.metatraffic, [datagram])
-
-    def to_met(self, datagram: bytes) -> list[Outgoing]:
-        """An announcement of a participant inside, after the first, for all outside.
-
-        Of a peer without a port it goes where participants of the peer receive discovery, and to
-        the next well-known ports, which participants take one after the other (DDSI-RTPS 2.5,
-        9.6.2.3). The discovery participant announces itself to all ports of peers, so participants
-        at other ports are met nevertheless. As long as no participant of a peer is known, all its
-        well-known ports are used.
-        """
-        sent = self.settings.to_lan(datagram)
-        for peer in self.settings.peers:
-            count = self.count_by_address[peer.host]
-            if peer.port:
-                targets = [peer]
-            elif not count:
-                targets = self.settings.well_known_of_peer(peer.host)
-            else:
-                targets = self._met_at(peer.host, count)
-            sent += [Outgoing(target, datagram) for target in targets]
-        return sent
-
-    def _met_at(self, host: str, count: int) -> list[HostPort]:
-        met = (p.metatraffic for p in self.by_prefix.values() if p.address == host)
-        next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, MOST_TRIED))
-        return list(dict.fromkeys([*next_ports, *filter(None, met)]))
+        return outsider.is_announced
 
     def is_met(self, source: str) -> bool:
         """Whether a participant is known at an address, or it is a peer's."""
@@ -328,87 +230,11 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         self.settings.settled(source)
         return outsider
 
-    def _imported(
-        self, outsider: OutsideParticipant, insider: InsideParticipant, message: DiscoveryMessage
-    ) -> bytes:
-        """A message as a participant inside gets it, without what the policy denies. RtpsError."""
-        return rewritten(
-            message,
-            self._leading_in(outsider, self.settings.proxy_address_for(insider.address), message),
-            lambda a: self.verdicts.is_hidden(insider, a, message.datagram, is_own=False),
-        )
-
     def _keep(self, outsider: OutsideParticipant, message: DiscoveryMessage) -> None:
         """Keep what a participant announces of itself, for those inside that come later."""
         announcement = participant_alone(message)
         if announcement != outsider.announcement:
             outsider.announcement = announcement
-            outsider.introduction = None
+            outsider.announcement_inside = None
         if message.of_participant is not None:
             outsider.next_number = message.of_participant.sample.sequence + 1
-
-    def _introduction(self, outsider: OutsideParticipant, near: str) -> bytes:
-        """The announcement of a participant for those that reach the proxy at ``near``. RtpsError.
-
-        It is made once for all of them: with many parameters that takes a millisecond.
-        """
-        if outsider.introduction is None or outsider.introduction[0] != near:
-            message = read_discovery(outsider.announcement)
-            lead = self._leading_in(outsider, near, message)
-            outsider.introduction = near, rewritten(message, lead, lambda _: False)
-        return outsider.introduction[1]
-
-    def _leading_in(
-        self, outsider: OutsideParticipant, near: str, message: DiscoveryMessage
-    ) -> Callable[[int, HostPort], HostPort | None]:
-        hosts = set(_user_hosts(message))
-        return partial(self._lead_in, outsider, near, outsider.address in hosts)
-
-    def _lead_in(
-        self,
-        outsider: OutsideParticipant,
-        near: str,
-        only_heard: bool,
-        pid: int,
-        locator: HostPort,
-    ) -> HostPort | None:
-        """Where inside reaches a locator of a participant outside; None if it does not."""
-        if pid == Pid.METATRAFFIC_UNICAST_LOCATOR:
-            # Whichever locator it is, discovery goes to the one at the address that it sends from.
-            mapping = outsider.metatraffic and self.stand_ins.open(
-                outsider, outsider.metatraffic, TrafficKind.METATRAFFIC
-            )
-        elif not self.settings.both_ways:
-            return None if _leads_elsewhere(outsider, near, only_heard, locator) else locator
-        else:
-            is_led = locator.host == outsider.address and not self.stand_ins.is_own_port(locator)
-            mapping = (
-                self.stand_ins.open(outsider, locator, TrafficKind.USER_DATA) if is_led else None
-            )
-        return HostPort(near, mapping.port) if mapping else None
-
-
-def _user_hosts(message: DiscoveryMessage) -> Iterator[str]:
-    """The hosts at which a message says that users' data is received."""
-    for announcement in message.announcements:
-        for pid, locator in announcement.reached_at(message.datagram):
-            if pid != Pid.METATRAFFIC_UNICAST_LOCATOR:
-                yield locator.host
-
-
-def _leads_elsewhere(
-    outsider: OutsideParticipant, near: str, only_heard: bool, locator: HostPort
-) -> bool:
-    """Whether a locator may mean somebody else where inside reaches the proxy at ``near``.
-
-    ``only_heard``: the message has a locator at the address that its participant was heard from.
-    Without one it is behind NAT, as it seems, and may be reached by those that it has. So it may be
-    by those of the other family, in which it was not heard.
-    """
-    heard = outsider.address
-    host = locator.host
-    if only_heard and (":" in host) == (":" in heard) and host != heard:
-        return True
-    # These addresses mean the reader's own machine or link, unless all is on one machine.
-    is_same_host = is_loopback(near) and is_loopback(heard)
-    return not is_same_host and (is_loopback(host) or is_of_link(host))

@@ -1,0 +1,1 @@
+"""Announcements on their way: what each side is told of the participants of the other."""

@@ -1,0 +1,114 @@
+"""Announcements to outside: which ports outside gets in place of the locators inside.
+
+Each locator of a participant inside is replaced by the advertised host and a port of the range. A
+locator without a port is taken out. The peers and the LAN relay get the announcement.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.participants.inside import InsideParticipants
+from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
+from rosproxy.ros2.domain_settings import MOST_TRIED, NEXT_PORTS, DomainSettings, Outgoing
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.registry.participants import InsideParticipant, TrafficKind
+from rosproxy.ros2.rewriting.announced_participant import note_endpoints
+from rosproxy.ros2.rewriting.discovery import Announcement, DiscoveryMessage, rewritten
+
+ANNOUNCED_AGAIN = 0.5
+"""Seconds in which outside is told the same announcement only once."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForOutside:
+    """Rewrites the discovery of a participant inside for outside.
+
+    ``former_ports`` are the ports that the participant is known to have had before the proxy
+    started, in the order of its locators. ``is_hiding``: the policy hides readers and writers. The
+    discovery participant is given all: it would ask for hidden announcements again and again.
+    """
+
+    inside: InsideParticipants
+    insider: InsideParticipant
+    now: float
+    former_ports: Sequence[int] = ()
+    is_hiding: bool = True
+
+    def rewritten(self, message: DiscoveryMessage) -> bytes:
+        """A message as outside gets it; its readers and writers are noted. Raises RtpsError.
+
+        Locators without a port get one.
+        """
+        datagram = message.datagram
+        note_endpoints(self.inside.notes, self.insider, datagram, message.announcements)
+        return rewritten(
+            message,
+            self._led,
+            lambda announcement: self._is_hidden(announcement, datagram),
+        )
+
+    def _led(self, pid: int, locator: HostPort) -> HostPort | None:
+        """The address and port at which outside reaches a locator; None if it does not."""
+        is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
+        kind = TrafficKind.METATRAFFIC if is_metatraffic else TrafficKind.USER_DATA
+        mappings = self.inside.mappings
+        return mappings.advertised(self.insider, locator, kind, self.former_ports, self.now)
+
+    def _is_hidden(self, announcement: Announcement, datagram: bytes) -> bool:
+        verdicts = self.inside.verdicts
+        return self.is_hiding and verdicts.is_hidden(
+            self.insider, announcement, datagram, is_own=True
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class AnnouncementsToOutside:
+    """What outside is told of participants inside."""
+
+    settings: DomainSettings
+    outside: OutsideParticipants
+
+    def of_inside(
+        self, insider: InsideParticipant, announcement: bytes, now: float
+    ) -> list[Outgoing]:
+        """What tells outside of a participant inside, unless that was told the same just now.
+
+        Participants repeat themselves while many meet, and each time it goes to all ports of peers.
+        """
+        if announcement == insider.announcement and now - insider.announced_at < ANNOUNCED_AGAIN:
+            return []
+        is_first = not insider.announcement
+        insider.announcement = announcement
+        insider.announced_at = now
+        if insider.apart_until:
+            return []
+        if is_first:
+            return self.settings.to_outside(announcement)
+        return self._to_met(announcement)
+
+    def _to_met(self, datagram: bytes) -> list[Outgoing]:
+        """An announcement of a participant inside, after the first, for all outside.
+
+        Of a peer without a port it goes where participants of the peer receive discovery, and to
+        the next well-known ports, which participants take one after the other (DDSI-RTPS 2.5,
+        9.6.2.3). The discovery participant announces itself to all ports of peers, so participants
+        at other ports are met nevertheless. As long as no participant of a peer is known, all its
+        well-known ports are used.
+        """
+        sent = self.settings.to_lan(datagram)
+        for peer in self.settings.peers:
+            count = self.outside.count_by_address[peer.host]
+            if peer.port:
+                targets = [peer]
+            elif not count:
+                targets = self.settings.well_known_of_peer(peer.host)
+            else:
+                targets = self._met_at(peer.host, count)
+            sent += [Outgoing(target, datagram) for target in targets]
+        return sent
+
+    def _met_at(self, host: str, count: int) -> list[HostPort]:
+        met = (p.metatraffic for p in self.outside.by_prefix.values() if p.address == host)
+        next_ports = self.settings.well_known(host, min(count + NEXT_PORTS, MOST_TRIED))
+        return list(dict.fromkeys([*next_ports, *filter(None, met)]))
