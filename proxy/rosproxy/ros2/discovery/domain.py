@@ -27,8 +27,7 @@ Every datagram may be forged. So
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
-from functools import partial
+from collections.abc import Collection, Iterable, Sequence
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside, ForInside
@@ -265,8 +264,7 @@ class Domain:
             if is_for_data or may_be_discovery(datagram):  # Cyclone DDS has one locator for both
                 if self._is_too_much(datagram, source, now):
                     return []
-                heard = partial(self._heard_at_range_port, port, source, insider, now)
-                passed, back = _pass_on_each(datagram, heard)
+                passed, back = self._read_at_range_port(port, source, insider, datagram, now)
         except RtpsError as error:
             return self._drop("malformed", source, str(error))
         return [self._passed(mapping, d, True) for d in passed] + back
@@ -291,8 +289,10 @@ class Domain:
         """Ask participants that wait again, and have others meet."""
         sent = self.former_ports.repeated_questions(now)
         for insider in list(self.inside.by_prefix.values()):
-            proceed = partial(self.rediscovery.proceed, insider, now)
-            sent += self._unless_malformed(insider.address, proceed)
+            try:
+                sent += self.rediscovery.proceed(insider, now)
+            except RtpsError as error:  # the others go on
+                sent += self._drop("malformed", insider.address, str(error))
         return sent + self.rediscovery.next_datagrams(now)
 
     def go_on(self, now: float) -> list[Outgoing]:
@@ -305,7 +305,10 @@ class Domain:
         if waited is None:
             return []  # it has ended meanwhile
         source, message = waited
-        return self._unless_malformed(source, partial(self._admitted_inside, message, source, now))
+        try:
+            return self._admitted_inside(message, source, now)
+        except RtpsError as error:
+            return self._drop("malformed", source, str(error))
 
     def apply_policy(self, now: float) -> list[Outgoing]:
         """Have participants meet anew of which the policy says something else than before."""
@@ -324,8 +327,10 @@ class Domain:
         )
         self.settings.hosts = hosts
         for insider in self.inside.by_prefix.values():
-            move = partial(self.rediscovery.move, insider)
-            sent += self._unless_malformed(insider.address, move)
+            try:
+                sent += self.rediscovery.move(insider)
+            except RtpsError as error:  # the others go on
+                sent += self._drop("malformed", insider.address, str(error))
         return sent + self.rediscovery.next_datagrams(now)
 
     def retire(self, now: float) -> list[Outgoing]:
@@ -380,13 +385,6 @@ class Domain:
         for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
             sent += self._end_for(leaver)
         return sent
-
-    def _unless_malformed(self, source: str, step: Callable[[], list[Outgoing]]) -> list[Outgoing]:
-        """What a step gives to send, or nothing: one participant must not keep it from others."""
-        try:
-            return step()
-        except RtpsError as error:
-            return self._drop("malformed", source, str(error))
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         prefix = message.prefix
@@ -608,19 +606,20 @@ class Domain:
             return []
         return self.former_ports.reminders(insider, now)
 
-    def _heard_at_range_port(
-        self,
-        port: int,
-        source: str,
-        insider: InsideParticipant,
-        now: float,
-        message: DiscoveryMessage,
-        received: int,
+    def _read_at_range_port(
+        self, port: int, source: str, insider: InsideParticipant, datagram: bytes, now: float
     ) -> _Passing:
-        """What becomes of metatraffic from outside at a port of the range. Raises RtpsError."""
-        if is_question_of_proxy(message):
-            return [], self.proxy_participants.answer_to_proxy(insider.prefix, message, source)
-        return self._imported(port, source, insider, now, message, received)
+        """What becomes of discovery from outside at a port of the range. Raises RtpsError."""
+        passed = list[bytes]()
+        back = list[Outgoing]()
+        for message, received in credited_messages(datagram):
+            if is_question_of_proxy(message):
+                back += self.proxy_participants.answer_to_proxy(insider.prefix, message, source)
+                continue
+            forwarded, replies = self._imported(port, source, insider, now, message, received)
+            passed += forwarded
+            back += replies
+        return passed, back
 
     def _imported(
         self,
@@ -812,19 +811,6 @@ def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUse
     """
     named = destinations(datagram) if len(users) > 1 else None
     return [user for user in users if user[0].prefix in named] if named else users
-
-
-def _pass_on_each(
-    datagram: bytes, pass_on: Callable[[DiscoveryMessage, int], _Passing]
-) -> _Passing:
-    """What is passed on of a datagram, and what goes back, of all who send in it. RtpsError."""
-    passed = list[bytes]()
-    back = list[Outgoing]()
-    for message, received in credited_messages(datagram):
-        forwarded, replies = pass_on(message, received)
-        passed += forwarded
-        back += replies
-    return passed, back
 
 
 def _dispose_message_of(participant: Participant) -> bytes:

@@ -108,7 +108,7 @@ class DomainServer:
         domain = self.domain
         self._groups.open(_families(self._bind))
         well_known = datagrams.bind(self._bind, settings.unicast_port)
-        self._read(well_known, self._from_inside(domain.heard_inside), self._is_read_of_inside)
+        self._read(well_known, self._heard_at_well_known, self._is_read_of_inside)
         taken_ports = []
         for port in settings.ports.listen.ports():
             try:
@@ -305,8 +305,8 @@ class DomainServer:
         self._send(Outgoing(HostPort(group, port), datagram) for group in groups_of(near))
 
     def _read_group(self, sock: socket.socket) -> None:
-        take = self._from_inside(self._heard_in_group)
-        self._loop.add_reader(sock, self._take_in, sock, take, self._is_read_of_inside)
+        must_read = self._is_read_of_inside
+        self._loop.add_reader(sock, self._take_in, sock, self._heard_in_group, must_read)
 
     def _stop_reading(self, sock: socket.socket) -> None:
         self._loop.remove_reader(sock)
@@ -323,28 +323,35 @@ class DomainServer:
         is_own = self._secret and datagram == self._secret
         return not is_own and self.domain.is_read_at_discovery(datagram, source)
 
-    def _from_inside(self, take: Take) -> Take:
-        def take_selected(datagram: bytes, source: str, now: float) -> list[Outgoing]:
-            if not self._is_inside(source):
-                return []
-            if self._selected.admits(source, now):
-                return take(datagram, source, now)
-            standing = self.domain.standing(source)
-            if not self.domain.rates.take(source, len(datagram), now, standing):
-                return []
-            with contextlib.suppress(RtpsError):
-                for message in read_messages(datagram):
-                    if message.of_participant is not None:
-                        self._selected.hold(source, message.datagram)
+    def _heard_at_well_known(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        if not self._is_let_in(datagram, source, now):
             return []
-
-        return take_selected
+        return self.domain.heard_inside(datagram, source, now)
 
     def _heard_in_group(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        if not self._is_let_in(datagram, source, now):
+            return []
         sent = self.domain.heard_inside(datagram, source, now)
         # Only now: a participant that is new was not in the table before.
         self.domain.inside.note_in_group(datagram, source)
         return sent
+
+    def _is_let_in(self, datagram: bytes, source: str, now: float) -> bool:
+        """Whether discovery from inside is read now.
+
+        Announcements of an address that is not selected wait, as the operator may select it soon.
+        """
+        if not self._is_inside(source):
+            return False
+        if self._selected.admits(source, now):
+            return True
+        standing = self.domain.standing(source)
+        if self.domain.rates.take(source, len(datagram), now, standing):
+            with contextlib.suppress(RtpsError):
+                for message in read_messages(datagram):
+                    if message.of_participant is not None:
+                        self._selected.hold(source, message.datagram)
+        return False
 
     def _at_discovery(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
         if self._secret and datagram == self._secret:
