@@ -27,12 +27,13 @@ Every datagram may be forged. So
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 from rosproxy.leases.ports import PortPool
 from rosproxy.ros2.discovery.announcements.to_inside import AnnouncementsToInside, ForInside
 from rosproxy.ros2.discovery.announcements.to_outside import AnnouncementsToOutside, ForOutside
 from rosproxy.ros2.discovery.discovery_participant import DiscoveryParticipant
+from rosproxy.ros2.discovery.disposal import Disposal
 from rosproxy.ros2.discovery.fragments import FragmentStores
 from rosproxy.ros2.discovery.participants.inside import InsideParticipants
 from rosproxy.ros2.discovery.participants.outside import OutsideParticipants
@@ -51,13 +52,11 @@ from rosproxy.ros2.ports.former_ports import FormerPorts
 from rosproxy.ros2.ports.locator_ports import LocatorPorts, NamedBy
 from rosproxy.ros2.ports.mappings import PortMappings
 from rosproxy.ros2.ports.stand_ins import LocatorStandIns, StandInUser
-from rosproxy.ros2.ports.store import PortStore
 from rosproxy.ros2.protocol.addressing import (
     destinations,
     for_all,
     may_be_discovery,
 )
-from rosproxy.ros2.protocol.announcement import dispose_message
 from rosproxy.ros2.protocol.relay_envelope import unwrapped
 from rosproxy.ros2.protocol.relay_proof import Direction
 from rosproxy.ros2.protocol.rtps import (
@@ -70,7 +69,6 @@ from rosproxy.ros2.protocol.rtps import (
 from rosproxy.ros2.registry.participants import (
     InsideParticipant,
     OutsideParticipant,
-    Participant,
     PortMapping,
     TrafficKind,
 )
@@ -118,31 +116,31 @@ class Domain:
         self.mappings = PortMappings(settings, self.ports, refused, proofs)
         self.stand_ins = LocatorStandIns(settings, refused)
         verdicts = Verdicts(settings.judge)
-        self.inside = InsideParticipants(settings, self.mappings, refused, proofs, verdicts)
-        self.outside = OutsideParticipants(settings, self.stand_ins, refused, proofs, verdicts)
-        settings.participants_at = self.outside.count_by_address.__getitem__
-        self.to_inside = AnnouncementsToInside(settings, self.inside, self.outside)
-        self.to_outside = AnnouncementsToOutside(settings, self.outside)
-        port_store = PortStore.of(
-            settings.host,
-            settings.ports.listen,
-            settings.number,
-            when - now,
-            settings.port_store_key,
-        )
-        self.former_ports = FormerPorts(settings, self.ports, port_store, proofs)
-        self.owners = PrefixOwners(settings, self.inside, self.outside, self.former_ports, proofs)
-        self.rediscovery = Rediscovery(settings, self.inside, self.outside, self.to_inside)
-        self.fragments = FragmentStores()
+        inside = InsideParticipants(settings, self.mappings, refused, proofs, verdicts)
+        outside = OutsideParticipants(settings, self.stand_ins, refused, proofs, verdicts)
+        self.inside = inside
+        self.outside = outside
+        settings.participants_at = outside.count_by_address.__getitem__
+        self.to_inside = AnnouncementsToInside(settings, inside, outside)
+        self.to_outside = AnnouncementsToOutside(settings, outside)
+        former_ports = FormerPorts.starting(settings, self.ports, proofs, when - now)
+        self.former_ports = former_ports
+        self.owners = PrefixOwners(settings, inside, outside, former_ports, proofs)
+        self.rediscovery = Rediscovery(settings, inside, outside, self.to_inside)
+        self.fragments = fragments = FragmentStores()
         self.proxy_participants = ProxyParticipants(
+            settings, DiscoveryParticipant(own), inside, outside, former_ports, fragments, proofs
+        )
+        self.disposal = Disposal(
             settings,
-            DiscoveryParticipant(own),
-            port_store,
-            self.inside,
-            self.outside,
-            self.former_ports,
-            self.fragments,
+            inside,
+            outside,
+            self.proxy_participants,
+            former_ports,
+            self.rediscovery,
+            fragments,
             proofs,
+            refused,
         )
 
     @property
@@ -343,7 +341,7 @@ class Domain:
         self.former_ports.forget({insider.address for insider in self.inside.by_prefix.values()})
         for insider in list(self.inside.by_prefix.values()):
             sent += self.rediscovery.separate(insider)
-            self._forget_inside(insider)
+            self.disposal.forget_inside(insider)
         return sent + self.rediscovery.next_datagrams(now)
 
     def standing(self, source: str) -> Standing:
@@ -368,10 +366,10 @@ class Domain:
         sent = list[Outgoing]()
         insiders = [p for p in self.inside.by_prefix.values() if p.until < now]
         for insider in insiders[:ENDED_AT_ONCE]:
-            sent += self._end_for(insider)
+            sent += self.disposal.end_inside(insider)
         outsiders = [p for p in self.outside.by_prefix.values() if p.until < now]
         for outsider in outsiders[:ENDED_AT_ONCE]:
-            self._forget_outside(outsider)
+            self.disposal.forget_outside(outsider)
         self.proofs.expire(now, self.inside, self.outside)
         return sent
 
@@ -383,7 +381,7 @@ class Domain:
         self.former_ports.forget(addresses)
         sent = list[Outgoing]()
         for leaver in [p for p in self.inside.by_prefix.values() if p.address in addresses]:
-            sent += self._end_for(leaver)
+            sent += self.disposal.end_inside(leaver)
         return sent
 
     def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
@@ -394,8 +392,8 @@ class Domain:
         ):
             return []  # a proxy's own participants are not passed on
         if self.proofs.note(source, message.datagram, now):
-            sent = self._end_former_processes(prefix, source)
-            return sent + [out for p in self.inside.prove() for out in self._end_for(p)]
+            sent = self.disposal.end_former_processes(prefix, source)
+            return sent + [out for p in self.inside.prove() for out in self.disposal.end_inside(p)]
         if spdp is None:
             return self.proxy_participants.told_inside(message, source, now)
         if spdp.ended:
@@ -414,7 +412,7 @@ class Domain:
             self.former_ports.forget_participant(message.prefix)
             text = f"GUID prefix {outsider.guid_prefix} belongs to a participant outside, at "
             return self._drop("prefix", source, text + outsider.address)
-        sent = self._give_prefix_to_inside(message.prefix, source)
+        sent = self.disposal.give_prefix_to_inside(message.prefix, source)
         return sent + self._announced_inside(message, source, now)
 
     def _wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
@@ -423,7 +421,7 @@ class Domain:
             return []
         sent = self.former_ports.wait(message, source, now)
         if sent and self.owners.yields_to_inside(message.prefix):
-            sent += self._give_prefix_to_inside(message.prefix, source)
+            sent += self.disposal.give_prefix_to_inside(message.prefix, source)
         return sent + self.proxy_participants.question_to_announced(message, source)
 
     def _heard_outside(
@@ -461,7 +459,7 @@ class Domain:
         if claimant is None:
             return []  # the LAN relay hears what it has sent to the LAN itself, or an end
         if self.owners.yields_to_outside(message.prefix, source, now):
-            self._give_prefix_to_outside(message.prefix, source)
+            self.disposal.give_prefix_to_outside(message.prefix, source)
             return self._announced_outside(message, source, received, now)
         text = f"GUID prefix {claimant.guid_prefix} belongs to a participant inside"
         self.refused("prefix", source, text)
@@ -473,10 +471,12 @@ class Domain:
         """Take in what a participant outside tells the proxy's own. Raises RtpsError."""
         sent = list[Outgoing]()
         if self.proofs.note(source, message.datagram, now):
-            sent += self._end_former_processes(message.prefix, source)
+            sent += self.disposal.end_former_processes(message.prefix, source)
             told, ended = self.outside.prove(source)
             inside = self.inside.by_prefix.values()
-            sent += [out for outsider in ended for out in self._end_outside(outsider, inside)]
+            sent += [
+                out for outsider in ended for out in self.disposal.end_outside(outsider, inside)
+            ]
             sent += self.to_inside.of_outside(told, inside, now)
         return sent + self.proxy_participants.told_outside(message, source, received)
 
@@ -491,7 +491,7 @@ class Domain:
         sent += self.to_inside.of_outside([outsider], self.inside.by_prefix.values(), now)
         if message.of_participant is None or not message.of_participant.ended:
             return sent + self.proxy_participants.question_to_outside(outsider)
-        self._forget_outside(outsider)  # those inside are told of that, too
+        self.disposal.forget_outside(outsider)  # those inside are told of that, too
         return sent
 
     def _meet_outside(
@@ -507,7 +507,9 @@ class Domain:
         if spdp is None or spdp.ended or message.prefix in self.outside.by_prefix:
             return []
         outsider = self.outside.gives_place(source)
-        return self._end_outside(outsider, self.inside.by_prefix.values()) if outsider else []
+        return (
+            self.disposal.end_outside(outsider, self.inside.by_prefix.values()) if outsider else []
+        )
 
     def _announced_inside(
         self, message: DiscoveryMessage, source: str, now: float
@@ -520,17 +522,14 @@ class Domain:
             # of a participant that it knows. It announces itself again.
             return self.proxy_participants.question_to_announced(message, source)
         gives_place = self.inside.gives_place(prefix, source) if is_new else None
-        sent = self._end_for(gives_place) if gives_place else []
+        sent = self.disposal.end_inside(gives_place) if gives_place else []
         insider = self.inside.meet(message, source, now)
         if insider is None:
             if prefix not in self.inside.by_prefix:  # it may get a place once it has answered
                 sent += self.proxy_participants.question_to_announced(message, source)
             return sent
         if is_new:
-            sent += self._end_former_processes(prefix, source)  # it has answered while it waited
-            insider.was_inside = self.former_ports.was_inside(prefix)
-            holders = self.ports.displaced_by(prefix, now)
-            sent += [out for p in holders for out in self._give_up_ports(self.inside.by_prefix[p])]
+            sent += self._make_way(insider, now)
         mapping_count = len(insider.mappings)
         for_outside = ForOutside(self.inside, insider, now, self.former_ports.of(prefix))
         exported = for_outside.rewritten(message)
@@ -552,6 +551,19 @@ class Domain:
         )
         return sent + self.proxy_participants.first_questions(insider)
 
+    def _make_way(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
+        """End participants that stand where a new participant inside is: at its port, or its ports.
+
+        Return what outside is told.
+        """
+        prefix = insider.prefix
+        # It may have answered while it waited.
+        sent = self.disposal.end_former_processes(prefix, insider.address)
+        insider.was_inside = self.former_ports.was_inside(prefix)
+        for holder in self.ports.displaced_by(prefix, now):
+            sent += self.disposal.give_up_ports(self.inside.by_prefix[holder])
+        return sent
+
     def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
         self.former_ports.end(message.prefix, source)
         insider = self.inside.find(message.prefix, source)
@@ -560,7 +572,7 @@ class Domain:
         require_rewritable(message)
         # It may tell other things as well.
         exported = ForOutside(self.inside, insider, now).rewritten(message)
-        self._forget_inside(insider)
+        self.disposal.forget_inside(insider)
         return self.settings.to_outside(exported)
 
     def _exported(
@@ -660,7 +672,7 @@ class Domain:
         )
         back += self.outside.allowed_questions(outsider, questions)
         if spdp is not None and spdp.ended:
-            self._forget_outside(outsider)
+            self.disposal.forget_outside(outsider)
         return passed, back
 
     def _to_outside(self, users: Sequence[StandInUser], datagram: bytes) -> list[Outgoing]:
@@ -711,94 +723,6 @@ class Domain:
         is_proven = self.proofs.has(source) and not self.settings.is_inside(source)
         return NamedBy.PROVEN if is_proven else NamedBy.OTHERS
 
-    def _end_former_processes(self, prefix: bytes, source: str) -> list[Outgoing]:
-        """End the participants of crashed processes at the port of a participant.
-
-        A crashed process sends no dispose message, and would be known until its lease duration is
-        over. A participant that has answered has bound the port, so the former process has gone.
-        The answer of the former process counts no longer: its announcement may be repeated.
-        """
-        if not self.proofs.has_answered(source, prefix):
-            return []
-        sent = list[Outgoing]()
-        for insider in self.inside.former_processes(prefix, source):
-            self.proofs.forget(source, insider.prefix)
-            sent += self._end_for(insider)
-        for outsider in self.outside.former_processes(prefix, source):
-            self.proofs.forget(source, outsider.prefix)
-            sent += self._end_outside(outsider, self.inside.by_prefix.values())
-        return sent
-
-    def _end_for(self, insider: InsideParticipant) -> list[Outgoing]:
-        """End a participant inside on its behalf; what outside is told.
-
-        It may live, and come back by other ports. Outside has to meet it anew then.
-        """
-        ended = _dispose_message_of(insider)
-        self._forget_inside(insider)
-        self.former_ports.displace(insider.prefix)
-        return self.settings.to_outside(ended)
-
-    def _end_outside(
-        self, outsider: OutsideParticipant, inside: Iterable[InsideParticipant]
-    ) -> list[Outgoing]:
-        """Forget a participant outside, and tell some inside that it has ended."""
-        ended = _dispose_message_of(outsider)
-        told = list(inside) if outsider.is_announced else []
-        self._forget_outside(outsider)
-        return [sent for insider in told for sent in sent_to(insider.metatraffic, [ended])]
-
-    def _give_prefix_to_inside(self, prefix: bytes, source: str) -> list[Outgoing]:
-        """Forget the participant outside, if any, whose prefix is that of one at an address inside.
-
-        Only participants on other networks are told of the end: those on its own know the rightful
-        one, and would forget it.
-        """
-        outsider = self.outside.by_prefix.get(prefix)
-        if outsider is None:
-            return []
-        text = f"GUID prefix {outsider.guid_prefix} belongs to a participant inside, at {source}"
-        self.refused("prefix", outsider.address, text)
-        near = self.settings.proxy_address_for(source)
-        elsewhere = [p for p in self.inside.by_prefix.values() if p.proxy_address != near]
-        return self._end_outside(outsider, elsewhere)
-
-    def _give_prefix_to_outside(self, prefix: bytes, source: str) -> None:
-        """Forget the participant inside, if any, whose prefix is that of one at an address outside.
-
-        Outside is told of no end: it knows the rightful one, and would forget it.
-        """
-        insider = self.inside.by_prefix.get(prefix)
-        if insider is not None:
-            text = (
-                f"GUID prefix {insider.guid_prefix} belongs to a participant outside, at {source}"
-            )
-            self.refused("prefix", insider.address, text)
-            self._forget_inside(insider)
-
-    def _give_up_ports(self, insider: InsideParticipant) -> list[Outgoing]:
-        """End a participant inside for the ports that are another one's; what outside is told.
-
-        It is let in again with its next announcement, and gets other ports.
-        """
-        text = (
-            f"participant {insider.guid_prefix} loses a port that another participant has claimed"
-        )
-        self.refused("port_claim", insider.address, text)
-        return self._end_for(insider)
-
-    def _forget_inside(self, insider: InsideParticipant) -> None:
-        self.inside.forget(insider)
-        self.proxy_participants.forget(insider.prefix)
-        self.fragments.forget(insider.prefix)
-
-    def _forget_outside(self, outsider: OutsideParticipant) -> None:
-        self.rediscovery.forget(self.inside.by_prefix.values(), outsider.prefix)
-        self.outside.forget(outsider)
-        # What is known of ports belongs to a participant inside, which may have the same prefix.
-        self.proxy_participants.discovery_participant.forget(outsider.prefix)
-        self.fragments.forget(outsider.prefix)
-
     def _drop(self, reason: str, source: str, text: str) -> list[Outgoing]:
         self.refused(reason, source, text)
         return []
@@ -811,12 +735,3 @@ def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUse
     """
     named = destinations(datagram) if len(users) > 1 else None
     return [user for user in users if user[0].prefix in named] if named else users
-
-
-def _dispose_message_of(participant: Participant) -> bytes:
-    """The dispose message of a participant that may come back.
-
-    The number is the next one after that of its last announcement: Fast DDS takes no older sample
-    of the same writer (StatelessReader.cpp), so a greater one would keep it out for good.
-    """
-    return dispose_message(participant.prefix, participant.vendor, participant.next_number)

@@ -32,12 +32,16 @@ class ProxyParticipants:
 
     settings: DomainSettings
     discovery_participant: DiscoveryParticipant
-    port_store: PortStore
     inside: InsideParticipants
     outside: OutsideParticipants
     former_ports: FormerPorts
     fragments: FragmentStores
     proofs: AddressProofs
+
+    @property
+    def port_store(self) -> PortStore:
+        """The port store of the domain."""
+        return self.former_ports.port_store
 
     def is_of_proxy(self, prefix: bytes) -> bool:
         """Whether a GUID prefix is that of one of the proxy's own participants.

@@ -10,6 +10,7 @@ reminders make participants remember the ports that they have now.
 from collections import Counter
 from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Self
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import (
@@ -51,6 +52,27 @@ class FormerPorts:
     recorded: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     displaced: dict[bytes, None] = field(default_factory=dict)
     _counts: Counter[str] = field(default_factory=Counter)
+
+    @classmethod
+    def starting(
+        cls,
+        settings: DomainSettings,
+        ports: LocatorPorts,
+        proofs: AddressProofs,
+        unix_offset: float,
+    ) -> Self:
+        """The former ports of a proxy that starts, with the port store that knows them.
+
+        ``unix_offset`` is Unix time less the time that the methods are given, in seconds.
+        """
+        port_store = PortStore.of(
+            settings.host,
+            settings.ports.listen,
+            settings.number,
+            unix_offset,
+            settings.port_store_key,
+        )
+        return cls(settings, ports, port_store, proofs)
 
     def is_waiting(self, prefix: bytes, source: str) -> bool:
         """Whether a participant at an address waits."""
