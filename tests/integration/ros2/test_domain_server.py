@@ -176,7 +176,7 @@ async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
     server.domain.heard_inside(spdp(A, INSIDE), INSIDE, 0.1)
     now = SETTLING + ANSWER_TIME
     await server.expire()
-    server._reader._queue = DiscoveryQueue()
+    server._scheduler._queue = DiscoveryQueue()
     for _ in range(3):
         await asyncio.sleep(0)
     assert not server.domain.inside.by_prefix

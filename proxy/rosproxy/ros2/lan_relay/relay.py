@@ -31,7 +31,7 @@ from rosproxy.ros2.protocol.relay_envelope import listed_addresses, wrapped
 from rosproxy.ros2.protocol.relay_proof import Direction, ProofError, RelayProof
 from rosproxy.ros2.protocol.rtps import RtpsError, by_source
 from rosproxy.ros2.rewriting.discovery import read_discovery
-from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
+from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
 from rosproxy.ros2.sources.rates import DiscoveryRates
 
@@ -69,7 +69,7 @@ class LanRelay:
         self._sources = LanSources()
         # A machine on the LAN may forge the proxy's address, but not its proof.
         self._proxy_rates = DiscoveryRates(PER_SECOND, BURST)
-        self._reader = DiscoveryReader()
+        self._scheduler = DiscoveryScheduler()
         self._warned_at = -QUIET_S
         self.from_lan = self.to_lan = self.dropped = 0
 
@@ -89,7 +89,7 @@ class LanRelay:
 
     def close(self) -> None:
         """End."""
-        self._reader.close()
+        self._scheduler.close()
         self._groups.close()
         for sock in self._sockets:
             self._end(sock)
@@ -110,7 +110,7 @@ class LanRelay:
                 source = plain_address(sender[0])
                 size = len(datagram)
                 read = partial(self._tell_proxy, datagram, source)
-                is_read = self._sources.take(source, size, now) and self._reader.put(
+                is_read = self._sources.take(source, size, now) and self._scheduler.put(
                     source, self._sources.standing(source, now), size, read
                 )
                 self.dropped += not is_read

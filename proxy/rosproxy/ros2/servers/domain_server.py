@@ -1,7 +1,7 @@
 """The sockets of one domain: what they receive goes to `Domain`, what that returns is sent.
 
 User data passes at once. Discovery, which takes long to read, waits for its turn
-(`DiscoveryReader`).
+(`DiscoveryScheduler`).
 
     the groups       at the domain's multicast port, on every inside network
     well-known port  where those inside announce themselves that know the proxy as a peer
@@ -36,7 +36,7 @@ from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
 from rosproxy.ros2.rewriting.discovery import read_messages
-from rosproxy.ros2.servers.discovery_reader import DiscoveryReader
+from rosproxy.ros2.servers.discovery_scheduler import DiscoveryScheduler
 from rosproxy.ros2.servers.groups import GroupSockets, family_of, groups_of, send_through
 from rosproxy.ros2.sources.selected import SelectedAddresses
 
@@ -91,7 +91,7 @@ class DomainServer:
         self._groups = GroupSockets(settings.multicast_port, self._read_group, self._stop_reading)
         self._secret = b""
         self._heard = asyncio.Event()
-        self._reader = DiscoveryReader()
+        self._scheduler = DiscoveryScheduler()
         self._next_part: asyncio.Handle | None = None
         self._admitting: dict[bytes, float] = {}
         """Participants that have waited, and since when they wait for their turn."""
@@ -221,7 +221,7 @@ class DomainServer:
 
     def close(self) -> None:
         """Close all sockets."""
-        self._reader.close()
+        self._scheduler.close()
         if self._next_part:
             self._next_part.cancel()
         # Participants must not forget the port store, by which they keep their ports.
@@ -255,7 +255,7 @@ class DomainServer:
             source, message, _ = former_ports.waiting[prefix]
             standing = self.domain.standing(source)
             admit = partial(self._admit, prefix)
-            if self._reader.put(source, standing, len(message.datagram), admit):
+            if self._scheduler.put(source, standing, len(message.datagram), admit):
                 admitting[prefix] = now
 
     def _admit(self, prefix: bytes) -> list[Outgoing]:
@@ -387,7 +387,7 @@ class DomainServer:
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
-        if not self._reader.read(heard_at, standing, len(datagram), read):
+        if not self._scheduler.read(heard_at, standing, len(datagram), read):
             text = "the queue of discovery that the proxy has not read yet is full"
             self.domain.refused("rate", heard_at, text)
 

@@ -7,7 +7,7 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.domain_settings import Outgoing
-from rosproxy.ros2.servers.discovery_reader import LONGEST_ROUND, ROUND, DiscoveryReader
+from rosproxy.ros2.servers.discovery_scheduler import LONGEST_ROUND, ROUND, DiscoveryScheduler
 from rosproxy.ros2.sources.fair_queue import MOST_OF_SOURCE, OVERHEAD
 from rosproxy.ros2.sources.rates import Standing
 
@@ -28,7 +28,7 @@ async def until_read(names: list[str], count: int) -> None:
 
 
 async def test_something_else_runs_between_two_long_datagrams() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     for _ in range(3):
         reader.put("robot", Standing.PROVEN, ROUND, reading(names, "robot"))
@@ -39,7 +39,7 @@ async def test_something_else_runs_between_two_long_datagrams() -> None:
 
 
 async def test_what_a_datagram_leads_to_counts_as_well() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 32
     for _ in range(3):
@@ -50,7 +50,7 @@ async def test_what_a_datagram_leads_to_counts_as_well() -> None:
 
 
 async def test_short_datagrams_share_a_round() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     for _ in range(20):
         reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
@@ -60,7 +60,7 @@ async def test_short_datagrams_share_a_round() -> None:
 
 async def test_a_round_is_longer_after_much_has_come() -> None:
     """With rounds of one length, receiving from a crowd took all the time, and all was late."""
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     count = ROUND // OVERHEAD
     for _ in range(4 * count):
@@ -75,7 +75,7 @@ async def test_a_round_is_longer_after_much_has_come() -> None:
 
 
 async def test_what_comes_while_none_waits_is_read_at_once() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     for name in ("robot", "laptop"):
         assert reader.read(name, Standing.PROVEN, 0, reading(names, name))
@@ -83,7 +83,7 @@ async def test_what_comes_while_none_waits_is_read_at_once() -> None:
 
 
 async def test_what_comes_after_a_full_round_waits_for_its_turn() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     copies = [Outgoing(HostPort("10.0.0.9", 7410), bytes(1000))] * 8
     reader.read("announces", Standing.PROVEN, 0, reading(names, "announces", copies))
@@ -97,7 +97,7 @@ async def test_what_comes_after_a_full_round_waits_for_its_turn() -> None:
 
 
 async def test_what_comes_behind_a_datagram_that_waits_waits_as_well() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     reader.put("robot", Standing.PROVEN, 0, reading(names, "first"))
     reader.read("robot", Standing.PROVEN, 0, reading(names, "second"))
@@ -107,7 +107,7 @@ async def test_what_comes_behind_a_datagram_that_waits_waits_as_well() -> None:
 
 
 async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     failures = list[str]()
     asyncio.get_running_loop().set_exception_handler(
@@ -128,7 +128,7 @@ async def test_a_datagram_that_breaks_the_reading_does_not_end_it() -> None:
 
 
 async def test_nothing_is_read_after_the_end() -> None:
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     reader.put("robot", Standing.PROVEN, 0, reading(names, "robot"))
     reader.close()
@@ -139,7 +139,7 @@ async def test_nothing_is_read_after_the_end() -> None:
 
 async def test_what_has_no_room_is_told() -> None:
     count = MOST_OF_SOURCE // (ROUND + OVERHEAD)
-    reader = DiscoveryReader()
+    reader = DiscoveryScheduler()
     names = list[str]()
     has_room = [
         reader.put("many", Standing.PROVEN, ROUND, reading(names, "many")) for _ in range(200)

@@ -26,7 +26,7 @@ Read = Callable[[], Sequence[Outgoing]]
 """Reads a datagram, sends what follows from it, and returns that."""
 
 
-class DiscoveryReader:
+class DiscoveryScheduler:
     """Reads datagrams in a fair order, until it is closed. Needs a running event loop."""
 
     def __init__(self) -> None:
