@@ -537,11 +537,11 @@ class Domain:
         # It knew the proxy elsewhere: it forgets the port store there, and meets all outside anew.
         if is_new and self.former_ports.must_be_rediscovered(prefix):
             sent += self.proxy_participants.port_store_dispose_message(insider)
-            insider.parting_from = now
+            insider.separation_due_from = now
         else:
             sent += self._reminders(insider, mapping_count, now)
         if not is_new and len(insider.mappings) > mapping_count:
-            insider.parting_from = now  # outside takes up no new locators of it
+            insider.separation_due_from = now  # outside takes up no new locators of it
         # For all: it may be an answer to the discovery participant.
         sent += self.to_outside.of_inside(insider, for_all(exported), now)
         if is_new:
@@ -591,7 +591,7 @@ class Domain:
                 source,
                 "the participant has not announced itself to the proxy",
             )
-        if insider.is_apart:
+        if insider.is_separated:
             return []
         readers = [outsider.prefix for outsider, _ in _meant(users, message.datagram)]
         if len(users) == 1 or destinations(message.datagram):
@@ -651,7 +651,7 @@ class Domain:
             message.prefix in self.inside.by_prefix
             or self.proxy_participants.is_of_proxy(message.prefix)
         )
-        if is_anothers or insider.is_apart:
+        if is_anothers or insider.is_separated:
             return [], []
         back = list[Outgoing]()
         if spdp is not None:

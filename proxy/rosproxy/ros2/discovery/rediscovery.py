@@ -1,20 +1,22 @@
-"""Having a participant inside and those outside meet anew.
+"""Rediscovery: a participant inside and the participants outside discover each other anew.
 
-A writer does not send again what a reader has confirmed (DDSI-RTPS 2.5, 8.4.9). So where two that
-know each other are to learn all of each other once more, both have to forget before either hears
-of the other. Else the one that still remembers confirms what the other begins anew, and is not sent
-it once it has forgotten as well: they never find each other's readers and writers. So the two are
-kept *apart* for a moment: both are told that the other has ended, nothing of discovery passes, and
-only then are they introduced.
+A writer does not send again what a reader has confirmed (DDSI-RTPS 2.5, 8.4.9). So before two
+participants can learn all of each other once more, both have to forget the other. If one of the two
+forgets later, it confirms from memory what the other begins anew, and is not sent it again once it
+has forgotten as well. The two then never find each other's readers and writers. So the proxy
+*separates* them for a moment: it tells both that the other has ended, and passes no discovery
+between them. Only then it announces each to the other.
 
-This is for participants whose policy has changed, and for those that knew the proxy at another
-address, as `FormerPorts` says. The latter wait until the LAN relay has been heard, which
-starts after the proxy: before that, outside would not hear that they have ended. Participants are
-told again, with each announcement from outside, until they send something to where outside is found
-now: while so many meet, not every datagram arrives.
+The proxy does so if a verdict of the policy has changed, if outside knows a participant by other
+ports or at another address (`FormerPorts`), and if the advertised host has moved. The separation
+waits for the first datagram of the LAN relay, which starts after the proxy: before that, outside
+would not hear that the participant has ended. While so many participants discover each other, not
+every datagram arrives. So a participant inside is told again to forget one outside, with each
+announcement of the latter, until it sends something to where the proxy announces this one now.
 
-Hundreds inside may have to meet hundreds outside, which takes many seconds. So dispose messages and
-introductions wait, and are made a few at a time (`next_datagrams`). Addresses inside take turns.
+Hundreds inside may have to rediscover hundreds outside, which takes many seconds. So dispose
+messages and announcements wait, and are made a few at a time (`next_datagrams`). Addresses inside
+take turns.
 """
 
 from collections import deque
@@ -33,19 +35,19 @@ from rosproxy.ros2.protocol.rtps import RtpsError
 from rosproxy.ros2.registry.participants import InsideParticipant, OutsideParticipant
 from rosproxy.ros2.rewriting.discovery import read_discovery, rewritten
 
-APART_TIME = 0.4
+SEPARATION_S = 0.4
 """Seconds in which a dispose message arrives, and is taken in, on both sides."""
 VERDICTS_AT_ONCE = 32
 """Verdicts that are judged again at a time. With 1,000 rules one takes 0.7 ms."""
 PAIRS_AT_ONCE = 32
 """Participants outside that participants inside are told of at a time. One takes 0.1 ms."""
 LAN_RELAY_TIME = 30.0
-"""Seconds that the LAN relay may take to be heard; the wait is in vain if nobody is on its LAN."""
+"""Seconds that the LAN relay may take to be heard. Without a participant on its LAN it is not."""
 
 
 @dataclass(slots=True)
 class Rediscovery:
-    """Parts participants inside from all outside, and introduces them again."""
+    """Separates participants inside from all outside, and announces them to each other again."""
 
     settings: DomainSettings
     inside: InsideParticipants
@@ -61,21 +63,21 @@ class Rediscovery:
     def separate(self, insider: InsideParticipant) -> list[Outgoing]:
         """Have a participant inside and all outside forget each other."""
         datagram = dispose_message(insider.prefix, insider.vendor, insider.next_number)
-        insider.parting_from = None
-        insider.apart_until = inf  # until the last dispose message
-        insider.dispose_message_times = {}  # it was not told to forget anybody yet
+        insider.separation_due_from = None
+        insider.separated_until = inf  # until the last dispose message
+        insider.dispose_message_times = {}  # it was told to forget no participant yet
         outsiders = [o for o in self.outside.by_prefix.values() if o.is_announced]
         self._put(insider, self._dispose_messages(insider, outsiders))
         return self.settings.to_outside(datagram)
 
     def review(self) -> None:
-        """Part the participants inside of which the policy says something else than before."""
+        """Separate the participants inside of which the policy says something else than before."""
         self._review = self.inside.verdicts.review(list(self.inside.by_prefix.values()))
         self._has_verdicts = True
 
     @property
     def is_busy(self) -> bool:
-        """Whether verdicts, dispose messages or introductions wait."""
+        """Whether verdicts, dispose messages or announcements wait."""
         return self._has_verdicts or bool(self._waiting)
 
     def next_datagrams(self, now: float) -> list[Outgoing]:
@@ -83,7 +85,7 @@ class Rediscovery:
         self._now = now
         verdicts = list(islice(self._review, VERDICTS_AT_ONCE))
         self._has_verdicts = len(verdicts) == VERDICTS_AT_ONCE
-        sent = [out for insider in filter(None, verdicts) for out in self._part(insider)]
+        sent = [out for insider in filter(None, verdicts) for out in self._separate_known(insider)]
         for _ in range(PAIRS_AT_ONCE):
             if not self._waiting:
                 break
@@ -100,12 +102,14 @@ class Rediscovery:
         return self.separate(insider)
 
     def proceed(self, insider: InsideParticipant, now: float) -> list[Outgoing]:
-        """Part a participant that has waited, or introduce it once it is apart for long enough."""
-        if insider.parting_from is not None and self._may_part(insider.parting_from, now):
+        """Separate a participant if that is due, or announce it after the separation."""
+        if insider.separation_due_from is not None and self._may_separate(
+            insider.separation_due_from, now
+        ):
             return self.separate(insider)
-        if insider.apart_until is None or now < insider.apart_until:
+        if insider.separated_until is None or now < insider.separated_until:
             return []
-        insider.apart_until = None
+        insider.separated_until = None
         self._put(insider, self._announcements(insider, list(self.outside.by_prefix.values())))
         return self.settings.to_outside(insider.announcement)
 
@@ -120,8 +124,8 @@ class Rediscovery:
             if insider.dispose_message_times is not None:
                 insider.dispose_message_times.pop(prefix, None)
 
-    def _part(self, insider: InsideParticipant) -> list[Outgoing]:
-        """Part a participant, of which the policy is asked anew then, unless it has gone."""
+    def _separate_known(self, insider: InsideParticipant) -> list[Outgoing]:
+        """Separate a participant unless it has gone. The policy is asked about it anew then."""
         if self.inside.by_prefix.get(insider.prefix) is not insider:
             return []
         self.inside.verdicts.forget(insider)
@@ -146,8 +150,8 @@ class Rediscovery:
     ) -> Iterator[list[Outgoing]]:
         for outsider in outsiders:
             yield self.to_inside.dispose_message(outsider, insider, self._now)
-        if insider.apart_until == inf:
-            insider.apart_until = self._now + APART_TIME
+        if insider.separated_until == inf:
+            insider.separated_until = self._now + SEPARATION_S
 
     def _announcements(
         self, insider: InsideParticipant, outsiders: Iterable[OutsideParticipant]
@@ -163,6 +167,6 @@ class Rediscovery:
     def _at_present_host(self, _: int, locator: HostPort) -> HostPort:
         return HostPort(self.settings.host_for(locator.host), locator.port)
 
-    def _may_part(self, waits_from: float, now: float) -> bool:
+    def _may_separate(self, waits_from: float, now: float) -> bool:
         no_lan_relay = self.settings.relay is None
         return no_lan_relay or self.lan_relay_heard or now - waits_from >= LAN_RELAY_TIME

@@ -179,7 +179,7 @@ class PortMappings:
 
     def _lose(self, participant: InsideParticipant, former_port: int | None, now: float) -> None:
         """Have all outside rediscover a participant, which they know by a port that it lost."""
-        participant.parting_from = now
+        participant.separation_due_from = now
         text = f"participant {participant.guid_prefix} gets another port than {former_port}, which "
         text += "another participant claims as well; outside discovers the participant anew"
         self.refused("port_claim", participant.address, text)

@@ -1,7 +1,7 @@
 """Participants: what the proxy knows of those inside and of those outside.
 
 A participant is known by its GUID prefix, and only together with the address that it was found at:
-anybody may write any prefix into a datagram.
+each sender may write any prefix into a datagram.
 """
 
 from collections import Counter
@@ -266,12 +266,12 @@ class InsideParticipant(Participant):
 
     ``verdicts``: whether the policy allows a topic or service, by rule; of its own endpoints and of
     those outside that it was to be told of; ``has_more_verdicts``: some are not remembered.
-    ``proxy_address`` is the proxy's address on its
-    network; ``is_in_group``: it was heard there by multicast. ``was_inside``: a former process
-    served it, as more than its own word says. ``announced_at`` is when outside was last told of it.
-    `Rediscovery` sets the rest, None if it does not apply: since when it waits to
-    be parted from outside; until when it is apart; when it was last told to forget each one
-    outside, by prefix.
+    ``proxy_address`` is the proxy's address on its network; ``is_in_group``: it was heard there by
+    multicast. ``was_inside``: a former process served it, as more than its own word says.
+    ``announced_at`` is when outside was last told of it.
+    The rest is None if it does not apply (`Rediscovery`). ``separation_due_from``: since when it
+    waits to be separated from outside. ``separated_until``: when the separation ends.
+    ``dispose_message_times``: when it was last told to forget each participant outside, by prefix.
     """
 
     verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
@@ -280,14 +280,14 @@ class InsideParticipant(Participant):
     is_in_group: bool = False
     was_inside: bool = False
     announced_at: float = 0.0
-    parting_from: float | None = None
-    apart_until: float | None = None
+    separation_due_from: float | None = None
+    separated_until: float | None = None
     dispose_message_times: dict[bytes, float] | None = None
 
     @property
-    def is_apart(self) -> bool:
+    def is_separated(self) -> bool:
         """Whether nothing of discovery passes between it and outside."""
-        return self.parting_from is not None or self.apart_until is not None
+        return self.separation_due_from is not None or self.separated_until is not None
 
     @property
     def ports(self) -> list[int]:

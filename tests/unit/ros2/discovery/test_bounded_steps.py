@@ -6,7 +6,7 @@ from itertools import chain
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import APART_TIME, PAIRS_AT_ONCE, VERDICTS_AT_ONCE
+from rosproxy.ros2.discovery.rediscovery import PAIRS_AT_ONCE, SEPARATION_S, VERDICTS_AT_ONCE
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -90,10 +90,10 @@ def test_a_change_of_the_policy_is_applied_in_parts() -> None:
     assert policy.count == INSIDE_COUNT + 1
     every_pair = {INSIDE: INSIDE_COUNT * OUTSIDE_COUNT, OTHER: OUTSIDE_COUNT}
     assert told([*chain(*parting)], ended=True) == every_pair
-    later = NOW + APART_TIME
+    later = NOW + SEPARATION_S
     meeting = parts(domain, domain.settle(later), later)
     assert told([*chain(*meeting)], ended=False) == every_pair
-    assert not any(insider.is_apart for insider in domain.inside.by_prefix.values())
+    assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
     most = PAIRS_AT_ONCE + 3 * (INSIDE_COUNT + 1)  # three for outside, of each inside
     assert max(map(len, parting + meeting)) <= most
 
@@ -103,7 +103,7 @@ def test_addresses_take_turns() -> None:
     domain = crowd(policy)
     policy.allows = False
     finished(domain, domain.apply_policy(NOW))
-    later = NOW + APART_TIME
+    later = NOW + SEPARATION_S
     sent = domain.settle(later)
     while told(sent, ended=False)[OTHER] < OUTSIDE_COUNT:
         sent += domain.go_on(later)
@@ -116,10 +116,10 @@ def test_a_participant_stays_apart_until_it_has_all_dispose_messages() -> None:
     policy.allows = False
     domain.apply_policy(NOW)
     assert domain.is_busy
-    later = NOW + APART_TIME
+    later = NOW + SEPARATION_S
     assert not told(domain.settle(later), ended=False)
     finished(domain, [], later)
-    assert all(insider.is_apart for insider in domain.inside.by_prefix.values())
+    assert all(insider.is_separated for insider in domain.inside.by_prefix.values())
 
 
 def test_verdicts_are_judged_again_a_few_at_a_time() -> None:

@@ -11,7 +11,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements import to_inside
 from rosproxy.ros2.discovery.announcements.to_outside import ANNOUNCED_AGAIN
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_MAPPINGS, MOST_PER_ADDRESS, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.ports.locator_ports import SETTLING
@@ -591,7 +591,7 @@ def test_a_participant_that_loses_one_of_two_networks_is_met_anew_at_the_other(
     (forgets_robot,) = to(parted, OTHER)
     assert source_prefix(forgets_robot) == B
     assert read_discovery(forgets_robot).announcements[0].ended
-    met = settle(domain, NOW + 22 + APART_TIME)
+    met = settle(domain, NOW + 22 + SEPARATION_S)
     (again,) = to(met, ROBOT)
     assert source_prefix(again) == A
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
@@ -617,12 +617,12 @@ def test_a_participant_with_other_locators_than_before_is_met_anew(count: int) -
     meet(domain)
     (ended,) = to(settle(domain, NOW), ROBOT)
     assert read_discovery(ended).announcements[0].ended
-    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + SEPARATION_S), ROBOT)
     ports = {RANGE.listen.first + p.port - RANGE.advertise.first for p in reached_at(again)}
     assert {domain.mappings.by_port[port][1].target.port for port in ports} == {7410, 7411}
     assert len(domain.mappings.by_port) <= MOST_MAPPINGS
     domain.heard_inside(spdp(A, INSIDE), INSIDE, NOW + 3)
-    assert not domain.inside.by_prefix[A].is_apart
+    assert not domain.inside.by_prefix[A].is_separated
 
 
 def test_a_proxy_that_retires_has_both_sides_forget_each_other() -> None:

@@ -12,7 +12,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery import domain as discovery_domain
 from rosproxy.ros2.discovery.announcements.to_outside import ForOutside
 from rosproxy.ros2.discovery.domain import ENDED_AT_ONCE
-from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS, MOST_PER_HOST, MOST_WAITING
 from rosproxy.ros2.ports import locator_ports
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
@@ -134,7 +134,7 @@ def test_fragments_are_judged_anew_by_another_policy() -> None:
     assert b"chatter" in sent.datagram
     allowed = False
     domain.apply_policy(NOW)
-    settle(domain, NOW + APART_TIME)
+    settle(domain, NOW + SEPARATION_S)
     (sent,) = domain.at_stand_in(stand_in, datagram, INSIDE, NOW)
     assert b"chatter" not in sent.datagram
 
@@ -381,7 +381,7 @@ def test_a_writer_without_a_topic_hinders_nobody(behind: bytes) -> None:
     domain.at_stand_in(stand_in, sedp(A, OTHER, 7000), OTHER, NOW)
     denied.append("/chatter")
     assert domain.apply_policy(NOW)
-    assert settle(domain, NOW + APART_TIME)
+    assert settle(domain, NOW + SEPARATION_S)
 
 
 def test_who_can_not_be_rewritten_is_not_taken_in(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -415,11 +415,11 @@ def test_one_whose_announcement_is_bad_keeps_no_policy_from_others() -> None:
     domain.inside.by_prefix[EVIL].announcement = b"no RTPS message"
     denied.append("/chatter")
     domain.apply_policy(NOW)
-    assert domain.inside.by_prefix[A].is_apart
+    assert domain.inside.by_prefix[A].is_separated
     assert spdp(A, OTHER)[:20] in {
-        told[:20] for told in to(settle(domain, NOW + APART_TIME), ROBOT)
+        told[:20] for told in to(settle(domain, NOW + SEPARATION_S), ROBOT)
     }
-    assert not domain.inside.by_prefix[A].is_apart
+    assert not domain.inside.by_prefix[A].is_separated
 
 
 def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None:
@@ -431,8 +431,8 @@ def test_one_outside_whose_announcement_is_bad_keeps_none_inside_apart() -> None
         domain.rediscovery.separate(insider)
     domain.go_on(NOW)
     domain.outside.by_prefix[B].announcement = b"no RTPS message"
-    settle(domain, NOW + APART_TIME)
-    assert not any(insider.is_apart for insider in domain.inside.by_prefix.values())
+    settle(domain, NOW + SEPARATION_S)
+    assert not any(insider.is_separated for insider in domain.inside.by_prefix.values())
 
 
 def test_one_that_waits_and_is_malformed_keeps_no_others_waiting(

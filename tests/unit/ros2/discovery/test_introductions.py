@@ -8,7 +8,7 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements import to_inside
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
 from rosproxy.ros2.protocol.rtps import FAST_DDS, HEADER, VERSION, source_prefix
@@ -90,7 +90,7 @@ def test_a_change_of_policy_reads_no_announcement_again(monkeypatch: pytest.Monk
     for insider in domain.inside.by_prefix.values():
         domain.rediscovery.separate(insider)
     finished(domain, [])
-    sent = finished(domain, domain.settle(NOW + APART_TIME), NOW + APART_TIME)
+    sent = finished(domain, domain.settle(NOW + SEPARATION_S), NOW + SEPARATION_S)
     told = [source_prefix(datagram) for datagram in to(sent, INSIDE)]
     assert set(told) == {named(0), named(1)}
     assert not calls

@@ -1,7 +1,7 @@
 """The advertised host has another address: outside meets the participants inside anew."""
 
 from rosproxy.ros2.discovery.announcements.to_outside import ANNOUNCED_AGAIN
-from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.protocol.rtps import source_prefix
 from tests.unit.ros2.discovery.domains import (
     HOST,
@@ -32,11 +32,11 @@ def test_outside_forgets_and_meets_participants_where_the_host_is_now() -> None:
     moved = domain.move_to((MOVED,), NOW)
     dispose_messages = [source_prefix(datagram) for datagram in to(moved, ROBOT)]
     assert dispose_messages == [domain.proxy_participants.discovery_participant.prefix, A]
-    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + SEPARATION_S), ROBOT)
     assert {locator.host for locator in reached_at(again)} == {MOVED}
     ports = {RANGE.advertised(port) for port in domain.inside.by_prefix[A].ports}
     assert {locator.port for locator in reached_at(again)} == ports
-    later = NOW + APART_TIME + ANNOUNCED_AGAIN
+    later = NOW + SEPARATION_S + ANNOUNCED_AGAIN
     (repeated,) = to(domain.heard_inside(spdp(A, INSIDE), INSIDE, later), ROBOT)
     assert repeated == again
 
@@ -53,7 +53,7 @@ def test_each_locator_keeps_its_family() -> None:
     domain.settings.hosts = (HOST, "fd77::1")
     meet(domain, address="fd30::11")
     domain.move_to((MOVED, MOVED_IPV6), NOW)
-    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + SEPARATION_S), ROBOT)
     assert {locator.host for locator in reached_at(again)} == {MOVED_IPV6}
 
 
@@ -63,5 +63,5 @@ def test_a_participant_without_a_port_keeps_no_other_from_moving() -> None:
     meet(domain, B, "172.30.0.7")
     domain.inside.by_prefix[A].announcement = b""
     domain.move_to((MOVED,), NOW)
-    (again,) = to(settle(domain, NOW + APART_TIME), ROBOT)
+    (again,) = to(settle(domain, NOW + SEPARATION_S), ROBOT)
     assert source_prefix(again) == B

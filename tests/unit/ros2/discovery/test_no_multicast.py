@@ -7,7 +7,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.announcements.to_inside import DISPOSE_MESSAGE_INTERVAL
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import APART_TIME, LAN_RELAY_TIME
+from rosproxy.ros2.discovery.rediscovery import LAN_RELAY_TIME, SEPARATION_S
 from rosproxy.ros2.domain_settings import MOST_PER_ADDRESS
 from rosproxy.ros2.protocol.rtps import source_prefix
 from rosproxy.ros2.rewriting.discovery import read_discovery
@@ -140,7 +140,7 @@ def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
     assert is_dispose_message(by(domain.proxy_participants.port_store.prefix, to(sent, INSIDE))[0])
     assert by(C, to(sent, INSIDE)) == []
     parting = settle(domain, NOW)
-    meeting = settle(domain, NOW + APART_TIME)
+    meeting = settle(domain, NOW + SEPARATION_S)
 
     for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
         assert [is_dispose_message(datagram) for datagram in told] == [True]
@@ -177,7 +177,7 @@ def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
     domain = moved()
     meet(domain)
     settle(domain, NOW)
-    settle(domain, NOW + APART_TIME)
+    settle(domain, NOW + SEPARATION_S)
     later = by(B, to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
     assert [is_dispose_message(datagram) for datagram in later] == [True, False]
     domain.heard_outside(dispose_message(B), ROBOT, NOW + 1)
@@ -189,7 +189,7 @@ def test_who_does_not_take_it_in_is_told_again() -> None:
     domain = moved()
     meet(domain)
     settle(domain, NOW)
-    settle(domain, NOW + APART_TIME)
+    settle(domain, NOW + SEPARATION_S)
 
     def told(later: float) -> list[bool]:
         sent = domain.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
@@ -226,7 +226,7 @@ def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
     meet(domain)
     assert not set(domain.inside.by_prefix[A].ports) & set(ports)
     parting = settle(domain, NOW)
-    meeting = settle(domain, NOW + APART_TIME)
+    meeting = settle(domain, NOW + SEPARATION_S)
     assert [is_dispose_message(datagram) for datagram in by(A, to(parting, ROBOT))] == [True]
     assert [is_dispose_message(datagram) for datagram in by(A, to(meeting, ROBOT))] == [False]
 

@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING
@@ -134,7 +134,7 @@ def test_a_participant_with_a_proof_takes_its_port_from_a_liar(proof: str) -> No
     come(domain, A, INSIDE, NUMBER, 3.0, PROOF)
     sent = settle(domain, 3.1)
     assert ports_of(domain, A) == PORTS
-    assert not domain.inside.by_prefix[A].is_apart
+    assert not domain.inside.by_prefix[A].is_separated
     assert B not in domain.inside.by_prefix
     assert ends_of(B, sent, ROBOT)
     assert reasons_of(domain)["port_claim"]
@@ -148,7 +148,7 @@ def test_a_proof_that_another_participant_has_as_well_gets_the_port_for_neither(
     settle(domain, SETTLING)
     for prefix in (A, B):
         assert not {*ports_of(domain, prefix)} & {*PORTS}
-        assert domain.inside.by_prefix[prefix].is_apart
+        assert domain.inside.by_prefix[prefix].is_separated
 
 
 def test_a_participant_that_has_lost_a_port_meets_outside_anew() -> None:
@@ -163,7 +163,7 @@ def test_a_participant_that_has_lost_a_port_meets_outside_anew() -> None:
     parting = settle(domain, 4.1)
     assert ends_of(B, parting, ROBOT)
     assert ends_of(C, parting, OTHER)
-    meeting = [d for d in to(settle(domain, 4.1 + APART_TIME), ROBOT) if source_prefix(d) == B]
+    meeting = [d for d in to(settle(domain, 4.1 + SEPARATION_S), ROBOT) if source_prefix(d) == B]
     assert not {locator.port - 1000 for locator in reached_at(meeting[0])} & {*PORTS}
 
 
@@ -181,7 +181,7 @@ def test_two_that_claim_one_port_by_their_word_both_get_others(second: float) ->
     settle(domain, second + 2)
     for prefix in (A, B):
         assert not {*ports_of(domain, prefix)} & {*PORTS}
-        assert domain.inside.by_prefix[prefix].is_apart
+        assert domain.inside.by_prefix[prefix].is_separated
     come(domain, C, THIRD, 1, REMEMBERED - 1)
     settle(domain, REMEMBERED - 1)
     assert not {*ports_of(domain, C)} & {*PORTS}
@@ -239,7 +239,7 @@ def test_a_number_without_a_proof_gets_its_ports_where_no_other_claims_them() ->
     come(domain, A, INSIDE, NUMBER, 0.1)
     settle(domain, SETTLING)
     assert ports_of(domain, A) == PORTS
-    assert not domain.inside.by_prefix[A].is_apart
+    assert not domain.inside.by_prefix[A].is_separated
 
 
 def test_wrong_proofs_from_many_addresses_take_nothing_from_a_proof() -> None:

@@ -8,7 +8,7 @@ import pytest
 from rosproxy.access.rules import RuleKind
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.domain import Domain
-from rosproxy.ros2.discovery.rediscovery import APART_TIME
+from rosproxy.ros2.discovery.rediscovery import SEPARATION_S
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.policy import verdicts
 from rosproxy.ros2.policy.verdicts import LONGEST_NAME
@@ -108,8 +108,8 @@ def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
     rules.denied = {RuleKind.PUBLISH}
     parting = domain.apply_policy(NOW)
     assert outwards(domain) == inwards(domain) == []
-    assert settle(domain, NOW + APART_TIME / 2) == []
-    meeting = settle(domain, NOW + APART_TIME)
+    assert settle(domain, NOW + SEPARATION_S / 2) == []
+    meeting = settle(domain, NOW + SEPARATION_S)
     for host in (ROBOT, INSIDE):
         told = [
             (announced.ended, announced.sample.sequence)

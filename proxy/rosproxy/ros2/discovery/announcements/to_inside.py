@@ -118,7 +118,7 @@ class AnnouncementsToInside:
         sent = list[Outgoing]()
         by_near = dict[str, list[InsideParticipant]]()
         for insider in inside:
-            if insider.metatraffic and not insider.is_apart:
+            if insider.metatraffic and not insider.is_separated:
                 near = self.settings.proxy_address_for(insider.address)
                 by_near.setdefault(near, []).append(insider)
         for outsider in filter(self.outside.may_be_announced, outside):

@@ -81,7 +81,7 @@ class AnnouncementsToOutside:
         is_first = not insider.announcement
         insider.announcement = announcement
         insider.announced_at = now
-        if insider.apart_until:
+        if insider.separated_until:
             return []
         if is_first:
             return self.settings.to_outside(announcement)
