@@ -1,29 +1,31 @@
 """One DDS domain: what the proxy does with each datagram of discovery, and as time passes.
 
 Participants inside announce themselves to a multicast group, or to the well-known port of a peer
-(SPDP). The proxy gives each of their locators a port of the range, and announces them outside with
-these. The announcement that outside answers to a port for metatraffic goes on to the participant
-inside, with a port of the proxy's (a *stand-in*) in place of outside's metatraffic: so all of
-discovery passes the proxy, both ways, and can be rewritten. What users send passes unread: to
-inside through the range, to outside without the proxy. Discovery that a sender puts among it is
-read like any other where the receiver would read it (`Participant.reads_discovery_at`).
+(SPDP). The proxy maps a port of the range to each of their locators (`PortMappings`), and announces
+the participants outside with these ports (`AnnouncementsToOutside`). An announcement that outside
+sends to a port for metatraffic goes on to the participant inside, with a *stand-in* in place of the
+locator for metatraffic (`AnnouncementsToInside`). So all of discovery passes the proxy, in both
+directions, and the proxy can rewrite it. User data passes unread: to inside through the range, to
+outside without the proxy. Discovery among user data is read like any other where the receiver would
+read it (`Participant.reads_discovery_at`).
 
-Nothing here does I/O: each method takes a datagram, where it came from and the time, and gives the
+Nothing here does I/O: each method takes a datagram, its source and the time, and returns the
 datagrams to send. After each, `stand_ins` tells which ports have to be open.
 
-Every datagram may be forged. So
+Each datagram may be forged. So
 
-- a participant inside is one whose address is inside, and only locators at that very address get a
+- a participant inside is one whose address is inside. Only locators at this very address get a
   port: no announcement makes the proxy a way to another host;
-- the prefix of a participant that is there can't be taken at another address or on the other side
-  (`PrefixOwners`);
+- no participant at another address or on the other side gets the GUID prefix of a participant that
+  is there (`PrefixOwners`);
 - a participant outside is one whose address is a peer's, or that the LAN relay has heard from
-  there, and the proxy itself sends to its locators at that very address alone;
-- the LAN relay is known by the proof of a shared secret, and the address that it claims for a
-  participant is neither inside nor the proxy's own;
-- until one outside has shown that it gets what it is sent (it names the prefix that it answers), it
-  is sent no more bytes than came from it: nobody can make the proxy flood somebody else;
-- each source may make only so much discovery in a second, what it leads to included.
+  there. The proxy itself sends to its locators at this very address alone;
+- the proxy knows the LAN relay by the proof of a shared secret. The address that the relay claims
+  for a participant is neither inside nor the proxy's own;
+- a participant outside is sent no more bytes than came from its address, until it has shown that it
+  receives them (it names the GUID prefix that it answers). So no sender can make the proxy flood
+  another machine;
+- each source may make only so much discovery in a second, with all that it leads to.
 """
 
 from collections import Counter
