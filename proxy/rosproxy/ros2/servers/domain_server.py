@@ -5,7 +5,8 @@ User data passes at once. Discovery, which takes long to read, waits for its tur
 
     the groups       at the domain's multicast port, on every inside network
     well-known port  where those inside announce themselves that know the proxy as a peer
-    the range        all its ports, from the start: what comes to one not lent tells who had it
+    the range        all its ports, from the start: what comes to a port without a mapping tells
+                     which participant had the port
     stand-ins        for the locators of participants outside, opened when they are first heard
 
 Everything is sent from one socket: RTPS answers to locators, not to where a datagram came from.

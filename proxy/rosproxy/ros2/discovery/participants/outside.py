@@ -64,7 +64,7 @@ class OutsideParticipants(ParticipantTable[OutsideParticipant]):
         participant = self.find(prefix, source)
         if spdp is None or spdp.ended or (participant is None and prefix in self.by_prefix):
             if participant is not None:
-                # Its end: `introduced` tells inside of it as of any announcement.
+                # Its end: `AnnouncementsToInside` tells inside of it as of any announcement.
                 self._keep(participant, message)
             return participant
         metatraffic = first_metatraffic(spdp, datagram, source)
