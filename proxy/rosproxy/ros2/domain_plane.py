@@ -1,4 +1,4 @@
-"""Who forwards user data of ROS 2, the proxy or the kernel: for ``/status``, and as metrics."""
+"""What forwards user data of ROS 2, the proxy or the kernel: for ``/status``, and as metrics."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -139,7 +139,7 @@ class DomainSettings:
         return self.ports.listen.first
 
     def to_outside(self, datagram: bytes) -> list[Outgoing]:
-        """A datagram for all to whom participants inside are announced: the LAN and all peers."""
+        """A datagram for the LAN and all peers, at which participants inside are announced."""
         sent = self.to_lan(datagram)
         for peer in self.peers:
             targets = [peer] if peer.port else self.well_known_of_peer(peer.host)

@@ -138,7 +138,7 @@ class Ros2:
                 self._runtime.now,
                 self._is_inside,
                 self.plane.syncer.note_change,
-                # An operator tells whom it selects by the admin endpoint, which takes its token.
+                # An operator selects addresses through the admin endpoint, which takes its token.
                 UPDATE_TIMEOUT if settings.admin_token_hash else 0.0,
             )
             server.domain.ports.note_forwarded(self.plane.forwards)
@@ -191,7 +191,7 @@ class Ros2:
         """
         update = read_body(body, ContainerUpdate)
         self._look_at_networks()  # the proxy may have just joined that of new containers
-        # Before anybody is selected: those who wait for that get their ports at once.
+        # Before addresses are selected: participants that wait for that get their ports at once.
         for server in self.servers:
             server.note_former(update.former_ports)
         if update.selected is not None:
@@ -257,7 +257,7 @@ class Ros2:
         return not self._awaiting and self._runtime.policy.ask(kind, name, (), address).allowed
 
     async def apply_policy(self) -> EnforcementCounts:
-        """Match participants anew of whom the policy says something else than before."""
+        """Separate the participants inside of which the policy says something else than before."""
         version = self._runtime.policy.version
         for server in self.servers:
             server.apply_policy()

@@ -376,7 +376,7 @@ class Domain:
         return sent
 
     def gone(self, addresses: Collection[str]) -> list[Outgoing]:
-        """End the participants at addresses inside where nobody is any more; what outside is told.
+        """End the participants at addresses inside that are gone. Return what outside is told.
 
         They can't say so themselves, and would be believed to be there for many seconds.
         """
@@ -697,7 +697,7 @@ class Domain:
         return Outgoing(mapping.target, datagram)
 
     def _note_former_use(self, port: int, datagram: bytes, source: str, now: float) -> None:
-        """Note whom outside means by a port that nobody has, soon after the start. RtpsError."""
+        """Note which participant outside means by a port without a mapping. Raises RtpsError."""
         if not self.ports.is_restoring(now):
             return
         if may_be_discovery(datagram) and self._is_too_much(datagram, source, now):
@@ -731,7 +731,7 @@ class Domain:
 
 
 def _meant(users: Sequence[StandInUser], datagram: bytes) -> Sequence[StandInUser]:
-    """Those of a stand-in that a message names; all if it is for everybody. Raises RtpsError.
+    """Those of a stand-in that a message names; all if it names none. Raises RtpsError.
 
     One that stands for a single participant takes everything, as that one does itself.
     """

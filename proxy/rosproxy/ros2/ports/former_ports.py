@@ -131,7 +131,7 @@ class FormerPorts:
         return source, message
 
     def forget(self, addresses: Collection[str]) -> None:
-        """Forget those that wait at addresses where nobody is any more."""
+        """Forget those that wait at addresses that are gone."""
         for prefix in [p for p, (source, *_) in self.waiting.items() if source in addresses]:
             self._forget_waiting(prefix)
 

@@ -34,7 +34,7 @@ MOST_NAMED = 8
 """Participants that may be named at one port; more tell nothing. One that is named for both kinds
 counts twice."""
 SETTLING = 1.0
-"""Seconds from the start in which no port is given, to hear first whom outside means by each."""
+"""Seconds from the start in which no port is given, to hear first what outside means by each."""
 REMEMBERED = 30.0
 """Seconds from the start in which a port is rather given to the participant that had it before."""
 
@@ -51,7 +51,7 @@ _User = tuple[bytes, TrafficKind]
 
 
 class NamedBy(IntEnum):
-    """Who names a participant at a port, from outside; the greatest counts."""
+    """What names a participant at a port, from outside; the greatest counts."""
 
     OTHERS = 0
     """An address whose datagrams may be forged."""
@@ -86,7 +86,7 @@ _SAID_BY_ITSELF = range(_Claim.KEPT_AND_NAMED, _Claim.NAMED)
 
 @dataclass(slots=True)
 class _FormerUsers:
-    """The participants that were named at a port, and for what, by who named them."""
+    """The participants that were named at a port, and for what, by what named them."""
 
     users_by: dict[NamedBy, set[_User]] = field(default_factory=dict)
 
@@ -141,7 +141,7 @@ class LocatorPorts:
         return now - self._started < REMEMBERED
 
     def note_use(self, port: int, datagram: bytes, by: NamedBy, now: float) -> None:
-        """Note whom a datagram from outside is for, at a port that nobody has. Raises RtpsError."""
+        """Note the addressee of a datagram from outside at a port without a mapping. RtpsError."""
         prefix = destination(datagram)
         is_built_in = of_built_in_writer(datagram)
         if prefix is not None and is_built_in is not None:

@@ -62,7 +62,7 @@ class DomainServer:
     """Serves one domain. ``now`` is the clock; ``is_inside`` tells an address's side.
 
     ``changed`` is called when a mapping was given or has ended.
-    For ``awaited`` seconds nobody is let in unless an operator has told who may.
+    For ``awaited`` seconds no participant is let in unless an operator has selected addresses.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class DomainServer:
         self.domain.former_ports.note_recorded(former, self.domain.inside.by_prefix)
 
     def end(self, addresses: Collection[str]) -> int:
-        """End the participants at addresses where nobody is any more; returns how many."""
+        """End the participants at addresses that are gone. Return how many there were."""
         before = len(self.domain.inside.by_prefix)
         self._send(self.domain.gone(addresses))
         return before - len(self.domain.inside.by_prefix)
@@ -419,7 +419,7 @@ class DomainServer:
         self._send_and_go_on(self.domain.go_on(self._now()))
 
     def _names_any(self, ports: Iterable[int], out: Outgoing) -> bool:
-        """Whether a datagram says that somebody is reached at one of these ports of the proxy's."""
+        """Whether a datagram has a locator with one of these ports of the proxy."""
         near = self.domain.settings.proxy_address_for(out.target.host)
         locators = (pack_locator(HostPort(near, p), order) for p in ports for order in "<>")
         return any(locator in out.datagram for locator in locators)
