@@ -33,7 +33,7 @@ DISPOSE_MESSAGE_INTERVAL = 2.0
 """Seconds after which a participant inside is told again to forget one outside, until they meet."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ForInside:
     """Rewrites the discovery of a participant outside for inside.
 

@@ -20,7 +20,7 @@ ANNOUNCED_AGAIN = 0.5
 """Seconds in which outside is told the same announcement only once."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ForOutside:
     """Rewrites the discovery of a participant inside for outside.
 
