@@ -228,7 +228,8 @@ class Neighbours(RuleBasedStateMachine):
     def check(self, sent: list[Outgoing]) -> None:
         """Hold to whom something may go: outside is sent no more than came from there."""
         outsiders = self.domain.outside.by_prefix.values()
-        self.proven |= {outsider.address for outsider in outsiders if outsider.proven}
+        # An address may prove to receive where no participant is known yet.
+        self.proven |= {*self.domain.proofs.addresses}
         self.answered |= {outsider.address for outsider in outsiders if outsider.has_answered}
         for out in sent:
             assert 0 < out.target.port < 65536
