@@ -107,7 +107,7 @@ def test_each_network_gets_the_proxys_address_there() -> None:
         assert hosts == [NEAR, ELSEWHERE]
 
 
-def test_an_introduction_follows_the_stand_in_and_the_announcement() -> None:
+def test_an_announcement_inside_follows_the_stand_in_and_the_announcement() -> None:
     domain = met()
     first, *_ = to(domain.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
     (blocked, _) = reached_at(first)
