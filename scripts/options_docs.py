@@ -58,8 +58,7 @@ def _option(setting: Setting) -> str:
 
 
 def _variables(setting: Setting) -> str:
-    own = f"ROSPROXY_{setting.parameter.upper()}"
-    names = ", ".join(f"`{name}`" for name in setting.option.variables or (own,))
+    names = ", ".join(f"`{name}`" for name in setting.variables)
     return f"{names} ({setting.option.note})" if setting.option.note else names
 
 

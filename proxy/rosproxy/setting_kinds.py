@@ -103,6 +103,11 @@ class Setting(NamedTuple):
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
     @property
+    def variables(self) -> tuple[str, ...]:
+        """The variables of the environment that give it."""
+        return self.option.variables or (f"ROSPROXY_{self.parameter.upper()}",)
+
+    @property
     def parameter(self) -> str:
         """The same as a name in Python."""
         return self.name.removeprefix("--").replace("-", "_")

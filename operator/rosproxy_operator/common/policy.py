@@ -15,10 +15,6 @@ from rosproxy.setting_kinds import SettingError
 
 ADMINISTRATOR = "administrator"
 """Name of the layer that the operator's options make, which is for every proxy."""
-_LAYERS = "ROSPROXY_POLICY_LAYERS"
-_AWAIT = "ROSPROXY_AWAIT_POLICY"
-POLICY_VARIABLES = (_LAYERS, _AWAIT)
-"""The variables that a proxy gets at its creation; they are not part of its fingerprint."""
 AWAITED = 3.0
 """Seconds that a proxy waits for its operator, as for an update about a new caller."""
 MOST_AUTHORS_RULES = MOST_RULES // 2
@@ -45,11 +41,6 @@ def too_much(layers: Sequence[PolicyLayer]) -> str:
         return f"{count} rules, at most {MOST_AUTHORS_RULES} are accepted"
     size = len(as_variable(layers).encode())
     return f"{size} bytes, at most {LONGEST_POLICY} are accepted" if size > LONGEST_POLICY else ""
-
-
-def policy_variables(layers: Sequence[PolicyLayer]) -> dict[str, str]:
-    """The variables by which a proxy learns of its policy at its creation, and that more comes."""
-    return {_AWAIT: f"{AWAITED:g}", _LAYERS: as_variable(layers)}
 
 
 def as_variable(layers: Sequence[PolicyLayer]) -> str:

@@ -28,13 +28,3 @@ OWN_BOUNDS = ProxyBounds()
 def make_proxy_bounds(options: Mapping[str, Any]) -> ProxyBounds:
     """The bounds from the values of the command line's options, by their names."""
     return ProxyBounds(*(options[f"proxy_{name}"] for name in ProxyBounds.__struct_fields__))
-
-
-def bound_variables(bounds: ProxyBounds) -> dict[str, str]:
-    """The variables by which a proxy learns its bounds: those that are not its own."""
-    own = msgspec.structs.asdict(OWN_BOUNDS)
-    return {
-        f"ROSPROXY_{name.upper()}": str(value)
-        for name, value in msgspec.structs.asdict(bounds).items()
-        if value != own[name]
-    }

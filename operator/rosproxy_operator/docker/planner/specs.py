@@ -8,15 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
-from rosproxy import fixes
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import SettingError, hash_token, parse_range
-from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
-from rosproxy_operator.common.proxy_bounds import bound_variables
+from rosproxy_operator.common.policy import AWAITED, as_variable
 from rosproxy_operator.common.ros2 import (
     LAN_RELAY_COMMAND,
     LAST_DOMAIN,
@@ -33,6 +31,7 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.model import STARTED_LABEL, Key
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.environment import LIVE_VARIABLES, environment
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
@@ -287,12 +286,8 @@ def proxy_fingerprint(action: Create, settings: PlanSettings, image_id: str, sec
     proxy that knows another one would not listen to the operator. So is what it shares with its
     LAN relay.
     """
-    # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
-    # is started again while the operator is away begins with the policy of its creation.
-    # VARIABLE came later: it only words the proxy's fixes, and is no reason to make a proxy anew.
     body = container_config(replace(action, sandbox="", fingerprint=""), settings, secret, "")
-    left_out = {*POLICY_VARIABLES, fixes.VARIABLE}
-    env = [v for v in body["Env"] if v.partition("=")[0] not in left_out]
+    env = [v for v in body["Env"] if v.partition("=")[0] not in LIVE_VARIABLES]
     return digest({**body, "Image": image_id, "Env": env})
 
 
@@ -360,12 +355,13 @@ def container_config(
     ``secret`` is what its token is made of. ``master_address`` may be empty: then the proxy
     resolves its master's host itself.
     """
-    variables = _variables(action, settings, secret, master_address)
+    told = _told(action, settings, secret, master_address)
+    variables = environment("docker", told, always=("port_range", "master_port"))
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
         "Image": settings.proxy_image,
         "User": USER,
-        "Env": [f"{name}={value}" for name, value in variables.items() if value],
+        "Env": [f"{name}={value}" for name, value in variables.items()],
         "Labels": own_labels(action),
         "HostConfig": {
             **COMMON,
@@ -377,39 +373,31 @@ def container_config(
     }
 
 
-def _variables(
+def _told(
     action: Create, settings: PlanSettings, secret: str, master_address: str
-) -> dict[str, str]:
-    """What a proxy is told; what is empty is left out. In another order it would be made anew."""
+) -> dict[str, Any]:
+    """The settings of a proxy, by their fields, in the order of `environment`."""
     key = action.key
     return {
-        fixes.VARIABLE: "docker",
-        "ROS_MASTER_URI": key.master_uri,
-        "ROSPROXY_ADVERTISE_HOST": key.advertise_host,
-        "ROSPROXY_PORT_RANGE": str(own_range(key, action.range)),
-        "ROSPROXY_MASTER_PORT": "" if key.is_ros2 else str(master(key).port),
-        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(key)}",
-        "ROSPROXY_DATA_PLANE": "" if action.data_plane == "auto" else action.data_plane,
-        "ROSPROXY_DIRECTION": "" if action.direction == "out" else action.direction,
-        "ROSPROXY_UDP": "1" if action.udp else "",
-        "ROSPROXY_SLAVE_CONTROL": "" if action.slave_control == "any" else action.slave_control,
-        "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(key, secret)),
-        "ROSPROXY_MASTER_ADDRESS": master_address,
-        **({} if key.is_ros2 else bound_variables(settings.proxy_bounds)),
-        **policy_variables((*settings.policy, *action.policy)),
-        **(_ros2_variables(action, secret) if key.is_ros2 else {}),
-    }
-
-
-def _ros2_variables(action: Create, secret: str) -> dict[str, str]:
-    return {
-        "ROSPROXY_ROS": "2",
-        "ROSPROXY_ROS2_DOMAINS": str(action.key.domain),
-        "ROSPROXY_ROS2_PEERS": " ".join(action.peers),
-        "ROSPROXY_ROS2_LAN_RELAY": str(action.lan_relay or ""),
-        "ROSPROXY_ROS2_LAN_RELAY_SECRET": _relay_secret(action.key, secret)
-        if action.lan_relay
-        else "",
+        "master_uri": key.master_uri,
+        "advertise_host": key.advertise_host,
+        "port_range": own_range(key, action.range),
+        "master_port": None if key.is_ros2 else master(key).port,
+        "admin": HostPort("0.0.0.0", admin_port(key)),
+        "data_plane": action.data_plane,
+        "direction": action.direction,
+        "udp": action.udp,
+        "slave_control": action.slave_control,
+        "admin_token_hash": hash_token(proxy_token(key, secret)),
+        "master_address": master_address,
+        **({} if key.is_ros2 else asdict(settings.proxy_bounds)),
+        "await_policy": AWAITED,
+        "policy_layers": as_variable((*settings.policy, *action.policy)),
+        "ros": ("2",) if key.is_ros2 else ("1",),
+        "ros2_domain": key.domain,
+        "ros2_peer": action.peers,
+        "ros2_lan_relay": action.lan_relay,
+        "ros2_lan_relay_secret": _relay_secret(key, secret) if action.lan_relay else None,
     }
 
 

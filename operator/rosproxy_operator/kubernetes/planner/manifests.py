@@ -7,12 +7,10 @@ from typing import Any
 
 import msgspec
 
-from rosproxy import fixes
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
+from rosproxy_operator.common.policy import AWAITED, as_variable
 from rosproxy_operator.common.port_negotiation import overlap
-from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
 from rosproxy_operator.kubernetes.planner.access.policies import policy_of
 from rosproxy_operator.kubernetes.resources.model import (
@@ -29,7 +27,6 @@ from rosproxy_operator.kubernetes.resources.names import (
     API_VERSION,
     CONTAINER,
     FINGERPRINT,
-    HASH_VARIABLE,
     KIND,
     MASTER_PORT,
     NODE,
@@ -41,8 +38,8 @@ from rosproxy_operator.kubernetes.resources.names import (
 )
 from rosproxy_operator.kubernetes.resources.pod_defaults import USER
 from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.proxy_spec.environment import LIVE_VARIABLES, environment, variable
 
-PEERS_VARIABLE = "ROSPROXY_ROS2_PEERS"
 STOPS_WITHIN = 5
 """Seconds that a proxy has to end before it is killed, `_LINGERS` included."""
 _LINGERS = 2
@@ -139,12 +136,9 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
         ADVERTISE_HOST: site.advertise_host,
     }
     meta = pod_metadata(rosproxy, proxy_id(rosproxy.id, site.node.name), annotations, settings)
-    # A running proxy is told a new policy, so that makes no pod anew. A proxy that is started
-    # again while the operator is away begins with the policy of its pod's creation.
-    # The same holds for peers, which come and go with the nodes. The operator's name only words
-    # the fixes of the proxy: proxies of former operators go on without it.
-    live_variables = {*POLICY_VARIABLES, PEERS_VARIABLE, fixes.VARIABLE}
-    env = [v for v in container["env"] if v["name"] not in live_variables]
+    # A running proxy is told new peers as well, which come and go with the nodes.
+    live = {*LIVE_VARIABLES, variable("ros2_peer")}
+    env = [v for v in container["env"] if v["name"] not in live]
     spec = {**_spec(site, settings), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     identity = _digest(f"{site.master.uri}{_domain(rosproxy)} {site.advertise_host}")[:8]
@@ -347,7 +341,8 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     publish = [site.master.publish] if site.master.publish else []
     host_ports = [("TCP", [*site.ports.ports(), *publish])] if spec.ros1 else []
     host_ports += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
-    variables = _environment(site, settings)
+    always = ("port_range", "master_port", "cleanup_after", "slave_control")
+    variables = environment("kubernetes", _told(site, settings), always)
     forwards = spec.data_plane == "kernel"
     return {
         "name": CONTAINER,
@@ -373,43 +368,34 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     }
 
 
-def _environment(site: ProxySite, settings: ClusterSettings) -> Mapping[str, str]:
+def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
+    """The settings of a proxy, by their fields, in the order of `environment`."""
     spec = site.rosproxy.spec
     policy = policy_of(site.rosproxy, settings)
-    variables = {
-        fixes.VARIABLE: "kubernetes",
-        "ROS_MASTER_URI": site.master.uri,
-        "ROSPROXY_MASTER_ADDRESS": site.master.address,
-        "ROSPROXY_ADVERTISE_HOST": site.advertise_host,
-        "ROSPROXY_PORT_RANGE": str(site.own_ports),
-        "ROSPROXY_MASTER_PORT": str(MASTER_PORT) if spec.ros1 else "",
-        "ROSPROXY_PUBLISH_MASTER": str(site.master.publish or ""),
-        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{ADMIN_PORT}",
-        "ROSPROXY_INSIDE_NETWORKS": " ".join(site.node.pod_networks),
-        "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
-        "ROSPROXY_SLAVE_CONTROL": slave_control_of(site.rosproxy, settings),
-        "ROSPROXY_DIRECTION": "" if spec.direction == "out" else spec.direction,
-        "ROSPROXY_UDP": "1" if spec.udp else "",
-        "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
-        HASH_VARIABLE: site.token_hash,
-        **_ros2_variables(site),
-        **bound_variables(settings.proxy_bounds),
-        # Without a policy there is nothing to wait for, which takes a second after each restart.
-        **(policy_variables(policy) if policy else {}),
-    }
-    return {name: value for name, value in variables.items() if value}
-
-
-def _ros2_variables(site: ProxySite) -> Mapping[str, str]:
-    spec = site.rosproxy.spec
-    if spec.ros2 is None:
-        return {}
     return {
-        "ROSPROXY_ROS": "1 2" if spec.ros1 else "2",
-        "ROSPROXY_ROS2_DOMAINS": str(spec.ros2.number),
-        PEERS_VARIABLE: " ".join(site.peers),
-        "ROSPROXY_ROS2_LAN_RELAY": str(site.lan_relay or ""),
-        "ROSPROXY_ROS2_LAN_RELAY_SECRET": site.relay_secret if site.lan_relay else "",
+        "master_uri": site.master.uri,
+        "master_address": site.master.address,
+        "advertise_host": site.advertise_host,
+        "port_range": site.own_ports,
+        "master_port": MASTER_PORT if spec.ros1 else None,
+        "publish_master": site.master.publish or None,
+        "admin": HostPort("0.0.0.0", ADMIN_PORT),
+        "inside_networks": site.node.pod_networks,
+        "cleanup_after": spec.cleanup_after,
+        "slave_control": slave_control_of(site.rosproxy, settings),
+        "direction": spec.direction,
+        "udp": spec.udp,
+        "data_plane": spec.data_plane,
+        "admin_token_hash": site.token_hash,
+        "ros": (*(["1"] if spec.ros1 else []), *(["2"] if spec.ros2 else [])),
+        "ros2_domain": spec.ros2.number if spec.ros2 else None,
+        "ros2_peer": site.peers,
+        "ros2_lan_relay": site.lan_relay,
+        "ros2_lan_relay_secret": site.relay_secret if site.lan_relay else None,
+        **msgspec.structs.asdict(settings.proxy_bounds),
+        # Without a policy there is nothing to wait for, which takes a second after each restart.
+        "await_policy": AWAITED if policy else None,
+        "policy_layers": as_variable(policy),
     }
 
 

@@ -56,7 +56,6 @@ MASTER_PORT = 11311
 ADMIN_PORT = 11312
 CONTAINER = "proxy"
 """Name of the container in a proxy's pod."""
-HASH_VARIABLE = "ROSPROXY_ADMIN_TOKEN_HASH"
 TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
 """Where former operators wrote the token itself."""
 

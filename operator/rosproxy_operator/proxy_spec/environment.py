@@ -1,0 +1,44 @@
+"""The variables of a proxy: the settings of ``rosproxy run`` that the operator gives the proxy."""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from rosproxy import fixes
+from rosproxy.setting_kinds import declared
+from rosproxy.settings import Settings
+
+_SETTINGS = {setting.field: setting for setting in declared(Settings)}
+
+
+def variable(field: str) -> str:
+    """The variable of a field of the proxy's `Settings`."""
+    # Another variable of the same setting would make the proxies of former operators anew.
+    return "ROS_MASTER_URI" if field == "master_uri" else _SETTINGS[field].variables[0]
+
+
+LIVE_VARIABLES = frozenset({fixes.VARIABLE, *map(variable, ("await_policy", "policy_layers"))})
+"""Variables in no fingerprint: a running proxy is told a new policy, and the operator's name only
+words the fixes of the proxy."""
+
+
+def environment(operator: str, told: Mapping[str, Any], always: Collection[str]) -> dict[str, str]:
+    """The variables of a proxy with these values of fields of its `Settings`, in their order.
+
+    Empty values and the proxy's own defaults have no variable, except defaults of the fields in
+    ``always``. With other variables, or in another order, an operator makes its proxies anew.
+    """
+    variables = {fixes.VARIABLE: operator}
+    for field, value in told.items():
+        text = _text(value)
+        if text and (field in always or value != _SETTINGS[field].default):
+            variables[variable(field)] = text
+    return variables
+
+
+def _text(value: Any) -> str:
+    """A value as a variable; empty if there is nothing to be told."""
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    if isinstance(value, bool | None):
+        return "1" if value else ""
+    return f"{value:g}" if isinstance(value, float) else str(value)
