@@ -19,6 +19,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
 from rosproxy_operator.kubernetes.resources.model import Name, Pod
 from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, RULE_KINDS, rosproxy
 from rosproxy_operator.kubernetes.status.rosproxy_status import status_of
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, words
 from tests.chart.chart import Json
 
 DEFINITION = custom_resource()
@@ -126,6 +127,14 @@ def test_defaults_are_the_operators(spec: Json) -> None:
 def test_limits_are_the_operators() -> None:
     assert SPEC["spec.ports"]["maximum"] == MOST_PORTS
     assert f"size() <= {MOST_NAME}" in SCHEMA["x-kubernetes-validations"][0]["rule"]
+
+
+@pytest.mark.parametrize("name", WISHES)
+def test_options_of_a_proxy_are_the_operators(name: str) -> None:
+    field = SPEC[f"spec.{WISHES[name].field}"]
+    default = getattr(OWN_SPEC, name)
+    assert field["default"] == (default.capitalize() if words(name) else default)
+    assert field.get("enum", []) == [word.capitalize() for word in words(name)]
 
 
 def test_bounds_of_a_policy_are_the_operators() -> None:

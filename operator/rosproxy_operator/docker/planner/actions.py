@@ -11,9 +11,9 @@ import msgspec
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 
 class Action(msgspec.Struct, frozen=True):
@@ -59,15 +59,10 @@ class _CreateContainer(Action, frozen=True):
 
 
 class CreateSandbox(_CreateContainer, frozen=True):
-    """Create a sandbox on the uplink network.
+    """Create the sandbox of a proxy with this ``spec``, on the uplink network."""
 
-    With ``forwards`` the kernel may forward packets in its network namespace. With ``udp`` one of
-    ROS 1 publishes its ports for UDP as well.
-    """
-
+    spec: ProxySpec = OWN_SPEC
     fingerprint: str = ""
-    forwards: bool = False
-    udp: bool = False
 
     def _details(self) -> str:
         return f": sandbox with ports {self.range} for the proxy of the {self.key.graph}"
@@ -82,19 +77,16 @@ class Create(_CreateContainer, frozen=True):
     """
 
     sandbox: str
-    data_plane: DataPlane = "auto"
+    spec: ProxySpec = OWN_SPEC
     fingerprint: str = ""
     replaces: str = ""
-    slave_control: SlaveControl = "any"
-    direction: Direction = "out"
-    udp: bool = False
     policy: tuple[PolicyLayer, ...] = ()
     peers: tuple[str, ...] = ()
     lan_relay: HostPort | None = None
 
     def _details(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
-        rights = ", with NET_ADMIN" if self.data_plane == "kernel" else ""
+        rights = ", with NET_ADMIN" if self.spec.data_plane == "kernel" else ""
         return (
             f": proxy of the {self.key.graph} at {self.key.advertise_host}, "
             f"ports {self.range} of {self.sandbox}{rights}{instead}"

@@ -132,7 +132,7 @@ class _Allocation:
         """Those of these ports whose protocol a key's proxy publishes."""
         if key.is_ros2:
             return udp
-        return tcp | udp if self.live[key].udp else tcp
+        return tcp | udp if self.live[key].spec.udp else tcp
 
     def _published(self, containers: Collection[Container], key: Key) -> frozenset[int]:
         """The ports that containers publish by the protocols of a key's proxy."""

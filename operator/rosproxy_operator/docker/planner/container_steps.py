@@ -195,9 +195,7 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _SandboxC
     taken = context.taken(sandboxes)
     # A sandbox where the kernel forwarded is not used without: a proxy that was killed has left its
     # rules there, and one without the capability can't take them away.
-    forwards = context.desired.data_plane == "kernel"
-    udp = context.desired.udp
-    action = CreateSandbox(sandbox_name(key), key, context.ports, forwards=forwards, udp=udp)
+    action = CreateSandbox(sandbox_name(key), key, context.ports, context.desired.spec)
     expected = sandbox_fingerprint(action, context.settings)
     selection = context.select(
         sandboxes, action.name, expected, lambda c: _usable(c, context.observed)
@@ -314,10 +312,7 @@ def _process_steps(
         key,
         context.ports,
         home.name,
-        context.desired.data_plane,
-        slave_control=context.desired.slave_control,
-        direction=context.desired.direction,
-        udp=context.desired.udp,
+        context.desired.spec,
         policy=context.label_policy,
         peers=context.desired.peers,
         lan_relay=context.lan_relay,

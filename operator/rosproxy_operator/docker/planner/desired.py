@@ -2,25 +2,13 @@
 
 from collections.abc import Collection, Iterable, Iterator
 
-from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.ros2 import LEAST_PORTS
-from rosproxy_operator.docker.planner.labels.readers import (
-    BUILT_IN,
-    DATA_PLANE,
-    DIRECTION,
-    UDP,
-)
-from rosproxy_operator.docker.planner.model import (
-    Desired,
-    HostState,
-    Member,
-)
+from rosproxy_operator.docker.planner.labels.readers import BUILT_IN
+from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
-
-_PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
-"""In order of precedence: first what the proxy can't do by itself."""
+from rosproxy_operator.proxy_spec.spec import WISHES, ProxySpec, merged
 
 
 def desire(
@@ -60,10 +48,7 @@ def desire(
                 max(ports, LEAST_PORTS) if key.is_ros2 else ports,
                 networks & usable,
                 own,
-                chosen_plane(considered, settings.data_plane),
-                "any" if key.is_ros2 else chosen_control(considered, settings.slave_control),
-                chosen_direction(considered, settings.direction),
-                not key.is_ros2 and chosen_udp(considered, settings),
+                proxy_spec(key, considered, settings),
                 _peers(considered, settings) if key.is_ros2 else (),
             )
         )
@@ -71,37 +56,12 @@ def desire(
     return tuple(desired), (*bad_networks, *_outvoted(desired))
 
 
-def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
-    """The data plane of a proxy with these containers; ``default`` if none asks for one."""
-    planes = {member.data_plane for member in members}
-    return next((plane for plane in _PLANES if plane in planes), default)
-
-
-def chosen_control(members: Iterable[Member], default: SlaveControl) -> SlaveControl:
-    """Who may control the nodes of a proxy with these containers: the narrowest that one asks for.
-
-    A node is not to be open to all because of a neighbour; who asks for more only gets less.
-    """
-    controls = {default, *(member.slave_control for member in members)}
-    return "master" if "master" in controls else "any"
-
-
-def chosen_direction(members: Iterable[Member], default: Direction) -> Direction:
-    """The direction of a proxy with these containers: both ways if one of them needs that.
-
-    Who has a route outwards loses nothing by going through the proxy.
-    """
-    directions = {member.direction or default for member in members} or {default}
-    return "both" if "both" in directions else "out"
-
-
-def chosen_udp(members: Collection[Member], settings: PlanSettings) -> bool:
-    """Whether a proxy with these containers has its ports for UDP, too: if one of them asks for it.
-
-    That is of no use without the other direction: datagrams outwards need no port.
-    """
-    is_both_ways = chosen_direction(members, settings.direction) == "both"
-    return is_both_ways and any(settings.udp if m.udp is None else m.udp for m in members)
+def proxy_spec(key: Key, members: Iterable[Member], settings: PlanSettings) -> ProxySpec:
+    """The options of a proxy with these containers."""
+    version = "2" if key.is_ros2 else "1"
+    names = (name for name, wish in WISHES.items() if wish.ros in ("", version))
+    defaults = ProxySpec(**{name: getattr(settings, name) for name in names})
+    return merged([member.wishes for member in members], defaults)
 
 
 def _peers(members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
@@ -140,21 +100,23 @@ def _bad_network(name: str, uplink: str) -> Problem:
 def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
     """Warn the containers whose proxy is not as their labels ask."""
     for wanted in desired:
-        winners = [m.container.name for m in wanted.members if m.data_plane == wanted.data_plane]
+        plane = wanted.spec.data_plane
+        winners = [m.container.name for m in wanted.members if m.wishes.get("data_plane") == plane]
         rival = f"container {winners[0]}" if winners else "an exited container"
         for member in wanted.members:
-            if member.udp and wanted.direction == "out":
+            subject = f"container {member.container.name}"
+            if member.wishes.get("udp") and wanted.spec.direction == "out":
                 yield Problem(
-                    f"container {member.container.name}",
-                    f"label {UDP}=true is ignored: datagrams from outside need both directions. "
-                    f"Add the label {DIRECTION}=both, or remove the label {UDP}",
+                    subject,
+                    "label rosproxy.udp=true is ignored: datagrams from outside need both "
+                    "directions. Add the label rosproxy.direction=both, or remove the label "
+                    "rosproxy.udp",
                     fatal=False,
                 )
-            if member.data_plane not in (None, wanted.data_plane):
+            if (asked := member.wishes.get("data_plane", plane)) != plane:
                 yield Problem(
-                    f"container {member.container.name}",
-                    f"label {DATA_PLANE}={member.data_plane} is ignored: the proxy also serves "
-                    f"{rival}, whose label asks for {wanted.data_plane}. Give both containers the "
-                    "same value",
+                    subject,
+                    f"label rosproxy.data-plane={asked} is ignored: the proxy also serves {rival}, "
+                    f"whose label asks for {plane}. Give both containers the same value",
                     fatal=False,
                 )

@@ -7,7 +7,7 @@ from ipaddress import IPv4Network
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec, Wishes
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which its nodes run, or may soon."""
@@ -252,13 +252,12 @@ class HostState:
 class Member:
     """A labelled container, and what it wants of its proxy: labels and settings put together.
 
-    ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label, ``direction`` is
-    None if any will do, ``udp`` if the option says. ``networks`` are the names of those on which it
-    wants to meet its proxy. ``wanted_alias`` is the host in its ROS_MASTER_URI: the name by which
-    it looks for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help
-    it. ``policy`` are rules for its own nodes alone. ``peers`` are hosts outside, for a member of a
-    ROS 2 domain, which has none of the others but ``ports`` and ``networks``. ``redirect`` is what
-    its label says, None without one; ``redirected_master`` the address and port of its master that
+    ``ports`` is 0 without a label, ``wishes`` are what its other labels ask for. ``networks`` are
+    the names of those on which it wants to meet its proxy. ``wanted_alias`` is the host in its
+    ROS_MASTER_URI: the name by which it looks for the proxy, ``rosproxy`` if it has no such
+    variable, empty where no alias can help it. ``policy`` are rules for its own nodes alone.
+    ``peers`` are hosts outside, for a member of a ROS 2 domain. ``redirect`` is what its label
+    says, None without one; ``redirected_master`` the address and port of its master that
     are to lead to its proxy, in its network, None if none are. A container that is not alive only
     keeps networks joined, and what else its labels made its proxy, for a while.
     """
@@ -268,10 +267,7 @@ class Member:
     ports: int = 0
     networks: frozenset[str] = frozenset()
     wanted_alias: str = ""
-    data_plane: DataPlane | None = None
-    slave_control: SlaveControl | None = None
-    direction: Direction | None = None
-    udp: bool | None = None
+    wishes: Wishes = field(default_factory=dict)
     policy: tuple[Rule, ...] = ()
     peers: frozenset[str] = frozenset()
     redirect: bool | None = None
@@ -283,9 +279,8 @@ class Desired:
     """What one proxy is to be.
 
     Without ``live`` no running container wants it any more: it is left as it is, but for the
-    networks that it leaves, until its grace ends. ``ports`` is the least number of ports. ``udp``:
-    they are published for UDP as well. ``peers`` are whom a proxy for ROS 2 tells of its
-    participants.
+    networks that it leaves, until its grace ends. ``ports`` is the least number of ports. ``peers``
+    are whom a proxy for ROS 2 tells of its participants.
     """
 
     key: Key
@@ -293,8 +288,5 @@ class Desired:
     ports: int
     networks: frozenset[str] = frozenset()
     members: tuple[Member, ...] = ()
-    data_plane: DataPlane = "auto"
-    slave_control: SlaveControl = "any"
-    direction: Direction = "out"
-    udp: bool = False
+    spec: ProxySpec = OWN_SPEC
     peers: tuple[str, ...] = ()

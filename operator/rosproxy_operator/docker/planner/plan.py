@@ -259,6 +259,5 @@ def _delays(
     for member in docker_plan.members:
         sandboxes = [s.container for s in observed.sandboxes_of(member.key)]
         joined = any(c.networks & member.networks for c in sandboxes if c.state != "removing")
-        asks = member.data_plane or member.direction or member.udp or member.peers
-        if not member.container.alive and (joined or asks):
+        if not member.container.alive and (joined or member.wishes or member.peers):
             yield settings.grace - (now - memory.exited[member.container.id])

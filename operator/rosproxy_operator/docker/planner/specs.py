@@ -298,11 +298,11 @@ def sandbox_config(action: CreateSandbox, settings: PlanSettings) -> dict[str, A
     below the ports that a proxy is to listen on.
     """
     sysctls = {"net.ipv4.ip_local_port_range": "1024 11000"}
-    if action.forwards:
+    if action.spec.data_plane == "kernel":
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {
         name: [{"HostIp": ip, "HostPort": str(port)} for ip in settings.publish_address]
-        for name, port in published_ports(action.key, action.range, action.udp)
+        for name, port in published_ports(action.key, action.range, action.spec.udp)
     }
     return {
         "Image": settings.proxy_image,
@@ -365,7 +365,7 @@ def container_config(
         "Labels": own_labels(action),
         "HostConfig": {
             **COMMON,
-            **(_KERNEL if action.data_plane == "kernel" else {}),
+            **(_KERNEL if action.spec.data_plane == "kernel" else {}),
             "Init": False,
             **{name: limit for name, limit in limits.items() if limit},
             "NetworkMode": f"container:{action.sandbox}",
@@ -384,10 +384,7 @@ def _told(
         "port_range": own_range(key, action.range),
         "master_port": None if key.is_ros2 else master(key).port,
         "admin": HostPort("0.0.0.0", admin_port(key)),
-        "data_plane": action.data_plane,
-        "direction": action.direction,
-        "udp": action.udp,
-        "slave_control": action.slave_control,
+        **asdict(action.spec),
         "admin_token_hash": hash_token(proxy_token(key, secret)),
         "master_address": master_address,
         **({} if key.is_ros2 else asdict(settings.proxy_bounds)),

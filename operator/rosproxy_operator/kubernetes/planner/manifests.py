@@ -39,6 +39,7 @@ from rosproxy_operator.kubernetes.resources.names import (
 from rosproxy_operator.kubernetes.resources.pod_defaults import USER
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.proxy_spec.environment import LIVE_VARIABLES, environment, variable
+from rosproxy_operator.proxy_spec.spec import WISHES
 
 STOPS_WITHIN = 5
 """Seconds that a proxy has to end before it is killed, `_LINGERS` included."""
@@ -114,12 +115,6 @@ def lan_address(node: ClusterNode, advertise_host: str) -> str:
 def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
     """The image of a RosProxy's proxies."""
     return rosproxy.spec.image or settings.image
-
-
-def slave_control_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
-    """Who may control a RosProxy's nodes: the operator decides, the RosProxy may only narrow it."""
-    modes = (settings.bounds.slave_control, rosproxy.spec.slave_control)
-    return "master" if "master" in modes else "any"
 
 
 def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
@@ -343,7 +338,7 @@ def _container(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:
     host_ports += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
     always = ("port_range", "master_port", "cleanup_after", "slave_control")
     variables = environment("kubernetes", _told(site, settings), always)
-    forwards = spec.data_plane == "kernel"
+    forwards = spec.proxy.data_plane == "kernel"
     return {
         "name": CONTAINER,
         "image": image_of(site.rosproxy, settings),
@@ -382,10 +377,13 @@ def _told(site: ProxySite, settings: ClusterSettings) -> Mapping[str, Any]:
         "admin": HostPort("0.0.0.0", ADMIN_PORT),
         "inside_networks": site.node.pod_networks,
         "cleanup_after": spec.cleanup_after,
-        "slave_control": slave_control_of(site.rosproxy, settings),
-        "direction": spec.direction,
-        "udp": spec.udp,
-        "data_plane": spec.data_plane,
+        # The order of former operators.
+        **dict.fromkeys(("slave_control", "direction", "udp", "data_plane")),
+        **msgspec.structs.asdict(spec.proxy),
+        # The operator decides, the RosProxy may only narrow it.
+        "slave_control": WISHES["slave_control"].first(
+            (settings.bounds.slave_control, spec.proxy.slave_control)
+        ),
         "admin_token_hash": site.token_hash,
         "ros": (*(["1"] if spec.ros1 else []), *(["2"] if spec.ros2 else [])),
         "ros2_domain": spec.ros2.number if spec.ros2 else None,

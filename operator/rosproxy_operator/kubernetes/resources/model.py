@@ -12,8 +12,8 @@ import msgspec
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
-from rosproxy.setting_kinds import DataPlane, Direction
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, ProxySpec
 
 Json = Mapping[str, Any]
 """An object as the API server gives it, or a part of one."""
@@ -119,12 +119,9 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     cleanup_after: float = 30.0
     grace: float = 60.0
     max_unavailable: MaxUnavailable = MaxUnavailable()
-    slave_control: str = "any"
+    proxy: ProxySpec = OWN_SPEC
     policy: tuple[PolicyLayer, ...] = ()
-    data_plane: DataPlane = "auto"
-    direction: Direction = "out"
     pod_egress: PodEgress = "any"
-    udp: bool = False
     image: str = ""
     image_pull_policy: str = ""
     image_pull_secrets: tuple[Json, ...] | None = None
@@ -141,7 +138,7 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     @property
     def takes_udp(self) -> bool:
         """Whether its proxies take UDP ports of their nodes: for DDS, or for UDPROS."""
-        return self.ros2 is not None or self.udp
+        return self.ros2 is not None or self.proxy.udp
 
 
 class RosProxy(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ pod is admitted) is checked here again. Names, types, bounds and defaults are th
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
@@ -15,7 +15,6 @@ from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.setting_kinds import DataPlane, Direction
 from rosproxy_operator.common.policy import too_much
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
@@ -46,11 +45,11 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, service_id
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
 from rosproxy_operator.kubernetes.resources.ros2_spec import check_ports, ros2_spec, versions
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
 MOST_PORTS = 500
 MOST_NAME = 46
 """Characters of a RosProxy's name, so that a proxy's still fits into a pod's host name."""
-_SLAVE_CONTROL = {"Any": "any", "Master": "master"}
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
 RULE_KINDS = {
@@ -63,13 +62,6 @@ RULE_KINDS = {
     "Slave": RuleKind.SLAVE,
 }
 _GLOB = re.compile(r"[^\s;]{1,256}")
-_DATA_PLANE: dict[str, DataPlane] = {
-    "Auto": "auto",
-    "Kernel": "kernel",
-    "Splice": "splice",
-    "Copy": "copy",
-}
-_DIRECTION: dict[str, Direction] = {"Out": "out", "Both": "both"}
 _POD_EGRESS: dict[str, PodEgress] = {"Any": "any", "Proxy": "proxy"}
 _ADVERTISE = {a.value: a for a in Advertise}
 _PULL_POLICY = {policy: policy for policy in ("", "Always", "IfNotPresent", "Never")}
@@ -152,12 +144,9 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         cleanup_after=field["cleanupAfterSeconds"].number(30.0, 0, _DAY),
         grace=field["graceSeconds"].number(60.0, 0, _DAY),
         max_unavailable=_max_unavailable(field["maxUnavailable"]),
-        slave_control=field["policy"]["slaveControl"].one_of(_SLAVE_CONTROL, "Any"),
+        proxy=_proxy_spec(field),
         policy=_policy(field["policy"], of),
-        data_plane=field["dataPlane"].one_of(_DATA_PLANE, "Auto"),
-        direction=field["direction"].one_of(_DIRECTION, "Out"),
         pod_egress=_pod_egress(field),
-        udp=_udp(field),
         image=field["image"].text(),
         image_pull_policy=field["imagePullPolicy"].one_of(_PULL_POLICY, ""),
         image_pull_secrets=_given(field["imagePullSecrets"], _maps),
@@ -187,19 +176,27 @@ def _max_unavailable(field: Field) -> MaxUnavailable:
 
 def _pod_egress(field: Field) -> PodEgress:
     egress = field["podEgress"].one_of(_POD_EGRESS, "Any")
-    direction = field["direction"]
-    if egress == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
+    if egress == "proxy" and _proxy_spec(field).direction == "out":
         problem = "needs spec.direction: Both; otherwise the pods receive nothing from outside"
         raise field["podEgress"].error(problem, "Set spec.direction: Both")
     return egress
 
 
-def _udp(field: Field) -> bool:
-    udp = field["udp"].boolean()
-    if udp and field["direction"].one_of(_DIRECTION, "Out") == "out":
+def _proxy_spec(field: Field) -> ProxySpec:
+    spec = ProxySpec(**{name: _wish(field, name) for name in WISHES})
+    if spec.udp and spec.direction == "out":
         problem = "needs spec.direction: Both; otherwise no datagrams reach the pods"
         raise field["udp"].error(problem, "Set spec.direction: Both")
-    return udp
+    return spec
+
+
+def _wish(field: Field, name: str) -> Any:
+    """What a field asks for: words begin with a capital there."""
+    for key in WISHES[name].field.split("."):
+        field = field[key]
+    allowed = {word.capitalize(): word for word in words(name)}
+    default = str(getattr(OWN_SPEC, name)).capitalize()
+    return field.one_of(allowed, default) if allowed else field.boolean()
 
 
 def _policy(field: Field, of: Name) -> tuple[PolicyLayer, ...]:

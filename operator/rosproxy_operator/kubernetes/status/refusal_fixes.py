@@ -102,7 +102,7 @@ def _unset_fix(low: str) -> str:
 def _security_fix(low: str, rosproxy: RosProxy) -> str:
     if "hostport" not in low and ("net_admin" in low or "privilegeescalation" in low):
         return "Allow NET_ADMIN for proxies in that namespace, or set spec.dataPlane: Auto"
-    kernel = rosproxy.spec.data_plane == "kernel"
+    kernel = rosproxy.spec.proxy.data_plane == "kernel"
     takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
     if rosproxy.spec.multicast:
         takes += ", and the LAN relay of a proxy needs hostNetwork"

@@ -6,7 +6,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.port_negotiation import overlap
 from rosproxy_operator.docker.planner.actions import Create, CreateLanRelay, CreateSandbox
-from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane, chosen_udp
+from rosproxy_operator.docker.planner.desired import proxy_spec
 from rosproxy_operator.docker.planner.model import STARTED, Key, Member
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
@@ -202,13 +202,10 @@ class Invariants:
 
     def made(self, key: Key, members: list[Member]) -> Create:
         """The proxy that these containers are to have, but for its range."""
-        plane = chosen_plane(members, SETTINGS.data_plane)
-        direction = chosen_direction(members, SETTINGS.direction)
         told = {peer for member in members for peer in member.peers}
         peers = tuple(sorted(told)) if key.is_ros2 else ()
-        udp = not key.is_ros2 and chosen_udp(members, SETTINGS)
-        made = Create("", key, PortRange(0, 0), "", plane, direction=direction, peers=peers)
-        return structs.replace(made, udp=udp)
+        spec = proxy_spec(key, members, SETTINGS)
+        return Create("", key, PortRange(0, 0), "", spec, peers=peers)
 
     def check_key(self, key: Key, wanted: set[str], made: Create) -> None:
         every = [(box, own) for box, own in self.own() if own.key == key]
@@ -231,8 +228,7 @@ class Invariants:
         for lan_relay, hears in lan_relays:
             self.check_lan_relay(lan_relay, hears, sandbox, near)
         if self.engine.image:
-            forwards = made.data_plane == "kernel"
-            box = CreateSandbox("", key, is_.range, forwards=forwards, udp=made.udp)
+            box = CreateSandbox("", key, is_.range, made.spec)
             assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
             made = structs.replace(made, range=is_.range, lan_relay=near if key.is_ros2 else None)
             assert runs.fingerprint == proxy_fingerprint(made, SETTINGS, self.engine.image, "")

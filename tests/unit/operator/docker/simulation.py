@@ -299,7 +299,7 @@ class Engine:
         if isinstance(action, CreateSandbox):
             if uplink not in self.networks:
                 raise Failed("no uplink")
-            published = published_ports(action.key, action.range, action.udp)
+            published = published_ports(action.key, action.range, action.spec.udp)
             tcp = frozenset(port for exposed, port in published if exposed.endswith("/tcp"))
             udp = frozenset(port for exposed, port in published if exposed.endswith("/udp"))
             self.join(self.add(name, labels=labels, ports=tcp, udp=udp), uplink)

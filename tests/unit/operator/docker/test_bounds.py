@@ -181,7 +181,7 @@ def test_which_data_planes_labels_may_ask_for() -> None:
 
 def test_a_data_plane_that_is_not_allowed() -> None:
     member, told = asked(data_plane="kernel")
-    assert member.data_plane is None
+    assert member.wishes == {}
     assert told == (
         "label rosproxy.data-plane=kernel is ignored: the operator does not allow this value in "
         "labels. To allow it, start the operator with --allow-data-plane kernel"
@@ -213,7 +213,7 @@ def test_slave_control(option: SlaveControl, label: str | None, gets: str, told:
     seen = observed(container(labels={**ENABLED, **names}), others)
     plan = planned(seen, settings, DockerMemory(), 0.0)
     (made,) = [action for action in plan.actions if isinstance(action, Create)]
-    assert made.slave_control == gets
+    assert made.spec.slave_control == gets
 
 
 def test_a_slave_control_that_can_not_be() -> None:
@@ -227,7 +227,8 @@ def test_who_has_exited_keeps_the_control_narrow_for_the_grace() -> None:
     narrow = {**ENABLED, "rosproxy.slave-control": "master"}
     seen = observed(container("a"), container("b", narrow, state="exited"))
     first = planned(seen, SETTINGS, DockerMemory(), 0.0)
-    assert first.desired[0].slave_control == "master"
+    assert first.desired[0].spec.slave_control == "master"
+    assert first.again_in is not None
     later = planned(seen, SETTINGS, first.memory, 60.0)
-    assert later.desired[0].slave_control == "any"
+    assert later.desired[0].spec.slave_control == "any"
     assert later.desired[0].key.advertise_host == HERE

@@ -33,7 +33,7 @@ from tests.unit.operator.docker.builders import IMAGE, KEY, RANGE, inspection
 from tests.unit.operator.docker.conftest import FakeEngine
 
 SETTINGS = PlanSettings(advertise_host=KEY.advertise_host, secret="secret")
-BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE, "f")
+BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE, fingerprint="f")
 PROCESS = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f")
 TOKEN = proxy_token(KEY, "secret")
 

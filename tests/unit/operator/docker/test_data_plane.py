@@ -18,6 +18,7 @@ from rosproxy_operator.docker.planner.specs import (
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.unit.operator.docker import builders
 from tests.unit.operator.docker.builders import (
     ENABLED,
@@ -35,7 +36,7 @@ from tests.unit.operator.docker.builders import (
 SETTINGS = replace(builders.SETTINGS, allow_data_plane=("auto", "kernel", "splice", "copy"))
 LABEL = "rosproxy.data-plane"
 NAME = proxy_name(KEY)
-SANDBOX = CreateSandbox("s", KEY, RANGE, "f1")
+SANDBOX = CreateSandbox("s", KEY, RANGE, fingerprint="f1")
 PROXY = Create("p", KEY, RANGE, "s")
 
 
@@ -56,19 +57,24 @@ def look(
 
 
 def given(plan: DockerPlan) -> DataPlane:
-    return plan.desired[0].data_plane
+    return plan.desired[0].spec.data_plane
 
 
 def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
     """What sandboxes are created with, and what proxies."""
-    boxes = [action.forwards for action in actions if isinstance(action, CreateSandbox)]
-    return boxes, [action.data_plane for action in actions if isinstance(action, Create)]
+    boxes = [
+        action.spec.data_plane == "kernel"
+        for action in actions
+        if isinstance(action, CreateSandbox)
+    ]
+    return boxes, [action.spec.data_plane for action in actions if isinstance(action, Create)]
 
 
-def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
+def own(plane: DataPlane) -> tuple[Sandbox, Proxy]:
     """A sandbox and its proxy, as they were created for a data plane."""
-    box = sandbox_fingerprint(structs.replace(SANDBOX, forwards=forwards), SETTINGS)
-    process = proxy_fingerprint(structs.replace(PROXY, data_plane=plane), SETTINGS, IMAGE, SECRET)
+    spec = ProxySpec(data_plane=plane)
+    box = sandbox_fingerprint(structs.replace(SANDBOX, spec=spec), SETTINGS)
+    process = proxy_fingerprint(structs.replace(PROXY, spec=spec), SETTINGS, IMAGE, SECRET)
     return sandbox(made=box), proxy(made=process)
 
 
@@ -110,16 +116,16 @@ def test_the_first_container_of_a_host(plane: DataPlane) -> None:
 
 
 def test_the_capability_is_for_the_kernel_plane_alone() -> None:
-    host = container_config(structs.replace(PROXY, data_plane="kernel"), SETTINGS, "t", "")[
-        "HostConfig"
-    ]
+    host = container_config(
+        structs.replace(PROXY, spec=ProxySpec(data_plane="kernel")), SETTINGS, "t", ""
+    )["HostConfig"]
     assert host["CapAdd"] == ["NET_ADMIN"]
     assert host["CapDrop"] == ["ALL"]
     assert host["SecurityOpt"] == ["no-new-privileges:false"]
     assert host["ReadonlyRootfs"] is True
     assert not {"Privileged", "Binds", "Devices", "Sysctls"} & host.keys()
     for plane in ("auto", "splice", "copy"):
-        spec = structs.replace(PROXY, data_plane=plane)
+        spec = structs.replace(PROXY, spec=ProxySpec(data_plane=plane))
         host = container_config(spec, SETTINGS, "t", "")["HostConfig"]
         assert "CapAdd" not in host
         assert host["SecurityOpt"] == ["no-new-privileges:true"]
@@ -127,14 +133,18 @@ def test_the_capability_is_for_the_kernel_plane_alone() -> None:
 
 @pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy"])
 def test_the_proxy_is_told(plane: DataPlane) -> None:
-    body = container_config(structs.replace(PROXY, data_plane=plane), SETTINGS, "t", "")
+    body = container_config(
+        structs.replace(PROXY, spec=ProxySpec(data_plane=plane)), SETTINGS, "t", ""
+    )
     told = [pair for pair in body["Env"] if pair.startswith("ROSPROXY_DATA_PLANE=")]
     assert told == ([] if plane == "auto" else [f"ROSPROXY_DATA_PLANE={plane}"])
     assert body["User"] == "10001:10001"
 
 
 def test_the_sandbox_forwards_and_gets_no_capability() -> None:
-    host = sandbox_config(structs.replace(SANDBOX, forwards=True), SETTINGS)["HostConfig"]
+    host = sandbox_config(structs.replace(SANDBOX, spec=ProxySpec(data_plane="kernel")), SETTINGS)[
+        "HostConfig"
+    ]
     assert host["Sysctls"] == {
         "net.ipv4.ip_local_port_range": "1024 11000",
         "net.ipv4.ip_forward": "1",
@@ -145,7 +155,10 @@ def test_the_sandbox_forwards_and_gets_no_capability() -> None:
 
 
 def test_the_plan_names_the_capability() -> None:
-    texts = [str(structs.replace(PROXY, data_plane=plane)) for plane in ("kernel", "splice")]
+    texts = [
+        str(structs.replace(PROXY, spec=ProxySpec(data_plane=plane)))
+        for plane in ("kernel", "splice")
+    ]
     assert ["NET_ADMIN" in text for text in texts] == [True, False]
 
 
@@ -153,29 +166,29 @@ def test_the_plan_names_the_capability() -> None:
 
 
 def test_all_is_as_it_ought_to_be() -> None:
-    assert look(asking("a", "kernel"), existing_pair=own("kernel", forwards=True)).actions == ()
-    assert look(asking("a", "splice"), existing_pair=own("splice", forwards=False)).actions == ()
+    assert look(asking("a", "kernel"), existing_pair=own("kernel")).actions == ()
+    assert look(asking("a", "splice"), existing_pair=own("splice")).actions == ()
 
 
 def test_the_kernel_plane_makes_both_anew() -> None:
-    plan = look(asking("a", "kernel"), existing_pair=own("auto", forwards=False))
+    plan = look(asking("a", "kernel"), existing_pair=own("auto"))
     assert made(plan.actions) == ([True], ["kernel"])
 
 
 @pytest.mark.parametrize("plane", ["auto", "splice", "copy"])
 def test_who_gives_the_kernel_plane_up_leaves_no_rules_behind(plane: DataPlane) -> None:
     """A proxy that was killed has not taken them away, and its successor can't."""
-    plan = look(asking("a", plane), existing_pair=own("kernel", forwards=True))
+    plan = look(asking("a", plane), existing_pair=own("kernel"))
     assert made(plan.actions) == ([False], [plane])
 
 
 def test_between_other_planes_the_sandbox_stays() -> None:
-    plan = look(asking("a", "copy"), existing_pair=own("splice", forwards=False))
+    plan = look(asking("a", "copy"), existing_pair=own("splice"))
     assert made(plan.actions) == ([], ["copy"])
 
 
 def test_a_container_that_is_restarted_does_not_change_the_plane() -> None:
-    pair = own("kernel", forwards=True)
+    pair = own("kernel")
     who = container("b"), asking("a", "kernel", state="exited")
     first = look(*who, existing_pair=pair)
     assert first.actions == ()

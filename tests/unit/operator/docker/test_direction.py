@@ -10,6 +10,7 @@ from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.model import Container, Network
 from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
@@ -43,9 +44,9 @@ def direction_of(
 ) -> Direction:
     seen = observed(*containers, networks=[UPLINK, APP, CELL])
     plan = planned(seen, replace(SETTINGS, direction=option), memory, now)
-    made = [action.direction for action in plan.actions if isinstance(action, Create)]
-    assert made in ([], [plan.desired[0].direction])
-    return plan.desired[0].direction
+    made = [action.spec.direction for action in plan.actions if isinstance(action, Create)]
+    assert made in ([], [plan.desired[0].spec.direction])
+    return plan.desired[0].spec.direction
 
 
 @pytest.mark.parametrize(
@@ -84,22 +85,26 @@ def test_who_has_exited_keeps_it_for_the_grace() -> None:
     """A container that is restarted does not have its proxy made anew twice."""
     seen = observed(container("a"), labelled("b", "both", state="exited"))
     first = planned(seen, SETTINGS, DockerMemory(), 0.0)
-    assert first.desired[0].direction == "both"
+    assert first.desired[0].spec.direction == "both"
     assert first.again_in is not None
     later = planned(seen, SETTINGS, first.memory, 60.0)
-    assert later.desired[0].direction == "out"
+    assert later.desired[0].spec.direction == "out"
 
 
 @pytest.mark.parametrize("direction", ["out", "both"])
 def test_the_proxy_is_told(direction: Direction) -> None:
-    body = container_config(structs.replace(PROXY, direction=direction), SETTINGS, "t", "")
+    body = container_config(
+        structs.replace(PROXY, spec=ProxySpec(direction=direction)), SETTINGS, "t", ""
+    )
     told = [pair for pair in body["Env"] if pair.startswith("ROSPROXY_DIRECTION=")]
     assert told == ([] if direction == "out" else ["ROSPROXY_DIRECTION=both"])
 
 
 def test_another_direction_makes_a_proxy_anew() -> None:
     digests = {
-        proxy_fingerprint(structs.replace(PROXY, direction=direction), SETTINGS, IMAGE, SECRET)
+        proxy_fingerprint(
+            structs.replace(PROXY, spec=ProxySpec(direction=direction)), SETTINGS, IMAGE, SECRET
+        )
         for direction in ("out", "both")
     }
     assert len(digests) == 2

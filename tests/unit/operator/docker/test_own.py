@@ -18,6 +18,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_config,
     sandbox_name,
 )
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.unit.operator.docker.builders import IMAGE, KEY, SECRET, SETTINGS, inspection
 
 PORTS = PortRange(11400, 11401)
@@ -56,15 +57,17 @@ def test_what_the_operator_makes_is_its_own(role: str, behind: str) -> None:
 
 @pytest.mark.parametrize("capability", ["NET_ADMIN", "CAP_NET_ADMIN"])
 def test_so_are_those_for_the_kernel_plane(capability: str) -> None:
-    box = sandbox_config(structs.replace(BOX, forwards=True), SETTINGS)
-    body = container_config(structs.replace(PROCESS, data_plane="kernel"), SETTINGS, SECRET, "")
+    box = sandbox_config(structs.replace(BOX, spec=ProxySpec(data_plane="kernel")), SETTINGS)
+    body = container_config(
+        structs.replace(PROCESS, spec=ProxySpec(data_plane="kernel")), SETTINGS, SECRET, ""
+    )
     process = inspection(body)
     process["HostConfig"]["CapAdd"] = [capability]
     assert wrong(inspection(box), BOX.name) == wrong(process, PROCESS.name) == ""
 
 
 def test_so_is_one_with_ports_for_udp() -> None:
-    box = inspection(sandbox_config(structs.replace(BOX, udp=True), SETTINGS))
+    box = inspection(sandbox_config(structs.replace(BOX, spec=ProxySpec(udp=True)), SETTINGS))
     assert wrong(box, BOX.name) == ""
     del box["HostConfig"]["PortBindings"]["11400/udp"]
     assert "PortBindings" in wrong(box, BOX.name)

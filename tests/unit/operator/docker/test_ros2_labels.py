@@ -187,7 +187,7 @@ def test_plane_direction_and_rules_are_its_own() -> None:
         "rosproxy.policy": "deny publish /camera/*",
     }
     (member,), told = read(labelled_container(labels))
-    assert (member.data_plane, member.direction) == ("splice", "both")
+    assert member.wishes == {"data_plane": "splice", "direction": "both"}
     assert member.policy == parse_rules("deny publish /camera/*")
     assert not told
 
@@ -218,7 +218,7 @@ def test_a_static_peer_inside_is_not(peers: str) -> None:
 def test_on_an_internal_network_it_reaches_outside_through_the_proxy() -> None:
     inner = (UPLINK, Network("n1", "app", internal=True))
     (member,), told = read(labelled_container(TWO), networks=inner)
-    assert (member.direction, told) == ("both", [])
+    assert (member.wishes, told) == ({"direction": "both"}, [])
 
 
 def test_it_is_exposed_by_default_as_it_is_by_its_variables() -> None:

@@ -28,10 +28,11 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
     sandbox_name,
 )
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SECRET, SETTINGS
 
-SANDBOX = CreateSandbox("s", KEY, PortRange(11400, 11401), "f1")
+SANDBOX = CreateSandbox("s", KEY, PortRange(11400, 11401), fingerprint="f1")
 PROXY = Create("p", KEY, PortRange(11400, 11401), "s", fingerprint="f2")
 TOKEN = proxy_token(KEY, SECRET)
 HASH = hash_token(TOKEN)
@@ -126,7 +127,7 @@ def test_a_proxy_is_bounded_in_memory_and_threads() -> None:
 
 
 def test_a_proxy_is_told_who_may_control_its_nodes() -> None:
-    narrow = structs.replace(PROXY, slave_control="master")
+    narrow = structs.replace(PROXY, spec=ProxySpec(slave_control="master"))
     assert "ROSPROXY_SLAVE_CONTROL=master" in container_config(narrow, SETTINGS, SECRET, "")["Env"]
     assert "SLAVE_CONTROL" not in str(container_config(PROXY, SETTINGS, SECRET, ""))
 
@@ -153,7 +154,9 @@ def test_what_makes_a_sandbox_anew() -> None:
     renamed = structs.replace(SANDBOX, name="other", fingerprint="")
     assert now == sandbox_fingerprint(renamed, replace(SETTINGS, proxy_image="other", grace=1.0))
     assert now != sandbox_fingerprint(structs.replace(SANDBOX, range=RANGE), SETTINGS)
-    assert now != sandbox_fingerprint(structs.replace(SANDBOX, forwards=True), SETTINGS)
+    assert now != sandbox_fingerprint(
+        structs.replace(SANDBOX, spec=ProxySpec(data_plane="kernel")), SETTINGS
+    )
     assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, publish_address=("::",)))
     assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, uplink="0-other"))
 
@@ -169,7 +172,7 @@ def test_what_makes_a_proxy_anew() -> None:
     assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE, SECRET)
     assert now != proxy_fingerprint(PROXY, SETTINGS, IMAGE, "another secret")
     assert now != proxy_fingerprint(
-        structs.replace(PROXY, slave_control="master"), SETTINGS, IMAGE, SECRET
+        structs.replace(PROXY, spec=ProxySpec(slave_control="master")), SETTINGS, IMAGE, SECRET
     )
     for bound in (replace(SETTINGS, proxy_memory=0), replace(SETTINGS, proxy_pids=300)):
         assert now != proxy_fingerprint(PROXY, bound, IMAGE, SECRET)
@@ -184,7 +187,9 @@ def test_fingerprints_stay_as_they_were() -> None:
 
 
 def test_labels_are_read_back() -> None:
-    assert read_own(own_labels(SANDBOX)) == OwnLabels("ports", KEY, PortRange(11400, 11401), "f1")
+    assert read_own(own_labels(SANDBOX)) == OwnLabels(
+        "ports", KEY, PortRange(11400, 11401), fingerprint="f1"
+    )
     assert read_own(own_labels(PROXY)) == OwnLabels("proxy", KEY, PortRange(11400, 11401), "f2")
 
 

@@ -16,6 +16,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.unit.operator.docker.builders import (
     ENABLED,
     KEY,
@@ -52,8 +53,8 @@ def labelled(name: str, *labels: Mapping[str, str]) -> Container:
 )
 def test_who_asks(containers: list[Container], option: bool, gets: bool) -> None:
     plan = planned(observed(*containers), replace(SETTINGS, udp=option), DockerMemory(), 0.0)
-    made = [action.udp for action in plan.actions if isinstance(action, Create | CreateSandbox)]
-    assert made == [gets, gets]
+    made = [action for action in plan.actions if isinstance(action, Create | CreateSandbox)]
+    assert [action.spec.udp for action in made] == [gets, gets]
 
 
 def test_who_asks_for_it_alone_is_told() -> None:
@@ -72,19 +73,20 @@ def test_a_word_that_is_none() -> None:
 
 @pytest.mark.parametrize("udp", [False, True])
 def test_what_is_published_and_told(udp: bool) -> None:
-    made = structs.replace(BOX, udp=udp)
+    made = structs.replace(BOX, spec=ProxySpec(udp=udp))
     bindings = sandbox_config(made, SETTINGS)["HostConfig"]["PortBindings"]
     assert sorted(bindings) == sorted(
         f"{port}/{protocol}"
         for port in (11400, 11401)
         for protocol in (["tcp", "udp"] if udp else ["tcp"])
     )
-    told = container_config(Create("p", KEY, RANGE, "s", udp=udp), SETTINGS, "t", "")["Env"]
+    create = Create("p", KEY, RANGE, "s", ProxySpec(udp=udp))
+    told = container_config(create, SETTINGS, "t", "")["Env"]
     assert ("ROSPROXY_UDP=1" in told) == udp
 
 
 def test_the_sandbox_is_made_anew_for_it() -> None:
-    either = (structs.replace(BOX, udp=udp) for udp in (False, True))
+    either = (structs.replace(BOX, spec=ProxySpec(udp=udp)) for udp in (False, True))
     assert len({sandbox_fingerprint(box, SETTINGS) for box in either}) == 2
 
 
@@ -97,4 +99,5 @@ def test_udp_ports_that_others_have_are_in_the_way_of_those_that_ask(
     plan = planned(seen, SETTINGS, DockerMemory(), 0.0)
     (box,) = [action for action in plan.actions if isinstance(action, CreateSandbox)]
     assert box.range.first == first
-    assert len(published_ports(KEY, box.range, box.udp)) == len(box.range) * (1 + box.udp)
+    published = published_ports(KEY, box.range, box.spec.udp)
+    assert len(published) == len(box.range) * (1 + box.spec.udp)

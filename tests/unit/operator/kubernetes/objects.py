@@ -29,6 +29,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
 )
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
+from rosproxy_operator.proxy_spec.spec import WISHES, ProxySpec
 
 BOUNDS = Bounds(data_planes=("auto", "kernel", "splice", "copy"), images=("*",))
 SETTINGS = ClusterSettings(image="rosproxy:1", bounds=BOUNDS, network_policy=False)
@@ -39,15 +40,18 @@ ROBOT = Name("ros", "robot")
 
 
 def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
-    """A RosProxy in namespace ros with four ports per node. ``changes`` are of it or its spec."""
+    """A RosProxy in namespace ros with four ports per node.
+
+    ``changes`` are of it, its spec or its `ProxySpec`.
+    """
     defaults: dict[str, Any] = {
         "master": MasterSpec("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
     }  # fmt: skip
     own = {key: changes.pop(key) for key in ("former_ranges", "cluster_ip", "status", "deleting")
            if key in changes}  # fmt: skip
-    return RosProxy(
-        Name("ros", name), uid or f"uid-{name}", 1, RosProxySpec(**defaults | changes), **own
-    )
+    asked = {key: changes.pop(key) for key in WISHES if key in changes}
+    spec = RosProxySpec(**defaults | changes, proxy=ProxySpec(**asked))
+    return RosProxy(Name("ros", name), uid or f"uid-{name}", 1, spec, **own)
 
 
 def node(name: str = "one", **changes: Any) -> ClusterNode:

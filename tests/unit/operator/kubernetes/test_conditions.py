@@ -9,6 +9,7 @@ from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer
 from rosproxy_operator.kubernetes.resources.cluster import Obstacle, PodFailure, ProxyReport
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, MasterSpec, Name, Reference
 from rosproxy_operator.kubernetes.status.findings import findings
+from rosproxy_operator.proxy_spec.spec import ProxySpec
 from tests.unit.operator.kubernetes.builders_api import (
     answer,
     condition,
@@ -283,7 +284,7 @@ def test_what_the_api_server_refuses(text, fix):
     ],
 )
 def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
-    of = replace(rosproxy(), spec=replace(rosproxy().spec, data_plane="kernel"))
+    of = replace(rosproxy(), spec=replace(rosproxy().spec, proxy=ProxySpec(data_plane="kernel")))
 
     (finding,) = findings(of, (), {REFUSED: text})
 

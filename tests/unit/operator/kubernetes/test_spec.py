@@ -23,8 +23,8 @@ def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
     assert spec.master == MasterSpec(uri="http://robot:11311")
     assert (spec.ports, spec.window) == (32, PortRange(11412, 29999))
     assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, None, None)
-    assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
-    assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
+    assert (spec.advertise, spec.proxy.slave_control) == (Advertise.INTERNAL_IP, "any")
+    assert (spec.cleanup_after, spec.grace, spec.proxy.data_plane) == (30.0, 60.0, "auto")
     assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", None)
     assert (parsed.former_ranges, parsed.cluster_ip, parsed.deleting) == ({}, "", False)
 
@@ -70,8 +70,8 @@ def test_all_fields():
     )
     assert spec.node_selector == {"disk": "ssd"}
     assert spec.tolerations == ({"operator": "Exists"},)
-    assert (spec.advertise, spec.slave_control) == (Advertise.HOSTNAME, "master")
-    assert (spec.cleanup_after, spec.grace, spec.data_plane) == (0.0, 5.0, "kernel")
+    assert (spec.advertise, spec.proxy.slave_control) == (Advertise.HOSTNAME, "master")
+    assert (spec.cleanup_after, spec.grace, spec.proxy.data_plane) == (0.0, 5.0, "kernel")
     assert (spec.image, spec.image_pull_policy) == ("rosproxy:2", "Never")
     assert spec.image_pull_secrets == ({"name": "pull"},)
     assert spec.resources == {"requests": {"cpu": 1}}
@@ -97,7 +97,7 @@ def test_masters(uri, read):
 def test_directions():
     def read(**spec):
         parsed = rosproxy(rosproxy_obj({"master": {"uri": "http://robot"}, **spec})).spec
-        return parsed.direction, parsed.pod_egress, parsed.udp
+        return parsed.proxy.direction, parsed.pod_egress, parsed.proxy.udp
 
     assert read() == ("out", "any", False)
     assert read(direction="Both") == ("both", "any", False)

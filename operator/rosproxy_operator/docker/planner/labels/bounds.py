@@ -56,19 +56,20 @@ def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str
             f"{limit} ports. To allow more, start the operator with --max-ports {request.ports}"
         )
         request = replace(request, ports=limit)
-    if request.data_plane and request.data_plane not in allowed_planes(settings):
+    wishes = dict(request.wishes)
+    plane = wishes.get("data_plane", settings.data_plane)
+    if plane not in allowed_planes(settings):
         warnings.append(
-            f"label rosproxy.data-plane={request.data_plane} is ignored: the operator does not "
-            "allow this value in labels. To allow it, start the operator with --allow-data-plane "
-            f"{request.data_plane}"
+            f"label rosproxy.data-plane={plane} is ignored: the operator does not allow this value "
+            f"in labels. To allow it, start the operator with --allow-data-plane {plane}"
         )
-        request = replace(request, data_plane=None)
-    if request.slave_control == "any" and settings.slave_control == "master":
+        del wishes["data_plane"]
+    if wishes.get("slave_control") == "any" and settings.slave_control == "master":
         warnings.append(
             "label rosproxy.slave-control=any is ignored: the operator has --slave-control master, "
             "and a label can only narrow this option"
         )
-        request = replace(request, slave_control=None)
+        del wishes["slave_control"]
     if request.redirect and not settings.redirect:
         warnings.append(
             "label rosproxy.redirect=true is ignored: the operator has --no-redirect, and a label "
@@ -81,7 +82,7 @@ def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str
             f"operator with {' '.join(f'--allow-peer {peer}' for peer in sorted(refused))}"
         )
         request = replace(request, peers=request.peers - refused)
-    return request, tuple(warnings)
+    return replace(request, wishes=wishes), tuple(warnings)
 
 
 def _is_allowed_master(master: HostPort, patterns: tuple[str, ...]) -> bool:

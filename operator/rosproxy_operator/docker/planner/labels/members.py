@@ -154,9 +154,7 @@ def _requests(
     """What a container gets of what it asks for, by version of ROS, and the warnings for it."""
     readers.refuse_long_values(container.labels)
     served = ros_versions.versions(container)
-    requests = [_request(container, observed, settings, proxies)] if "1" in served else []
-    if "2" in served:
-        requests.append(_ros2_request(container, observed, settings))
+    requests = [_request(r, container, observed, settings, proxies) for r in sorted(served)]
     granted = [bounds.narrowed(r, settings) for r in requests]
     warnings = [*ros_versions.warnings(container, served)]
     for request in requests:
@@ -166,40 +164,30 @@ def _requests(
     return [request for request, _ in granted], warnings
 
 
-def _ros2_request(container: Container, observed: HostState, settings: PlanSettings) -> Member:
-    labels = container.labels
-    host = readers.advertise_host(container.labels, settings)
-    ros_versions.refuse_unserved(container, host)
-    networks = readers.networks(container, observed, settings.uplink)
-    return Member(
-        container,
-        Key("", host, ros_versions.domain(container)),
-        ports=readers.ports(labels),
-        networks=networks,
-        data_plane=readers.data_plane(labels),
-        direction=readers.direction(labels, networks, observed.networks),
-        policy=readers.policy(labels),
-        peers=ros_versions.peers(labels),
-    )
-
-
 def _request(
-    container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
+    ros: str,
+    container: Container,
+    observed: HostState,
+    settings: PlanSettings,
+    proxies: Collection[str],
 ) -> Member:
+    """What a container asks for, for its nodes of one version of ROS."""
     labels = container.labels
-    uri = _master_uri(container, settings, proxies)
+    is_ros2 = ros == "2"
+    uri = "" if is_ros2 else _master_uri(container, settings, proxies)
+    host = readers.advertise_host(labels, settings)
+    if is_ros2:
+        ros_versions.refuse_unserved(container, host)
     networks = readers.networks(container, observed, settings.uplink)
     return Member(
         container,
-        Key(uri, readers.advertise_host(labels, settings)),
+        Key(uri, host, ros_versions.domain(container) if is_ros2 else None),
         ports=readers.ports(labels),
         networks=networks,
-        data_plane=readers.data_plane(labels),
-        direction=readers.direction(labels, networks, observed.networks),
-        udp=readers.udp(labels),
-        slave_control=readers.slave_control(labels),
+        wishes=readers.wishes(labels, ros, networks, observed.networks),
         policy=readers.policy(labels),
-        redirect=readers.redirect(labels),
+        peers=ros_versions.peers(labels) if is_ros2 else frozenset(),
+        redirect=None if is_ros2 else readers.redirect(labels),
     )
 
 

@@ -5,37 +5,34 @@ Each function that reads a label raises UnusableLabel for a value that can't be.
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from typing import TypeVar, get_args
+from typing import Any
 from urllib.parse import urlsplit
 
 from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.setting_kinds import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.option_values import MOST_PORTS
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import Container, HostState, Key, Network
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.spec import WISHES, Wish, words
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"
 PORTS = "rosproxy.ports"
 ADVERTISE_HOST = "rosproxy.advertise-host"
 NETWORK = "rosproxy.network"
-DATA_PLANE = "rosproxy.data-plane"
-DIRECTION = "rosproxy.direction"
-UDP = "rosproxy.udp"
-SLAVE_CONTROL = "rosproxy.slave-control"
 POLICY = "rosproxy.policy"
 ROS = "rosproxy.ros"
 DOMAIN = "rosproxy.domain"
 PEERS = "rosproxy.peers"
 REDIRECT = "rosproxy.redirect"
 LABELS = (
-    *(ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, DIRECTION),
-    *(UDP, SLAVE_CONTROL, POLICY, ROS, DOMAIN, PEERS, REDIRECT),
+    *(ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK),
+    *(wish.label for wish in WISHES.values()),
+    *(POLICY, ROS, DOMAIN, PEERS, REDIRECT),
 )
 
 ALIAS = "rosproxy"
@@ -52,7 +49,6 @@ _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
 Labels = Mapping[str, str]
-_Choice = TypeVar("_Choice", bound=str)
 
 
 class UnusableLabel(Exception):
@@ -105,35 +101,20 @@ def ports(labels: Labels) -> int:
     return int(digits)
 
 
-def data_plane(labels: Labels) -> DataPlane | None:
-    """One of the proxy's data planes, or None."""
-    fix = "kernel to let the kernel forward topics, or remove the label"
-    return _choice(DATA_PLANE, labels, get_args(DataPlane), fix)
+def wishes(
+    labels: Labels, ros: str, joined: Collection[str], networks: Iterable[Network]
+) -> dict[str, Any]:
+    """The options that the labels ask for, for nodes of this version of ROS.
 
-
-def direction(
-    labels: Labels, joined: Collection[str], networks: Iterable[Network]
-) -> Direction | None:
-    """Which side has no route to the other, or None if the option decides.
-
-    Without a label: a container on an internal network has none, of those that it ``joined``.
+    Of the networks that it ``joined``, a container on an internal one has no route outwards.
     """
-    if DIRECTION not in labels:
-        return "both" if any(n.internal and n.name in joined for n in networks) else None
-    fix = "both if the nodes reach outside only through the proxy, or remove the label"
-    return _choice(DIRECTION, labels, get_args(Direction), fix)
-
-
-def udp(labels: Labels) -> bool | None:
-    """Whether the ports are to be published for UDP, too, or None if the option decides."""
-    return _flag(UDP, labels)
-
-
-def slave_control(labels: Labels) -> SlaveControl | None:
-    """Which outside hosts may call the methods that control a node, or None."""
-    methods = "shutdown, publisherUpdate and paramUpdate"
-    fix = f"master to let only the master's host call {methods}, or remove the label"
-    return _choice(SLAVE_CONTROL, labels, get_args(SlaveControl), fix)
+    internal = any(n.internal and n.name in joined for n in networks)
+    asked = {
+        name: _wish(wish, words(name), labels)
+        for name, wish in WISHES.items()
+        if wish.label in labels and wish.ros in ("", ros)
+    }
+    return {**({"direction": "both"} if internal else {}), **asked}
 
 
 def policy(labels: Labels) -> tuple[Rule, ...]:
@@ -179,16 +160,15 @@ def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
     return value == "true" if value else None
 
 
-def _choice(label: str, labels: Labels, choices: tuple[_Choice, ...], fix: str) -> _Choice | None:
-    """The choice that a label names, None without the label; ``fix`` begins with a choice."""
-    if label not in labels:
-        return None
-    for choice in choices:
-        if labels[label].strip().lower() == choice:
-            return choice
-    raise UnusableLabel(
-        f"{named(label, labels)} is none of {', '.join(choices)}. Write {label}={fix}"
-    )
+def _wish(wish: Wish, choices: Collection[str], labels: Labels) -> str | bool | None:
+    """What a label says: one of the choices, else true or false."""
+    value = labels[wish.label].strip().lower()
+    if not choices:
+        return _flag(wish.label, labels)
+    if value not in choices:
+        text = f"{named(wish.label, labels)} is none of {', '.join(choices)}"
+        raise UnusableLabel(f"{text}. Write {wish.label}={wish.fix}")
+    return value
 
 
 def _host(source: str, value: str) -> str:

@@ -24,16 +24,15 @@ from rosproxy_operator.docker.planner.labels.readers import (
     PEERS,
     REDIRECT,
     ROS,
-    SLAVE_CONTROL,
-    UDP,
     Labels,
     UnusableLabel,
     named,
     quoted,
 )
 from rosproxy_operator.docker.planner.model import Container, HostState
+from rosproxy_operator.proxy_spec.spec import WISHES
 
-_OF_ROS1 = (MASTER_URI, REDIRECT, SLAVE_CONTROL, UDP)
+_OF_ROS1 = (MASTER_URI, REDIRECT, *(w.label for w in WISHES.values() if w.ros == "1"))
 _OF_ROS2 = (DOMAIN, PEERS)
 UNKNOWN = "no label and no variable states the ROS version"
 

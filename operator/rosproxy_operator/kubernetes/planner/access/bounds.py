@@ -95,9 +95,9 @@ def _violations(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
     if spec.ros2:
         yield from _ros2_violations(spec.ros2, bounds)
     yield from _port_violations(spec, bounds)
-    if spec.data_plane not in bounds.data_planes:
+    if spec.proxy.data_plane not in bounds.data_planes:
         choices = " or ".join(p.capitalize() for p in bounds.data_planes)
-        value = spec.data_plane.capitalize()
+        value = spec.proxy.data_plane.capitalize()
         yield _refusal("spec.dataPlane", value, f"Choose {choices}", "allow.dataPlanes")
     if spec.pod_egress == "proxy" and not settings.network_policy:
         yield _refusal("spec.podEgress", "Proxy", "Choose Any", "proxy.networkPolicy.enabled")

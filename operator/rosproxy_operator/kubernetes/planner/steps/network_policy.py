@@ -182,11 +182,11 @@ def _protocols(rosproxy: RosProxy) -> list[str]:
 def _pod_ports(rosproxy: RosProxy) -> Iterator[Json]:
     if rosproxy.spec.ros1:
         yield _port(MASTER_PORT)
-        if rosproxy.spec.direction == "both":
+        if rosproxy.spec.proxy.direction == "both":
             yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1])
     if rosproxy.spec.ros2:
         yield _port(discovery_port(rosproxy.spec.ros2.number), protocol="UDP")
-    if rosproxy.spec.ros2 or rosproxy.spec.direction == "both":
+    if rosproxy.spec.ros2 or rosproxy.spec.proxy.direction == "both":
         yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1], "UDP")
 
 
