@@ -16,11 +16,6 @@ def variable(field: str) -> str:
     return "ROS_MASTER_URI" if field == "master_uri" else _SETTINGS[field].variables[0]
 
 
-LIVE_VARIABLES = frozenset({fixes.VARIABLE, *map(variable, ("await_policy", "policy_layers"))})
-"""Variables in no fingerprint: a running proxy is told a new policy, and the operator's name only
-words the fixes of the proxy."""
-
-
 def environment(operator: str, told: Mapping[str, Any], always: Collection[str]) -> dict[str, str]:
     """The variables of a proxy with these values of fields of its `Settings`, in their order.
 

@@ -26,7 +26,6 @@ from rosproxy_operator.docker.planner.actions import Action, CreateFlush, Remove
 from rosproxy_operator.docker.planner.instants import instant
 from rosproxy_operator.docker.planner.model import Desired, FlushContainer, HostState, Key, Sandbox
 from rosproxy_operator.docker.planner.specs import (
-    digest,
     flush_command,
     flush_name,
     helper_config,
@@ -34,6 +33,7 @@ from rosproxy_operator.docker.planner.specs import (
     own_range,
 )
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.fingerprint import digest
 
 
 @dataclass(frozen=True, slots=True)

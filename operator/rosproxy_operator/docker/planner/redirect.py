@@ -38,7 +38,6 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.specs import (
     NFT,
-    digest,
     helper_config,
     master,
     own_labels,
@@ -46,6 +45,7 @@ from rosproxy_operator.docker.planner.specs import (
     redirect_name,
 )
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.fingerprint import digest
 
 # The priorities are those of destination and source NAT (nf_ip_hook_priorities in the kernel). In
 # the hook output, nat chains see what this network namespace itself opens, which is enough here.

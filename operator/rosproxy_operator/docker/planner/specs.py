@@ -2,7 +2,6 @@
 
 import hashlib
 import hmac
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +30,8 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.model import STARTED_LABEL, Key
 from rosproxy_operator.docker.settings import PlanSettings
-from rosproxy_operator.proxy_spec.environment import LIVE_VARIABLES, environment
+from rosproxy_operator.proxy_spec.environment import environment
+from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
@@ -445,8 +445,3 @@ def is_kernel_host(host: Mapping[str, Any]) -> bool:
     """
     added = [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()]
     return added == _KERNEL["CapAdd"] and host.get("SecurityOpt") == _KERNEL["SecurityOpt"]
-
-
-def digest(body: Mapping[str, Any]) -> str:
-    """What a container is made of, in 16 hex digits."""
-    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]

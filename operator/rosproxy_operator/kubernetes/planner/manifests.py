@@ -1,7 +1,6 @@
 """What the operator creates in a cluster, as the API server takes it."""
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -38,7 +37,8 @@ from rosproxy_operator.kubernetes.resources.names import (
 )
 from rosproxy_operator.kubernetes.resources.pod_defaults import USER
 from rosproxy_operator.kubernetes.settings import ClusterSettings
-from rosproxy_operator.proxy_spec.environment import LIVE_VARIABLES, environment, variable
+from rosproxy_operator.proxy_spec.environment import environment, variable
+from rosproxy_operator.proxy_spec.fingerprint import LIVE_VARIABLES, digest
 from rosproxy_operator.proxy_spec.spec import WISHES
 
 STOPS_WITHIN = 5
@@ -136,9 +136,11 @@ def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     env = [v for v in container["env"] if v["name"] not in live]
     spec = {**_spec(site, settings), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
-    identity = _digest(f"{site.master.uri}{_domain(rosproxy)} {site.advertise_host}")[:8]
+    ros2 = rosproxy.spec.ros2
+    graph = f"{site.master.uri}{f' domain {ros2.number}' if ros2 else ''} {site.advertise_host}"
+    identity = hashlib.sha256(graph.encode()).hexdigest()[:8]
     # The fingerprint is worked out without itself, and is on the pod then.
-    meta["annotations"][FINGERPRINT] = f"{_fingerprint(body)}-{identity}"
+    meta["annotations"][FINGERPRINT] = f"{digest(body)}-{identity}"
     return {**body, "spec": {**spec, "containers": [container]}}
 
 
@@ -172,7 +174,7 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
         "ports": [*_service_ports(rosproxy)],
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
-    annotations[FINGERPRINT] = _fingerprint(body)
+    annotations[FINGERPRINT] = digest(body)
     # No part of the fingerprint: a Service that has got another address is not made anew for that.
     if cluster_ip:
         spec["clusterIP"] = cluster_ip
@@ -189,11 +191,6 @@ def _service_ports(rosproxy: RosProxy) -> Iterator[Json]:
         yield {"name": name, "port": port, "targetPort": port, "protocol": protocol}
 
 
-def _domain(rosproxy: RosProxy) -> str:
-    """The domain as part of what a proxy's nodes know it by; empty without ROS 2."""
-    return f" domain {rosproxy.spec.ros2.number}" if rosproxy.spec.ros2 else ""
-
-
 def keeps_registrations(old: str, new: str) -> bool:
     """Whether a new proxy finds at its master the former one's nodes, by both fingerprints.
 
@@ -205,7 +202,7 @@ def keeps_registrations(old: str, new: str) -> bool:
 def fingerprinted(body: Json) -> Json:
     """An object with its fingerprint written on it."""
     meta = body["metadata"]
-    annotations = {**meta["annotations"], FINGERPRINT: _fingerprint(body)}
+    annotations = {**meta["annotations"], FINGERPRINT: digest(body)}
     return {**body, "metadata": {**meta, "annotations": annotations}}
 
 
@@ -218,14 +215,6 @@ def without_cluster_ip(body: Json) -> Json:
     """A Service that takes any address, for when another Service has its former one now."""
     spec = {key: value for key, value in body["spec"].items() if key != "clusterIP"}
     return {**body, "spec": spec}
-
-
-def _fingerprint(body: Json) -> str:
-    return _digest(json.dumps(body, sort_keys=True))[:16]
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def metadata(
