@@ -1,11 +1,13 @@
 """Values that can't be meant are refused, with a message that names them."""
 
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 import yaml  # type: ignore[import-untyped]
 
+from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, words
 from tests.chart.chart import CHART, Json, helm
 
 BAD: list[tuple[Json, str]] = [
@@ -127,6 +129,22 @@ def test_values_without_effect_are_refused(values: Json, told: str) -> None:
     done = helm("template", "x", CHART, "--kube-version", "1.30.0", values=values)
     assert done.returncode != 0
     assert told in done.stderr
+
+
+def test_values_about_the_options_of_a_proxy_are_the_operators() -> None:
+    schema = json.loads((CHART / "values.schema.json").read_text())["properties"]
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    planes = schema["allow"]["properties"]["dataPlanes"]["items"]
+    assert planes["enum"] == capitalized(words("data_plane"))
+    assert values["allow"]["dataPlanes"] == capitalized(WISHES["data_plane"].free)
+    control = schema["proxy"]["properties"]["slaveControl"]
+    assert control["enum"] == capitalized(words("slave_control"))
+    assert [values["proxy"]["slaveControl"]] == capitalized([OWN_SPEC.slave_control])
+
+
+def capitalized(words: Iterable[str]) -> list[str]:
+    """Words as Kubernetes writes them."""
+    return [word.capitalize() for word in words]
 
 
 def test_every_value_is_in_the_schema() -> None:

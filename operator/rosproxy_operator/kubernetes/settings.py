@@ -28,6 +28,7 @@ from rosproxy_operator.kubernetes import option_values
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.pod_defaults import PodDefaults
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
+from rosproxy_operator.proxy_spec.spec import WISHES
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
 DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)
@@ -81,7 +82,7 @@ class Bounds(msgspec.Struct, frozen=True):
             name="--allow-data-plane",
             repeatable=True,
         ),
-    ] = ("auto", "splice", "copy")
+    ] = WISHES["data_plane"].free
     images: Annotated[
         tuple[str, ...],
         Option(

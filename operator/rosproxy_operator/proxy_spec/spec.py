@@ -23,6 +23,7 @@ class Wish:
     ``field`` is below a RosProxy's ``spec``. If the containers of a proxy ask for several values,
     the first in ``precedence`` counts. ``yields``: a container that does not ask takes any value.
     ``ros``: the only version of ROS that has the option. ``fix`` is what to write into the label.
+    ``free`` are the values that no option of the administrator has to allow; empty: all values.
     """
 
     label: str
@@ -31,6 +32,7 @@ class Wish:
     yields: bool = False
     ros: str = ""
     fix: str = ""
+    free: tuple[Any, ...] = ()
 
     def first(self, values: Iterable[Any]) -> Any:
         """The one of several values that counts."""
@@ -49,6 +51,7 @@ class ProxySpec(msgspec.Struct, frozen=True):
             ("kernel", "splice", "copy", "auto"),
             yields=True,
             fix="kernel to let the kernel forward topics, or remove the label",
+            free=("auto", "splice", "copy"),  # the kernel's takes the capability NET_ADMIN
         ),
     ] = "auto"
     direction: Annotated[

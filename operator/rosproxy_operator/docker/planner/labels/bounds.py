@@ -11,13 +11,13 @@ container gets what is allowed, and a warning.
 
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from typing import get_args
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.setting_kinds import DataPlane, read_peer
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.settings import PlanSettings
+from rosproxy_operator.proxy_spec.spec import WISHES
 
 LEAST_PORT = 1024
 """Where no master is named, the least port of one that a label may name.
@@ -41,9 +41,8 @@ def refused_master(uri: str, settings: PlanSettings) -> str:
 
 def allowed_planes(settings: PlanSettings) -> frozenset[DataPlane]:
     """The data planes that labels may ask for."""
-    planes: tuple[DataPlane, ...] = get_args(DataPlane)
-    usual = tuple(plane for plane in planes if plane != "kernel")
-    return frozenset({*(settings.allow_data_plane or usual), settings.data_plane})
+    free = WISHES["data_plane"].free
+    return frozenset({*(settings.allow_data_plane or free), settings.data_plane})
 
 
 def narrowed(request: Member, settings: PlanSettings) -> tuple[Member, tuple[str, ...]]:
