@@ -23,7 +23,11 @@ from rosproxy_operator.common.proxy_doctor import (
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.api.kubeconfig import configuration
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
-from rosproxy_operator.kubernetes.planner.pods.labelled import lonely_findings, unreached
+from rosproxy_operator.kubernetes.planner.pods.labelled import (
+    lonely_findings,
+    misspelt_findings,
+    unreached,
+)
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.model import Json
 from rosproxy_operator.kubernetes.resources.names import PROXY, component
@@ -47,13 +51,15 @@ def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFindi
         own_pods = api.own_pods()
         facts = DoctorFacts(api, namespaces)
         operators = facts.operators(rosproxies)
-        pods = facts.labelled_pods()
+        pods = facts.meant_pods()
         usable, _ = read_rosproxies(rosproxies)
         cut_off = unreached(pods, [*usable.values()], operators.ready_since)
+        with_rosproxy = namespaces_of(rosproxies)
         findings = [
             *operator_findings(operators),
             *cluster_findings(rosproxies, operators),
-            *lonely_findings(pods, namespaces_of(rosproxies)),
+            *lonely_findings(pods, with_rosproxy),
+            *misspelt_findings(pods, with_rosproxy),
             *webhook_findings(facts.webhook(operators, cut_off)),
             *event_findings(facts.events(rosproxies, own_pods), ready_pods(own_pods)),
             *facts.refused,

@@ -64,16 +64,18 @@ class DoctorFacts:
         may_write = self._api.may_patch_status
         return frozenset(n for n in sorted(namespaces) if not may_write(account, n))
 
-    def labelled_pods(self) -> list[Pod]:
-        """The users' pods with the label rosproxy.io/inject."""
-        objs: list[Json] = []
+    def meant_pods(self) -> list[Pod]:
+        """The users' pods with the label rosproxy.io/inject, or with a misspelt name."""
+        found: list[Pod] = []
         for place in self._places:
-            objs += self._ask("pods", partial(self._labelled, place)) or []
-        pods = map(objects.pod, objs)
-        return [pod for pod in pods if not (pod.ended or pod.deleting)]
+            found += self._ask("pods", partial(self._meant, place)) or []
+        return found
 
-    def _labelled(self, place: str) -> list[Json]:
-        return [*self._api.list_fresh("pods", place, labels=INJECT)]
+    def _meant(self, place: str) -> list[Pod]:
+        # No label selector finds a misspelt label.
+        pods = map(objects.pod, self._api.each("pods", place, ""))
+        meant = (pod for pod in pods if INJECT in pod.labels or pod.misspelt)
+        return [pod for pod in meant if not (pod.ended or pod.deleting)]
 
     def webhook(self, operators: Operators, unreached: Sequence[str]) -> WebhookFacts:
         """What there is of the webhook."""

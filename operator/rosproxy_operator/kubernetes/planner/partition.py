@@ -56,7 +56,8 @@ def partitions(observed: ClusterSnapshot) -> Iterator[Partition]:
     pending |= {name.namespace for name in observed.unusable}
     pending |= {namespace for namespace, _ in _uses(observed)}
     pending |= {name.namespace for name in (*observed.services, *observed.policies)}
-    pending |= {pod.id.namespace for pod in observed.unselected_pods}
+    pods = (*observed.unselected_pods, *observed.misspelt_pods)
+    pending |= {pod.id.namespace for pod in pods}
     while pending:
         partition = partition_of(observed, [min(pending)])
         pending -= partition.namespaces

@@ -21,9 +21,12 @@ from rosproxy_operator.kubernetes.planner.access.bounds import within_bounds
 from rosproxy_operator.kubernetes.planner.access.policies import policies
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
-from rosproxy_operator.kubernetes.planner.cluster_view import view
+from rosproxy_operator.kubernetes.planner.cluster_view import View, view
 from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
-from rosproxy_operator.kubernetes.planner.misspellings import misspellings
+from rosproxy_operator.kubernetes.planner.misspellings import (
+    misspellings,
+    misspelt_pod_findings,
+)
 from rosproxy_operator.kubernetes.planner.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
@@ -122,9 +125,9 @@ def plan(
     retries = Retries(decided.attempts, observed.failures, now)
     context = ClusterContext(cluster_view, settings, decided, ranges, retries, now)
     actions = [*reconcile_orphans(context), *reconcile_orphaned_policies(context)]
-    unselected = tuple(unselected_findings(cluster_view, decided.unselected, now))
-    problems = [*cluster_view.findings, *unselected]
-    shared = (*cluster_view.findings, *unselected, *moves(cluster_view, decided, ranges.given))
+    of_pods = _pod_findings(cluster_view, decided, now)
+    problems = [*of_pods]
+    shared = (*of_pods, *moves(cluster_view, decided, ranges.given))
     for _, rosproxy in sorted(cluster_view.rosproxies.items()):
         own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))
@@ -148,6 +151,17 @@ def plan(
         peers=peers(context),
         former_ports=former_ports(cluster_view, decided.former),
         next_look_in=min(_waits(context, departed), default=None),
+    )
+
+
+def _pod_findings(
+    cluster_view: View, state: ClusterState, now: float
+) -> tuple[ClusterFinding, ...]:
+    """What is wrong with pods, in namespaces with and without a RosProxy."""
+    return (
+        *cluster_view.findings,
+        *unselected_findings(cluster_view, state.unselected, now),
+        *misspelt_pod_findings(cluster_view),
     )
 
 

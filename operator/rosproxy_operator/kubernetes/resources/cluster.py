@@ -189,14 +189,14 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies may name it,
     besides its own. ``selected`` are the uids of the pods that a RosProxy selects,
     ``unselected_pods`` those that ask for a proxy by their label and that no RosProxy selects;
-    ``misspelt_pods`` are those of the RosProxies' namespaces that have a misspelt label or
-    annotation, ``misspelt_services`` says what is wrong with those of ``masters``. ``policies`` are
-    the operator's own NetworkPolicies by their names; ``policies_error`` is why they can't be
-    listed. ``key`` is that from which the proxies' tokens are made. ``unusable`` are the RosProxies
-    that can't be read at all: what they have is left as it is. ``reports`` are what the proxies say
-    of themselves, by the uid of the pod; ``failures`` are, by RosProxy and object, what the API
-    server said of the actions that failed at the last try; ``webhook`` is that of this operator:
-    none of these is listed, the operator puts them here.
+    ``misspelt_pods`` are those with a misspelt label or annotation, ``misspelt_services`` says what
+    is wrong with those of ``masters``. ``policies`` are the operator's own NetworkPolicies by their
+    names; ``policies_error`` is why they can't be listed. ``key`` is that from which the proxies'
+    tokens are made. ``unusable`` are the RosProxies that can't be read at all: what they have is
+    left as it is. ``reports`` are what the proxies say of themselves, by the uid of the pod;
+    ``failures`` are, by RosProxy and object, what the API server said of the actions that failed at
+    the last try; ``webhook`` is that of this operator: none of these is listed, the operator puts
+    them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()

@@ -83,6 +83,7 @@ class ClusterStore:
         self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
         self._helpers: dict[str, dict[str, HelperPod]] = defaultdict(dict)
         self._labelled: dict[str, dict[str, Pod]] = defaultdict(dict)
+        self._misspelt: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
         self._touched = StoreChanges()
@@ -190,7 +191,7 @@ class ClusterStore:
             image_checks=tuple(h for h in helpers if h.component == IMAGE_CHECK),
             selected=frozenset(pod.uid for pod in selected if not pod.ended),
             unselected_pods=tuple(self._unselected({pod.uid for pod in selected})),
-            misspelt_pods=tuple(pod for pod in candidates if pod.misspelt),
+            misspelt_pods=tuple(p for group in self._misspelt.values() for p in group.values()),
         )
 
     def _unselected(self, selected: Container[str]) -> Iterator[Pod]:
@@ -262,11 +263,17 @@ class ClusterStore:
         elif isinstance(record, HelperPod):
             _set(self._helpers, record.of.namespace, key, record if add else None)
         elif isinstance(record, Pod):
-            _set(self._pods, record.id.namespace, key, record if add else None)
-            if self._is_looked_after(record.id.namespace) and wants_proxy(record):
-                _set(self._labelled, record.id.namespace, key, record if add else None)
-            if record.every_port and record.node:
-                _set(self._pods_with_ports, record.node, key, record if add else None)
+            self._index_pod(record, key, record if add else None)
+
+    def _index_pod(self, pod: Pod, key: str, kept: Pod | None) -> None:
+        _set(self._pods, pod.id.namespace, key, kept)
+        if self._is_looked_after(pod.id.namespace):
+            if wants_proxy(pod):
+                _set(self._labelled, pod.id.namespace, key, kept)
+            if pod.misspelt:
+                _set(self._misspelt, pod.id.namespace, key, kept)
+        if pod.every_port and pod.node:
+            _set(self._pods_with_ports, pod.node, key, kept)
 
     def _touch(self, record: Record | None, counterpart: Record | None) -> None:
         """Note whom a change concerns that brings or takes a record in place of its counterpart."""
@@ -294,12 +301,11 @@ class ClusterStore:
     def _touch_pod(self, pod: Pod) -> None:
         """A pod of others matters if a RosProxy selects it or is meant to, or if it takes ports."""
         selected = self._is_selected(pod)
-        misspelt = bool(pod.misspelt) and pod.id.namespace in self._rosproxies
-        labelled = wants_proxy(pod) and self._is_looked_after(pod.id.namespace)
-        if selected or misspelt or labelled:
+        is_meant = wants_proxy(pod) or bool(pod.misspelt)
+        if selected or (is_meant and self._is_looked_after(pod.id.namespace)):
             self._touched.namespaces.add(pod.id.namespace)
             self._wake()
-        if selected or misspelt or pod.every_port:
+        if selected or pod.every_port:
             self._touched.nodes.add(pod.node)
             self._wake()
 

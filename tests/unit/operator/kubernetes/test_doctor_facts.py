@@ -14,7 +14,11 @@ from rosproxy_operator.kubernetes.api.api_client import Api, ApiNotFound
 from rosproxy_operator.kubernetes.api.rbac import missing_right
 from rosproxy_operator.kubernetes.doctor import running_proxies
 from rosproxy_operator.kubernetes.doctor_facts import DoctorFacts, ready_pods
-from rosproxy_operator.kubernetes.planner.pods.labelled import lonely_findings, unreached
+from rosproxy_operator.kubernetes.planner.pods.labelled import (
+    lonely_findings,
+    misspelt_findings,
+    unreached,
+)
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import (
     COMPONENT_LABEL,
@@ -135,12 +139,34 @@ async def test_labelled_pods_in_a_namespace_without_a_rosproxy(server: ApiServer
     for name in ("talker", "listener"):
         server.put("pods", pod_obj(name, {"rosproxy.io/inject": "true"}), NAMESPACE)
     server.put("pods", pod_obj("off", {"rosproxy.io/inject": "false"}), NAMESPACE)
-    pods = await in_thread(DoctorFacts(api, ()).labelled_pods)
+    pods = await in_thread(DoctorFacts(api, ()).meant_pods)
     (finding,) = lonely_findings(pods, frozenset({"other"}))
     assert (finding.severity, finding.subject) == (Severity.ERROR, f"namespace {NAMESPACE}")
     assert "2 pods with the label rosproxy.io/inject (listener, talker)" in finding.text
     assert "create a RosProxy in the namespace, then run kubectl -n robots delete" in finding.fix
     assert list(lonely_findings(pods, frozenset({NAMESPACE}))) == []
+
+
+async def test_misspelt_labels_in_a_namespace_without_a_rosproxy(
+    server: ApiServer, api: Api
+) -> None:
+    """The doctor mentioned no pod, and only asked for a RosProxy."""
+    for name in ("talker", "listener"):
+        obj = pod_obj(name, {"rosproxy.io/injekt": "true"})
+        owner = {"kind": "StatefulSet", "name": "robots", "controller": True}
+        server.put(
+            "pods", {**obj, "metadata": {**obj["metadata"], "ownerReferences": [owner]}}, NAMESPACE
+        )
+    server.put("pods", pod_obj("other", {"app": "x"}), NAMESPACE)
+    pods = await in_thread(DoctorFacts(api, ()).meant_pods)
+    (finding,) = misspelt_findings(pods, frozenset())
+    assert (finding.severity, finding.subject) == (Severity.ERROR, f"pod {NAMESPACE}/listener")
+    assert "Did you mean the label rosproxy.io/inject of pods?" in finding.text
+    assert finding.fix == (
+        f"correct the name in the template: kubectl -n {NAMESPACE} edit statefulset/robots"
+    )
+    assert misspelt_findings(pods, frozenset({NAMESPACE})) == []
+    assert list(lonely_findings(pods, frozenset())) == []
 
 
 CERT_MANAGER = {"cert-manager.io/inject-ca-from": "a/b"}

@@ -7,11 +7,14 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import Emit
 from rosproxy_operator.kubernetes.planner.misspellings import MOST_PODS
+from rosproxy_operator.kubernetes.planner.partition import partitions
 from rosproxy_operator.kubernetes.resources import misspelt_names as module
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.misspelt_names import MOST, misspelt_names
 from rosproxy_operator.kubernetes.resources.model import MasterSpec, Name, Reference
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from rosproxy_operator.kubernetes.status.condition_findings import cluster_findings
+from rosproxy_operator.kubernetes.watch.store import ClusterStore
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (
     NAMESPACE,
@@ -24,6 +27,7 @@ from tests.unit.operator.kubernetes.objects import (
     complete,
     look,
     node,
+    observed,
     pod,
     rosproxy,
     status,
@@ -101,7 +105,10 @@ def test_a_pod_of_which_nobody_would_speak_is_in_the_snapshot() -> None:
         obj["metadata"]["namespace"] = namespace
         server.put("pods", obj, namespace)
     snapshot = snapshot_of(server)
-    assert [p.misspelt for p in snapshot.misspelt_pods] == [(TEXT,)]
+    assert {p.id.name: p.misspelt for p in snapshot.misspelt_pods} == {
+        "talker": (TEXT,),
+        "other": (TEXT,),
+    }
     assert snapshot.pods == ()
 
 
@@ -120,6 +127,29 @@ def test_it_is_told_once_on_the_pod_and_in_the_status():
     assert (degraded["status"], degraded["reason"]) == ("True", "UnknownName")
     obj = {**rosproxy_obj(), "status": status(first)}
     assert any(TEXT in finding.text for finding in cluster_findings([obj]))
+
+
+def test_without_a_rosproxy_it_is_told_once_on_the_pod() -> None:
+    """The pod has no label that the webhook reads, and no RosProxy has a status that reports it."""
+    astray = pod("astray", misspelt=(TEXT,), workload="deployment/talker")
+    seen = observed(misspelt_pods=(astray,))
+    assert [p.namespaces for p in partitions(seen)] == [{"ros"}]
+    first = look(seen)
+    (event,) = first.actions
+    assert isinstance(event, Emit)
+    assert event.about == Reference("Pod", Name("ros", "astray"), "uid-astray")
+    fix = "Correct the name in the template: kubectl -n ros edit deployment/talker"
+    assert (event.reason, event.message) == ("UnknownName", f"{TEXT} {fix}")
+    assert look(seen, first.state, now=101.0).actions == ()
+
+
+def test_a_misspelt_label_wakes_the_operator_without_a_rosproxy() -> None:
+    store = ClusterStore([("pods", "")], ("",), lambda: None, lambda: None)
+    store.changed("pods", "", {"uid": objects.pod(pod_obj("a", {"rosproxy.io/injekt": "true"}))})
+    assert store.take_changes().namespaces == {NAMESPACE}
+    assert len(store.snapshot().misspelt_pods) == 1
+    store.changed("pods", "", {"uid": None})
+    assert store.snapshot().misspelt_pods == ()
 
 
 def test_many_pods_of_one_kind_are_told_of_by_some():

@@ -291,7 +291,7 @@ async def test_whom_it_concerns(server: ApiServer, seen: Seen) -> None:
     server.put("pods", {**pod_obj("talker", {})}, NAMESPACE)  # it has lost its label
     await touches({NAMESPACE}, {"node1"})
     server.put("pods", {**pod_obj("talker", {"rosproxy.io/injekt": "true"})}, NAMESPACE)
-    await touches({NAMESPACE}, {"node1"})
+    await touches({NAMESPACE}, set())
     server.drop("pods", "holder", "other")
     await touches(set(), {"node1"})
     server.put("nodes", changed(server.get("nodes", "node1", ""), conditions=[]))

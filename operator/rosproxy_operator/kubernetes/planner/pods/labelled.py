@@ -6,6 +6,7 @@ from rosproxy.admin.doctor_finding import DoctorFinding, error
 from rosproxy.telemetry.text import listed, plural
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.pods.injection import (
+    edited,
     has_come_unwired,
     is_late,
     restart_of,
@@ -16,6 +17,8 @@ from rosproxy_operator.kubernetes.resources.names import INJECT
 
 MOST_COMMANDS = 5
 """Commands in a fix."""
+MOST_MISSPELT = 10
+"""Misspelt names of pods that are reported."""
 
 
 def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Iterator[DoctorFinding]:
@@ -30,6 +33,17 @@ def lonely_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> Itera
         restarts = sorted({restart_of(pod) for pod in group})[:MOST_COMMANDS]
         fix = f"create a RosProxy in the namespace, then run {'; '.join(restarts)}"
         yield error("pods", f"namespace {namespace}", text, fix)
+
+
+def misspelt_findings(pods: Iterable[Pod], with_rosproxy: frozenset[str]) -> list[DoctorFinding]:
+    """An error for each misspelt name of pods, where no RosProxy has a status that reports it."""
+    lonely = sorted((p for p in pods if p.id.namespace not in with_rosproxy), key=lambda p: p.id)
+    first: dict[tuple[str, str], Pod] = {}
+    for pod in lonely:
+        for text in pod.misspelt:
+            first.setdefault((text, edited("correct the name in the template", pod)), pod)
+    found = [error("pods", f"pod {pod.id}", text, fix) for (text, fix), pod in first.items()]
+    return found[:MOST_MISSPELT]
 
 
 def unreached(pods: Iterable[Pod], rosproxies: Sequence[RosProxy], ready_since: str) -> list[str]:
