@@ -343,11 +343,10 @@ def read_master(service: MasterService | None, id: Name, ports: Iterable[int]) -
     """
     if service is None:
         return "", "does not exist. Create the Service, or correct spec.master.service"
+    if service.address == "None":
+        return "", "is headless. Delete the Service, and create it without clusterIP: None"
     if not is_address(service.address):
-        return "", (
-            f"has no cluster IP ({service.type or 'headless'}). "
-            "Use a Service of type ClusterIP with an address of its own"
-        )
+        return "", f"has no cluster IP (type {service.type}). Use a Service of type ClusterIP"
     if service.ports.isdisjoint(ports):
         has, wanted = (
             ", ".join(sorted(map(str, numbers))) or "none" for numbers in (service.ports, ports)

@@ -409,8 +409,8 @@ async def test_a_role_without_the_right_to_policies_stops_nothing(
 @pytest.mark.parametrize(
     ("spec", "told"),
     [
-        ({"clusterIP": "None"}, "has no cluster IP (headless)"),
-        ({"type": "ExternalName"}, "has no cluster IP (ExternalName)"),
+        ({"type": "ClusterIP", "clusterIP": "None"}, "is headless. Delete the Service, and create"),
+        ({"type": "ExternalName"}, "has no cluster IP (type ExternalName). Use a Service of type"),
         ({"clusterIP": "10.96.1.1", "ports": [{"port": 80}]}, "has no port 11311 (its ports: 80)"),
         ({"clusterIP": "10.96.1.1"}, "has no port 11311 (its ports: none)"),
         ({}, "has no cluster IP"),
