@@ -30,6 +30,7 @@ GROUPS = {
 PLURALS = {
     "Pod": "pods", "Service": "services", "RosProxy": "rosproxies", "Namespace": "namespaces",
     "Deployment": "deployments", "ResourceQuota": "resourcequotas", "LimitRange": "limitranges",
+    "Endpoints": "endpoints",
 }  # fmt: skip
 
 

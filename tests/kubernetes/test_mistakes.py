@@ -13,9 +13,12 @@ from typing import Any
 import pytest
 
 from tests.docker.engine import wait_until
+from tests.docker.nodes import node_command
 from tests.kubernetes import api
 from tests.kubernetes.api import Json
 from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.cluster.layout import NODES, ROBOT_ADDRESS
+from tests.kubernetes.cluster.network import inside
 from tests.kubernetes.pods import INJECT, Namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import RosProxy, events, rosproxy
@@ -45,18 +48,23 @@ class Site:
     def create_app(self, **template: Any) -> None:
         """Create the Deployment; ``template`` is what its pods have besides the label."""
         labels = {"app": APP, **template.pop("labels", {INJECT: "true"})}
-        spec = self.net.pod_body("unused", "sleep", "infinity", **template)["spec"]
+        metadata = {"labels": labels, "annotations": template.pop("annotations", {})}
+        command = template.pop("command", ("sleep", "infinity"))
+        spec = self.net.pod_body("unused", *command, **template)["spec"]
         body = {
             "apiVersion": "apps/v1", "kind": "Deployment",
             "metadata": {"name": APP, "namespace": self.net.name},
             "spec": {"replicas": 1, "selector": {"matchLabels": {"app": APP}},
-                     "template": {"metadata": {"labels": labels}, "spec": spec}},
+                     "template": {"metadata": metadata, "spec": spec}},
         }  # fmt: skip
         api.create(body)
 
-    def edit_app(self, labels: Json | None = None, **spec: Any) -> None:
-        """Change the template of the pods; None takes a label or field out."""
-        template = {"metadata": {"labels": labels or {}}, "spec": spec}
+    def edit_app(
+        self, labels: Json | None = None, annotations: Json | None = None, **spec: Any
+    ) -> None:
+        """Change the template of the pods; None takes a label, annotation or field out."""
+        metadata = {"labels": labels or {}, "annotations": annotations or {}}
+        template = {"metadata": metadata, "spec": spec}
         api.patch("deployments", self.net.name, APP, {"spec": {"template": template}})
 
     def restart_app(self) -> None:
@@ -92,12 +100,16 @@ Step = Callable[[Site], None]
 
 @dataclass(frozen=True)
 class Mistake:
-    """What is done wrong, the reason and words that are told, and what is done about it."""
+    """What is done wrong, the reason and words that are told, and what is done about it.
+
+    ``undo`` removes what is left of the mistake outside of the namespace.
+    """
 
     make: Step
     reason: str
     words: str
     fix: Step
+    undo: Step = lambda _: None
 
 
 def _both(spec: dict[str, Any], template: dict[str, Any]) -> Step:
@@ -232,12 +244,102 @@ def _privileged(site: Site) -> None:
     kubectl("label", "namespace", site.net.name, label, "--overwrite")
 
 
+def _astray_alone(site: Site) -> None:
+    site.create_app(labels={"rosproxy.io/injekt": "true"})
+
+
+def _label_and_rosproxy(site: Site) -> None:
+    site.create_rosproxy()
+    site.edit_app({INJECT: "true", "rosproxy.io/injekt": None})
+
+
+def _made_anew(site: Site) -> None:
+    site.create_rosproxy()
+    site.create_app()
+    wait_until(site.is_well, 90, site.rosproxy.tell)
+    site.rosproxy.remove()
+    wait_until(lambda: not site.rosproxy.body, 60, "the RosProxy is gone")
+    site.create_rosproxy()
+
+
+TWO_NODES = " & exec ".join(
+    " ".join(node_command("rospy", "pub", "--topic", f"/few_{name}", f"__name:=few_{name}"))
+    for name in ("one", "two")
+)
+
+
+def _taint(site: Site) -> None:
+    kubectl("taint", "node", "node2", "robots=only:NoSchedule")
+    site.create_rosproxy()
+    toleration = {"key": "robots", "operator": "Exists"}
+    site.create_app(on="node2", tolerations=[toleration])
+
+
+def _untaint(_: Site) -> None:
+    kubectl("taint", "node", "node2", "robots-", check=False)
+
+
+def _rule(site: Site) -> tuple[str, ...]:
+    port = str(site.robot.port)
+    return ("FORWARD", "-d", ROBOT_ADDRESS, "-p", "tcp", "--dport", port, "-j", "DROP")
+
+
+def _block_master(site: Site) -> None:
+    for node in NODES:
+        inside(node, "iptables", "-w", "-I", *_rule(site))
+    site.create_rosproxy()
+    site.create_app()
+
+
+def _open_master(site: Site) -> None:
+    for node in NODES:
+        inside(node, "sh", "-c", f"while iptables -w -D {' '.join(_rule(site))}; do :; done 2>&1")
+
+
+def _master_service(site: Site, **spec: Any) -> None:
+    """A Service at port 11400 that leads to the master on the robot, as many sites have one."""
+    port = {"port": 11400, "targetPort": site.robot.port}
+    site.create("Service", "master", ports=[port], **spec)
+    ports = [{"port": site.robot.port}]
+    subsets = [{"addresses": [{"ip": ROBOT_ADDRESS}], "ports": ports}]
+    metadata = {"name": "master", "namespace": site.net.name}
+    api.create({"apiVersion": "v1", "kind": "Endpoints", "metadata": metadata, "subsets": subsets})
+
+
+def _other_port(site: Site) -> None:
+    _master_service(site)
+    site.create_rosproxy(master={"service": {"name": "master"}})
+    site.create_app()
+
+
+def _headless(site: Site) -> None:
+    _master_service(site, clusterIP="None")
+    site.create_rosproxy(master={"service": {"name": "master", "port": 11400}})
+    site.create_app()
+
+
+def _with_an_address(site: Site) -> None:
+    for resource in ("services", "endpoints"):
+        api.delete(resource, site.net.name, "master")
+    wait_until(lambda: not api.get("endpoints", site.net.name, "master"), 30, "both are gone")
+    _master_service(site)
+
+
 IMAGE = {"image": "rosproxy:typo", "imagePullPolicy": "Never"}
 MISTAKES: dict[str, Mistake] = {
     "key of the label": Mistake(
         _template(labels={"rosproxy.io/injekt": "true"}),
         "UnknownName", "Did you mean the label rosproxy.io/inject",
         _relabel("true", **{"rosproxy.io/injekt": None}),
+    ),
+    "key of the label, and no RosProxy": Mistake(
+        _astray_alone, "UnknownName", "Did you mean the label rosproxy.io/inject",
+        _label_and_rosproxy,
+    ),
+    "annotation instead of the label": Mistake(
+        _template(labels={}, annotations={INJECT: "true"}),
+        "UnknownName", "The operator reads only the label rosproxy.io/inject",
+        lambda site: site.edit_app({INJECT: "true"}, {INJECT: None}),
     ),
     "True with a capital": Mistake(
         _template(labels={INJECT: "True"}), "NotWired", "true in lower case", _relabel("true")
@@ -251,6 +353,9 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "RosProxy after the pod": Mistake(
         _late_rosproxy, "NotWired", f"rollout restart deployment/{APP}", Site.restart_app
+    ),
+    "RosProxy deleted and created again": Mistake(
+        _made_anew, "NotWired", f"rollout restart deployment/{APP}", Site.restart_app
     ),
     "two RosProxies": Mistake(_two, "Ambiguous", INJECT, _relabel("robot")),
     "another master in the template": Mistake(
@@ -274,6 +379,10 @@ MISTAKES: dict[str, Mistake] = {
         _spec(master={"uri": "http://10.88.0.50:1"}), "MasterUnreachable", "correct spec.master",
         _set_master,
     ),
+    "firewall before the master": Mistake(
+        _block_master, "MasterUnreachable", "allow connections from pods", _open_master,
+        _open_master,
+    ),
     "name of the master": Mistake(
         _unknown_name, "MasterUnreachable", "set spec.master.address", _set_address
     ),
@@ -281,6 +390,17 @@ MISTAKES: dict[str, Mistake] = {
         _spec(master={"service": {"name": "roscore"}}), "MasterUnknown",
         "does not exist. Create the Service", lambda site: site.rosproxy.change(
             master={"service": None, "uri": site.robot.master_uri}),
+    ),
+    "port of the master's Service": Mistake(
+        _other_port, "MasterUnknown", "its ports: 11400). Set spec.master.service.port",
+        _change(master={"service": {"name": "master", "port": 11400}}),
+    ),
+    "headless Service of the master": Mistake(
+        _headless, "MasterUnknown", "create it without clusterIP: None", _with_an_address
+    ),
+    "fewer ports than ROS nodes": Mistake(
+        _both({"ports": 1}, {"command": ("sh", "-c", TWO_NODES)}), "ProxyWarns",
+        "et a larger spec.ports", _change(ports=8),
     ),
     "image": Mistake(
         _spec(**IMAGE), "ProxyStuck", "set spec.image",
@@ -294,12 +414,20 @@ MISTAKES: dict[str, Mistake] = {
         _spec(nodeSelector={"kubernetes.io/hostname": "nowhere"}), "NodeLeftOut",
         "spec.nodeSelector", _change(nodeSelector=None),
     ),
+    "taint of the node": Mistake(
+        _taint, "ProxyStuck", "Set spec.tolerations as in your pods",
+        _change(tolerations=[{"key": "robots", "operator": "Exists"}]), _untaint,
+    ),
     "more memory than a node has": Mistake(
         _spec(resources={"requests": {"memory": "4Ti"}, "limits": {"memory": "4Ti"}}), "ProxyStuck",
         "spec.resources", _change(resources=None),
     ),
     "no external address": Mistake(
         _spec(advertise="ExternalIP"), "NoAdvertiseHost", "spec.advertise",
+        _change(advertise="InternalIP"),
+    ),
+    "name that outside does not know": Mistake(
+        _spec(advertise="Hostname"), "ProxyWarns", "et spec.advertise",
         _change(advertise="InternalIP"),
     ),
     "ports of NodePorts": Mistake(
@@ -325,6 +453,10 @@ MISTAKES: dict[str, Mistake] = {
         _both({"ros": 2, "domain": 3, "master": None}, {"env": {"ROS_DOMAIN_ID": "7"}}),
         "OtherDomain", "ROS_DOMAIN_ID", _without_variables,
     ),
+    "localhost only": Mistake(
+        _both({"ros": 2, "master": None}, {"env": {"ROS_LOCALHOST_ONLY": "1"}}),
+        "Alone", "ROS_LOCALHOST_ONLY", _without_variables,
+    ),
     "peers in the template": Mistake(
         _both({"ros": 2, "master": None}, {"env": {"ROS_STATIC_PEERS": "192.0.2.7"}}),
         "NotWired", "ROS_STATIC_PEERS", _without_variables,
@@ -332,11 +464,30 @@ MISTAKES: dict[str, Mistake] = {
 }  # fmt: skip
 
 
+@pytest.fixture
+def site(net: Namespace, robot: Robot) -> Site:
+    return Site(net, robot)
+
+
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_told_and_the_fix_works(name: str, net: Namespace, robot: Robot) -> None:
-    site = Site(net, robot)
+def test_a_mistake_is_told_and_the_fix_works(name: str, site: Site) -> None:
     mistake = MISTAKES[name]
-    mistake.make(site)
+    try:
+        mistake.make(site)
+        told = _wait_told(site, mistake)
+        code, found = doctor(site.net.name)
+        assert code == 1, found
+        mistake.fix(site)
+        wait_until(site.is_well, 90, lambda: f"the fix works: {told()}")
+    finally:
+        mistake.undo(site)
+    wrong = [finding for finding in doctor(site.net.name)[1] if finding["severity"] == "error"]
+    # The doctors of ROS 2 proxies miss participants: the pods run no nodes.
+    assert not [finding for finding in wrong if not finding["subject"].startswith("proxy ")], wrong
+
+
+def _wait_told(site: Site, mistake: Mistake) -> Callable[[], str]:
+    """Wait until a mistake is told; return what tells the story of a failure."""
 
     def is_told() -> bool:
         return any(mistake.words in text for text in site.texts(mistake.reason))
@@ -345,10 +496,4 @@ def test_a_mistake_is_told_and_the_fix_works(name: str, net: Namespace, robot: R
         return f"{mistake.reason}: {site.texts(mistake.reason)}\n{site.rosproxy.tell()}"
 
     wait_until(is_told, TOLD_WITHIN, lambda: f"{mistake.words!r} is told: {story()}")
-    code, found = doctor(net.name)
-    assert code == 1, found
-    mistake.fix(site)
-    wait_until(site.is_well, 90, lambda: f"the fix works: {story()}")
-    wrong = [finding for finding in doctor(net.name)[1] if finding["severity"] == "error"]
-    # The doctors of ROS 2 proxies miss participants: the pods run no nodes.
-    assert not [finding for finding in wrong if not finding["subject"].startswith("proxy ")], wrong
+    return story
