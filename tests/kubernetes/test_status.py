@@ -43,8 +43,10 @@ def test_status_and_columns(net: Namespace, robot: Robot) -> None:
     assert narrow[0].split() == ["NAME", "MASTER", "DOMAIN", "NODES", "PROXIES", "READY", "AGE"]
     assert narrow[1].split()[:5] == ["robot", robot.master_uri, "2", "2/2", "True"]
     wide = kubectl("get", "rp", "-n", net.name, "-o", "wide").splitlines()
-    more = ["PORTS", "ROS-NODES", "PARTICIPANTS", "TOPICS", "MASTER-URI", "MESSAGE"]
+    more = ["ADDRESSES", "PORTS", "ROS-NODES", "PARTICIPANTS", "TOPICS", "MASTER-URI", "MESSAGE"]
     assert wide[0].split()[7:] == more
+    assert "node1: 10.88.0.11, node2: 10.88.0.12" in wide[1]
+    assert wide[1].endswith("2 of 2 proxies serve 1 ROS node")
     assert here["ports"] in wide[1]
     assert status["masterURI"] in wide[1]
     created = made.wait_event("ProxyCreated")
@@ -90,6 +92,9 @@ def test_image_that_is_not_there(net: Namespace) -> None:
     net.idle(on="node1")
     made.wait_event("ProxyStuck", "rosproxy:missing")
     assert "rosproxy:missing" in made.wait_for("Ready", "False")["message"]
+    wide = kubectl("get", "rp", "-n", net.name, "-o", "wide")
+    assert "node1: 10.88.0.11 (not ready)" in wide
+    assert "the node can't get the image rosproxy:missing" in wide
     made.change(image=None)
     wait_until(lambda: any(p.body["status"].get("phase") == "Running" for p in made.proxies),
                40, made.tell)  # fmt: skip

@@ -47,7 +47,7 @@ MOST_NAMES_OF_ALL = 4000
 """The same of all nodes: with `_NAME` characters each they take less than half of that object."""
 _NAME = 100
 _MESSAGE = 300
-_PORTS = 400
+_BY_NODE = 400
 # As for the reason of a metav1.Condition in k8s.io/apimachinery, pkg/apis/meta/v1/types.go.
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS = "NoPods"
@@ -94,8 +94,9 @@ def status_of(
     served = [plural(nodes, "ROS node")] if spec.ros1 else []
     if spec.ros2:
         served.append(f"{plural(members, 'participant')} of domain {spec.ros2.number}")
+    ready = _ready(rosproxy, wanted, problems, " and ".join(served))
     judged = (
-        _ready(rosproxy, wanted, problems, " and ".join(served)),
+        ready,
         _allocated(wanted, problems),
         *([_reached(states, problems, former)] if spec.ros1 else []),
         _way_in(states, problems, former),
@@ -103,12 +104,14 @@ def status_of(
     )
     return {
         "observedGeneration": rosproxy.generation,
+        "message": _message(ready, problems),
         **_addressed(rosproxy, cluster_ip, master),
         **({"domain": spec.ros2.number, "participants": members} if spec.ros2 else {}),
         "nodes": len(wanted),
         "proxies": f"{sum(map(_serving, wanted))}/{len(wanted)}",
         "rosNodes": nodes,
         "topics": _topics(states, former),
+        "addresses": _addresses(wanted),
         "ports": _ports(states),
         "perNode": lines,
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
@@ -156,6 +159,7 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     return {
         **former,
         "observedGeneration": rosproxy.generation,
+        "message": bounded(text, LONGEST),
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
 
@@ -216,7 +220,20 @@ def _ports(states: Sequence[RosProxyOnNode]) -> str:
     ranges = {s.name: str(s.range) for s in states if s.range and (s.pods or s.proxy)}
     if len(set(ranges.values())) <= 1:
         return next(iter(ranges.values()), "")
-    return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(ranges.items())), _PORTS)
+    return bounded(
+        ", ".join(f"{name}: {ports}" for name, ports in sorted(ranges.items())), _BY_NODE
+    )
+
+
+def _addresses(wanted: Sequence[RosProxyOnNode]) -> str:
+    """Where outside reaches the proxy of each node, and which nodes have no proxy that works."""
+    hosts = {state.name: state.advertise_host or "no address" for state in wanted}
+    waiting = {state.name for state in wanted if not _serving(state)}
+    lines = (
+        f"{name}: {host}{' (not ready)' if name in waiting else ''}"
+        for name, host in sorted(hosts.items())
+    )
+    return bounded(", ".join(lines), _BY_NODE)
 
 
 def _serving(state: RosProxyOnNode) -> bool:
@@ -293,6 +310,13 @@ def _ready(
     if proxy is not None and not proxy.pod.deleting:
         progress = f"proxy {proxy.pod.id.name} is starting"
     return Condition(READY, "False", "ProxiesStarting", f"node {name}: {progress}")
+
+
+def _message(ready: Condition, problems: Sequence[ClusterFinding]) -> str:
+    """Why the RosProxy is not ready, else the first problem, else what the proxies serve."""
+    is_ready = ready.status == "True"
+    text = _one_line(problems[0]) if is_ready and problems else ready.message
+    return bounded(text, LONGEST)
 
 
 def _of_pod(problem: ClusterFinding) -> bool:

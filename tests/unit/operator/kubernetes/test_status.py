@@ -15,6 +15,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     RosProxyOnNode,
 )
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Selector
+from rosproxy_operator.kubernetes.status.findings import pod_finding
 from rosproxy_operator.kubernetes.status.rosproxy_status import (
     LONGEST,
     MOST_NAMES,
@@ -46,12 +47,14 @@ def test_all_is_well():
         key: value for key, value in rosproxy_status.items() if key not in ("perNode", "conditions")
     } == {
         "observedGeneration": 3,
+        "message": "2 of 2 proxies serve 3 ROS nodes",
         "master": ROBOT,
         "masterURI": URI,
         "nodes": 2,
         "proxies": "2/2",
         "rosNodes": 3,
         "topics": 1,
+        "addresses": "node1: 192.0.2.11, node2: 192.0.2.11",
         "ports": "11400-11431",
     }
     assert [(c["type"], c["status"], c["reason"]) for c in rosproxy_status["conditions"]] == [
@@ -110,6 +113,24 @@ def test_ports_that_differ_are_told_by_node():
     node2 = state("node2", range=PortRange(12000, 12031))
 
     assert status(node2, state())["ports"] == "node1: 11400-11431, node2: 12000-12031"
+
+
+def test_the_wide_output_tells_which_node_is_not_ready_and_why():
+    node2 = state("node2", proxy=stuck_proxy(PodFailure.IMAGE), answer=None)
+
+    rosproxy_status = status(node2, state())
+
+    assert rosproxy_status["addresses"] == "node1: 192.0.2.11, node2: 192.0.2.11 (not ready)"
+    assert rosproxy_status["message"] == message(rosproxy_status)
+    assert "the node can't get the image" in rosproxy_status["message"]
+
+
+def test_the_wide_output_tells_the_first_problem_of_a_rosproxy_that_is_ready():
+    astray = pod_finding(pod("astray"), rosproxy(), "NotWired", "has no variable", fatal=False)
+    rosproxy_status = status(state(), more=(astray,))
+
+    assert judged(rosproxy_status, "Ready") == ("True", "Serving")
+    assert rosproxy_status["message"] == "pod robots/astray: has no variable"
 
 
 def test_no_pod_is_selected():
@@ -186,12 +207,12 @@ def test_one_that_can_not_be_read_keeps_what_it_has():
 
     rosproxy_status = status_of_invalid(bad, LATER)
 
-    assert {
-        key: rosproxy_status[key]
-        for key in first
-        if key not in ("conditions", "observedGeneration")
-    } == {key: first[key] for key in first if key not in ("conditions", "observedGeneration")}
+    changed = ("conditions", "observedGeneration", "message")
+    assert {key: rosproxy_status[key] for key in first if key not in changed} == {
+        key: first[key] for key in first if key not in changed
+    }
     assert rosproxy_status["observedGeneration"] == 4
+    assert rosproxy_status["message"] == text
     assert judged(rosproxy_status, "Ready") == ("False", "Invalid")
     assert message(rosproxy_status) == text
     assert judged(rosproxy_status, "Degraded") == ("True", "Invalid")
