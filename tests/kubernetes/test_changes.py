@@ -1,10 +1,17 @@
 """A RosProxy that is changed or deleted while its proxies serve."""
 
+import time
+
+import pytest
+
 from tests.docker.engine import wait_until
+from tests.docker.nodes import node_command
 from tests.kubernetes import api
+from tests.kubernetes.measured import note
 from tests.kubernetes.pods import INJECT, Namespace, unique
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
+from tests.kubernetes.test_mistakes import Site, restart_as_told
 from tests.kubernetes.traffic import START, wait_for_service
 
 
@@ -84,6 +91,38 @@ def test_deleted_rosproxy_leaves_only_the_users_pods(net: Namespace, robot: Robo
     wait_until(lambda: not made.proxies and not made.service, 40, made.tell)
     assert {body["metadata"]["uid"] for body in net.pods(INJECT)} == pods
     wait_until(lambda: not robot.uri(name), 25, lambda: f"unregistered: {robot.nodes()}")
+
+
+@pytest.mark.parametrize("who", ["user", "operator"])
+def test_rosproxy_deleted_and_created_at_once(who: str, net: Namespace, robot: Robot) -> None:
+    """The pods have to be created anew: by the user, or by the operator with an annotation."""
+    topic = f"/{unique('anew').replace('-', '_')}"
+    site = Site(net, robot)
+    made = site.rosproxy
+    site.create_rosproxy()
+    wait_for_service(net)
+    site.create_app(command=node_command("roscpp", "pub", "--topic", topic, "--word", "inside"))
+    listener = robot.node(f"listener_{who}", "roscpp", "sub", "--topic", topic)
+    listener.wait_for("inside", seconds=START)
+    (before,) = net.pods(INJECT)
+
+    deleted = time.time()
+    made.remove()
+    wait_until(lambda: not made.body, 60, made.tell)
+    site.create_rosproxy()
+    if who == "operator":
+        annotation = {"rosproxy.io/remake-unwired": "true"}
+        api.patch("rosproxies", net.name, made.name, {"metadata": {"annotations": annotation}})
+    else:
+        restart_as_told(site)
+
+    def replaced() -> bool:
+        return before["metadata"]["uid"] not in {pod["metadata"]["uid"] for pod in net.pods(INJECT)}
+
+    wait_until(replaced, 120, made.tell)
+    listener.wait_for("inside", since=time.time(), seconds=START)
+    gap = listener.longest_gap("inside", deleted, time.time())
+    note(f"RosProxy deleted and created, pods restarted by the {who}: {gap:.1f} s without messages")
 
 
 def test_deleted_service_comes_back_at_its_address(net: Namespace) -> None:

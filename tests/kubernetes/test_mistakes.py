@@ -188,15 +188,15 @@ def _namesake(site: Site) -> None:
 
 def _no_namesake(site: Site) -> None:
     api.delete("services", site.net.name, "rosproxy-robot")
-    _restart_as_told(site)
+    restart_as_told(site)
 
 
 def _allowed_image(site: Site) -> None:
     site.rosproxy.change(image=None)
-    _restart_as_told(site)
+    restart_as_told(site)
 
 
-def _restart_as_told(site: Site) -> None:
+def restart_as_told(site: Site) -> None:
     """Restart pods that were created while their RosProxy had no Service, once that is told."""
     command = f"rollout restart deployment/{APP}"
     wait_until(

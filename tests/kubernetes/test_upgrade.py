@@ -2,7 +2,10 @@
 
 import time
 
+import pytest
+
 from tests.docker.engine import wait_until
+from tests.docker.nodes import LIBRARIES
 from tests.kubernetes import api, release
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
@@ -30,18 +33,19 @@ def test_upgrade_of_the_operator_only(net: Namespace, robot: Robot) -> None:
         assert made.the_proxy().uid_then == before.uid_then
 
 
-def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_upgrade_of_the_proxies(library: str, net: Namespace, robot: Robot) -> None:
     """Their image is changed in place: the same pod, the same ports."""
     other = release.other_image()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
-    with flow(net, robot, "rospy") as traffic:
+    with flow(net, robot, library) as traffic:
         before = made.the_proxy()
         started = time.time()
         release.upgrade(proxy={"image": {"tag": other}})
         wait_until(lambda: made.the_proxy().restarts == 1, 60, made.tell)
         traffic.wait(since=time.time(), seconds=60)
         after = made.the_proxy()
-        note(f"helm upgrade, other image of the proxy: {traffic.gaps(started)}")
+        note(f"helm upgrade, other image of the proxy, {library}: {traffic.gaps(started)}")
         assert (after.uid_then, after.ports) == (before.uid_then, before.ports)
         assert after.body["spec"]["containers"][0]["image"] == f"rosproxy:{other}"
     release.upgrade()
@@ -83,6 +87,23 @@ def test_other_defaults_of_the_proxies(net: Namespace, robot: Robot) -> None:
         assert after.body["metadata"]["labels"]["team"] == "arms"
         assert "runAsUser" not in after.body["spec"]["securityContext"]
         traffic.wait(since=time.time(), seconds=60)
+    release.upgrade()
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_other_bounds_of_the_proxies(library: str, net: Namespace, robot: Robot) -> None:
+    """Proxies are made anew with the bounds, on their ports, and ROS nodes go on."""
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    with flow(net, robot, library) as traffic:
+        before = made.the_proxy()
+        started = time.time()
+        release.upgrade(proxy={"bounds": {"maxBuffered": 16}})
+        wait_until(lambda: made.the_proxy().uid_then != before.uid_then, 60, made.tell)
+        traffic.wait(since=time.time(), seconds=60)
+        after = made.the_proxy()
+        note(f"helm upgrade, other bounds of the proxy, {library}: {traffic.gaps(started)}")
+        assert after.ports == before.ports
+        assert after.environment["ROSPROXY_MAX_BUFFERED"] == "16"
     release.upgrade()
 
 
