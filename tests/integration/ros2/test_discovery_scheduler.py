@@ -49,6 +49,18 @@ async def test_what_a_datagram_leads_to_counts_as_well() -> None:
     assert names == ["announces", "other", "other", "other", "announces", "announces"]
 
 
+async def test_the_last_of_datagrams_that_say_the_same_is_read() -> None:
+    reader = DiscoveryScheduler()
+    names = list[str]()
+    reader.put("robot", Standing.PROVEN, 0, reading(names, "first"), "stream")
+    assert reader.is_behind
+    assert reader.replace("stream", reading(names, "last"))
+    reader.put("robot", Standing.PROVEN, 0, reading(names, "other"))
+    await until_read(names, 2)
+    assert names == ["last", "other"]
+    assert not reader.replace("stream", reading(names, "too late"))
+
+
 async def test_short_datagrams_share_a_round() -> None:
     reader = DiscoveryScheduler()
     names = list[str]()

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import struct
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, pairwise, repeat
@@ -12,17 +13,26 @@ from examples.demo.fake_http import free_ports
 from rosproxy.forwarding.datagrams import bind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.domain_settings import DomainSettings
+from rosproxy.ros2.domain_settings import DomainSettings, Outgoing
 from rosproxy.ros2.ports.former_ports import ANSWER_TIME
 from rosproxy.ros2.ports.locator_ports import REMEMBERED, SETTLING
 from rosproxy.ros2.ports.stand_ins import stand_in_port
 from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 from rosproxy.ros2.servers.domain_server import ADMISSION_TIMEOUT, DomainServer
 from rosproxy.ros2.sources.fair_queue import DiscoveryQueue
-from rosproxy.ros2.sources.rates import DiscoveryRates
+from rosproxy.ros2.sources.rates import DiscoveryRates, Standing
 from tests.integration.net import PATIENCE, until
 from tests.integration.own_domain import own_domain
-from tests.unit.ros2.discovery.domains import A, B, dispose_message, reached_at, spdp
+from tests.unit.ros2.discovery.domains import (
+    SEDP_WRITERS,
+    A,
+    B,
+    dispose_message,
+    reached_at,
+    spdp,
+)
+from tests.unit.ros2.protocol.messages import message, submessage
 
 PROXY = "127.0.7.1"
 INSIDE = "127.0.7.2"
@@ -186,3 +196,27 @@ async def test_a_participant_whose_turn_is_lost_gets_another_one() -> None:
         await asyncio.sleep(0)
     assert A in server.domain.inside.by_prefix
     server.close()
+
+
+async def test_of_heartbeats_that_wait_only_the_last_one_of_a_stream_is_read(
+    server: DomainServer,
+) -> None:
+    """Fast DDS repeats them 25 times a second: they would fill the queue of a slow proxy."""
+    read = list[bytes]()
+
+    def take(datagram: bytes, _source: str, _now: float) -> list[Outgoing]:
+        read.append(datagram)
+        return []
+
+    def heartbeat(count: int, writer: int = SEDP_WRITERS) -> bytes:
+        body = struct.pack(">II", writer + 5, writer) + struct.pack("<iIiIi", 0, 1, 0, 5, count)
+        return message(submessage(0x0E, 0, B), submessage(0x07, 0, body), prefix=A)
+
+    with participant(INSIDE) as sender, participant(PROXY) as sock:
+        for count in range(1, 6):
+            sender.sendto(heartbeat(count), sock.getsockname())
+        sender.sendto(heartbeat(1, BuiltinWriter.SUBSCRIPTIONS), sock.getsockname())
+        server._scheduler.put("another source", Standing.PROVEN, 0, list)
+        server._take_in(sock, take, lambda *_: True)
+        await until(lambda: not server._scheduler.is_behind, "all is read")
+    assert read == [heartbeat(5), heartbeat(1, BuiltinWriter.SUBSCRIPTIONS)]

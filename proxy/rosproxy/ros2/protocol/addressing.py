@@ -6,6 +6,7 @@ ids, and INFO_DST in front of it whose they are.
 
 from rosproxy.ros2.protocol.rtps import (
     FAST_DDS,
+    HEADER,
     INFO_DST,
     PREFIX,
     STATISTICS,
@@ -22,6 +23,10 @@ from rosproxy.ros2.protocol.rtps import (
 
 MOST_OF_USERS = 16
 """Submessages of a datagram that may pass unread; of users' data there are half a dozen."""
+
+LONGEST_HEARTBEAT = 160
+"""Bytes of a message that may count as a heartbeat alone. Those of Fast DDS have 112: header 20,
+INFO_DST 16, heartbeat 32, statistics 44."""
 
 _WRITER_AT: dict[int, int] = {
     SubmessageId.DATA: 8,
@@ -45,6 +50,9 @@ _NAMELESS = frozenset(
 """Submessages that are from no writer, and only tell of those that follow."""
 _NAMELESS_OF = {FAST_DDS: _NAMELESS | {STATISTICS}}
 """The same of vendors that have others."""
+_ENTITY_ID = 4
+_HEARTBEAT = 28
+"""Bytes of an entity id, and of the body of a heartbeat (9.4.5.7)."""
 _BUILT_IN = 0xC0
 """The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
 
@@ -105,6 +113,31 @@ def of_built_in_writer(datagram: bytes) -> bool | None:
             require_size(body, offset + 4)
             return bool(datagram[body.start + offset + 3] & _BUILT_IN == _BUILT_IN)
     return None
+
+
+def heartbeat_stream(datagram: bytes) -> bytes | None:
+    """From and to whom a message is that is a heartbeat and nothing else; None if it is another.
+
+    A later heartbeat of the same stream says all that an earlier one did (8.3.8.6). The flags are
+    part of the stream: they say whether an answer is wanted, and whether the writer is alive.
+    """
+    if len(datagram) > LONGEST_HEARTBEAT:
+        return None
+    stream = b""
+    try:
+        nameless = _NAMELESS_OF.get(source_vendor(datagram), _NAMELESS)
+        for kind, flags, body in walk_submessages(datagram):
+            if kind == INFO_DST and not stream:
+                stream = datagram[body.start : body.start + PREFIX]
+            elif kind == SubmessageId.HEARTBEAT and len(stream) <= PREFIX:
+                require_size(body, _HEARTBEAT)
+                entities = datagram[body.start : body.start + 2 * _ENTITY_ID]
+                stream = stream.ljust(PREFIX, b"\0") + entities + bytes([flags])
+            elif kind not in nameless or kind == SubmessageId.INFO_SRC:
+                return None
+    except RtpsError:
+        return None
+    return datagram[HEADER - PREFIX : HEADER] + stream if len(stream) > PREFIX else None
 
 
 def may_be_discovery(datagram: bytes) -> bool:

@@ -6,7 +6,7 @@ the event loop serves whatever else is ready.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 from rosproxy.ros2.domain_settings import Outgoing
 from rosproxy.ros2.sources.fair_queue import OVERHEAD, DiscoveryQueue
@@ -38,26 +38,37 @@ class DiscoveryScheduler:
         self._received = 0
         """Datagrams that have come since this round."""
 
-    def read(self, source: str, standing: Standing, size: int, read: Read) -> bool:
+    @property
+    def is_behind(self) -> bool:
+        """Whether a datagram that comes now has to wait."""
+        return bool(self._queue) or self._spent >= ROUND
+
+    def read(
+        self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
+    ) -> bool:
         """Read a datagram of so many bytes now if none waits, or when the turn of its source comes.
 
-        Return False if it is lost.
+        Return False if the datagram is lost. By its ``key`` it may be replaced while it waits.
         """
-        if self._queue or self._spent >= ROUND:
-            return self.put(source, standing, size, read)
+        if self.is_behind:
+            return self.put(source, standing, size, read, key)
         self._schedule()
         self._spent += size + OVERHEAD + _size_of(read())
         return True
 
-    def put(self, source: str, standing: Standing, size: int, read: Read) -> bool:
-        """Have a datagram of so many bytes read when the turn of its source comes.
-
-        Return False if it is lost.
-        """
+    def put(
+        self, source: str, standing: Standing, size: int, read: Read, key: Hashable = None
+    ) -> bool:
+        """Have a datagram of so many bytes read when the turn of its source comes; see `read`."""
         self._received += 1
-        has_room = self._queue.put(source, standing, read, size)
+        has_room = self._queue.put(source, standing, read, size, key)
         self._schedule()
         return has_room
+
+    def replace(self, key: Hashable, read: Read) -> bool:
+        """Read another datagram instead of the one that waits with a key; False if none does."""
+        self._received += 1
+        return self._queue.replace(key, read)
 
     def close(self) -> None:
         """Read nothing more."""

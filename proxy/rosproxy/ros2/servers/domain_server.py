@@ -19,7 +19,15 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import (
+    Awaitable,
+    Callable,
+    Collection,
+    Hashable,
+    Iterable,
+    Mapping,
+    Sequence,
+)
 from functools import partial
 
 from rosproxy.forwarding import datagrams
@@ -33,6 +41,7 @@ from rosproxy.ros2.domain_settings import (
     DomainSettings,
     Outgoing,
 )
+from rosproxy.ros2.protocol.addressing import heartbeat_stream
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.relay_envelope import address_lists
 from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError
@@ -374,21 +383,40 @@ class DomainServer:
                     spent += 1
                     continue
                 source = plain_address(sender[0])
-                if must_read(datagram, source):
+                key = self._replaceable_as(take, datagram, source)
+                if self._replaces(key, take, datagram, source):
                     weight = 1 / QUEUED_FOR_PASSED
-                    self._read_in_turn(take, datagram, source)
+                elif must_read(datagram, source):
+                    weight = 1 / QUEUED_FOR_PASSED
+                    self._read_in_turn(take, datagram, source, key)
                 else:
                     weight = 1.0
                     self._carry_out(take, datagram, source)
                 spent += weight
                 spent_bytes += weight * len(datagram)
 
-    def _read_in_turn(self, take: Take, datagram: bytes, source: str) -> None:
+    def _replaceable_as(self, take: Take, datagram: bytes, source: str) -> Hashable:
+        """The key of a datagram in the queue of discovery, if a later one may take its place.
+
+        Fast DDS repeats a heartbeat 25 times a second until the reader has answered. If the proxy
+        is slow, heartbeats would leave no room for the samples that they are about. So only the
+        last heartbeat of a stream waits.
+        """
+        stream = heartbeat_stream(datagram) if self._scheduler.is_behind else None
+        return (take, source, stream) if stream else None
+
+    def _replaces(self, key: Hashable, take: Take, datagram: bytes, source: str) -> bool:
+        """Read a datagram instead of the one that waits with its key; False if none does."""
+        if key is None:
+            return False
+        return self._scheduler.replace(key, partial(self._carry_out, take, datagram, source))
+
+    def _read_in_turn(self, take: Take, datagram: bytes, source: str, key: Hashable) -> None:
         """Have discovery read, at the latest when the turn of its source comes."""
         heard_at = self.domain.source_of(datagram, source)
         standing = self.domain.standing(heard_at)
         read = partial(self._carry_out, take, datagram, source)
-        if not self._scheduler.read(heard_at, standing, len(datagram), read):
+        if not self._scheduler.read(heard_at, standing, len(datagram), read, key):
             text = "the queue of discovery that the proxy has not read yet is full"
             self.domain.refused("rate", heard_at, text)
 

@@ -9,8 +9,9 @@ sources inside, and for other sources outside.
 
 import heapq
 from collections import deque
+from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 from rosproxy.ros2.sources.rates import Standing
 
@@ -31,12 +32,14 @@ OVERHEAD = 256
 Item = TypeVar("Item")
 
 
-class Waiting(NamedTuple, Generic[Item]):
-    """An item with its source, and the bytes that it counts for."""
+@dataclass(slots=True)
+class Waiting(Generic[Item]):
+    """An item with its source, and the bytes that it counts for; ``key`` as in `FairQueue.put`."""
 
     source: str
     item: Item
     size: int
+    key: Hashable = None
 
 
 @dataclass(slots=True)
@@ -52,6 +55,7 @@ class FairQueue(Generic[Item]):
     most_of_source: int = MOST_OF_SOURCE
     most_of_all: int = MOST_OF_ALL
     _waiting: dict[str, deque[Waiting[Item]]] = field(default_factory=dict)
+    _replaceable: dict[Hashable, Waiting[Item]] = field(default_factory=dict)
     _sizes: dict[str, int] = field(default_factory=dict)
     _order: list[tuple[int, str]] = field(default_factory=list)
     _next: dict[str, int] = field(default_factory=dict)
@@ -62,17 +66,30 @@ class FairQueue(Generic[Item]):
         """Whether an item waits."""
         return bool(self._waiting)
 
-    def put(self, source: str, item: Item, size: int) -> bool:
-        """Add an item of so many bytes. Return False if there is no room for the item."""
-        waiting = Waiting(source, item, size + OVERHEAD)
+    def put(self, source: str, item: Item, size: int, key: Hashable = None) -> bool:
+        """Add an item of so many bytes. Return False if there is no room for the item.
+
+        An item with a ``key`` can be replaced while it waits (`replace`).
+        """
+        waiting = Waiting(source, item, size + OVERHEAD, key)
         if not self._has_room(waiting):
             return False
+        if key is not None:
+            self._replaceable[key] = waiting
         if source not in self._waiting:
             self._waiting[source] = deque()
             self._next[source] = max(self._now, self._next.get(source, 0))
             heapq.heappush(self._order, (self._next[source], source))
         self._waiting[source].append(waiting)
         self._count(source, waiting.size)
+        return True
+
+    def replace(self, key: Hashable, item: Item) -> bool:
+        """Put an item in the place of the one that waits with a key; False if none does."""
+        former = self._replaceable.get(key)
+        if former is None:
+            return False
+        former.item = item
         return True
 
     def pop(self) -> Waiting[Item] | None:
@@ -93,7 +110,7 @@ class FairQueue(Generic[Item]):
 
     def _take(self, source: str) -> Waiting[Item]:
         waiting = self._waiting[source].popleft()
-        self._count(source, -waiting.size)
+        self._leave(waiting)
         self._next[source] += waiting.size
         if self._waiting[source]:
             heapq.heappush(self._order, (self._next[source], source))
@@ -115,8 +132,13 @@ class FairQueue(Generic[Item]):
             # A source is never emptied here: its place in `_order` would be left.
             if self._sizes[largest] <= size or len(self._waiting[largest]) == 1:
                 return False
-            self._count(largest, -self._waiting[largest].pop().size)
+            self._leave(self._waiting[largest].pop())
         return True
+
+    def _leave(self, waiting: Waiting[Item]) -> None:
+        """Count an item no longer."""
+        self._count(waiting.source, -waiting.size)
+        self._replaceable.pop(waiting.key, None)
 
     def _count(self, source: str, size: int) -> None:
         self._size += size
@@ -152,13 +174,19 @@ class DiscoveryQueue(Generic[Item]):
         """Whether a datagram waits."""
         return any(self._queues.values())
 
-    def put(self, source: str, standing: Standing, item: Item, size: int) -> bool:
-        """Add a datagram of so many bytes. Return False if there is no room for the datagram."""
+    def put(
+        self, source: str, standing: Standing, item: Item, size: int, key: Hashable = None
+    ) -> bool:
+        """Add a datagram of so many bytes; see `FairQueue.put`."""
         if not self._queues[standing]:
             busy = [self._used[other] for other, queue in self._queues.items() if queue]
             # A pause saves nothing.
             self._used[standing] = max(self._used[standing], min(busy, default=0))
-        return self._queues[standing].put(source, item, size)
+        return self._queues[standing].put(source, item, size, key)
+
+    def replace(self, key: Hashable, item: Item) -> bool:
+        """Put a datagram in the place of the one that waits with a key; False if none does."""
+        return any(queue.replace(key, item) for queue in self._queues.values())
 
     def pop(self) -> Waiting[Item] | None:
         """Take the next datagram; None if no datagram waits."""

@@ -47,6 +47,27 @@ def test_a_source_pays_for_what_its_datagrams_lead_to() -> None:
     assert Counter(sources) == {"announces": 2, "other": 20}
 
 
+def test_a_datagram_may_take_the_place_of_the_one_that_waits_with_its_key() -> None:
+    queue = FairQueue[int](most_sources=10)
+    assert not queue.replace("key", 0)
+    queue.put("robot", 1, 0, "key")
+    queue.put("robot", 2, 0)
+    assert queue.replace("key", 3)
+    taken_items = [waiting.item for waiting in (queue.pop(), queue.pop()) if waiting]
+    assert taken_items == [3, 2]
+    assert not queue.replace("key", 4)  # it waits no longer
+    assert queue.pop() is None
+
+
+def test_what_lost_its_place_to_another_source_is_not_replaced() -> None:
+    queue = FairQueue[int](most_sources=10, most_of_all=4 * OVERHEAD)
+    for number in range(4):
+        queue.put("many", number, 0, number)
+    assert queue.put("few", 9, 0)
+    assert not queue.replace(3, 7)
+    assert queue.replace(2, 7)
+
+
 def test_a_source_that_always_has_one_datagram_is_not_always_next() -> None:
     """It began where the queue was each time, and no other source was read meanwhile."""
     queue = FairQueue[int](most_sources=10)
