@@ -7,10 +7,11 @@ import asyncio
 from collections.abc import Sequence
 from ipaddress import IPv4Network, IPv6Network, collapse_addresses, ip_network
 
-from rosproxy.net.addresses import Network, is_inside
+from rosproxy.net.addresses import Network
 from rosproxy.net.budget import Budget
 from rosproxy.net.gate import Gate
 from rosproxy.net.interfaces import address_towards, interface_networks
+from rosproxy.net.network_changes import NetworkChanges
 from rosproxy.ros1.clients.master_client import MasterClient
 from rosproxy.ros1.clients.node_client import NodeClient
 from rosproxy.ros1.protocol.xmlrpc import limits
@@ -24,8 +25,6 @@ from rosproxy.settings import MEBIBYTE
 
 REGISTRATION_GRACE = 0.5
 """Seconds that a publisherUpdate waits at most for a registration of the same node."""
-NETWORKS_TTL = 5.0
-"""Seconds for which the list of the machine's own networks is taken as current."""
 MANY_VALUES = 100
 """Values from which on a document is large; registrations have six."""
 MOST_PASSING = 256
@@ -86,7 +85,13 @@ class Context:
         self._client_kinds: dict[str, ClientKind] = {}
         """By address; emptied when the networks or the selection are read again."""
         self._client_networks: list[Network] | None = None
+        self._network_changes = NetworkChanges()
         self.read_networks()
+
+    async def close(self) -> None:
+        """Close what is open towards the master, the nodes and the kernel."""
+        self._network_changes.close()
+        await self.upstream.close()
 
     def now(self) -> float:
         """Seconds of the event loop's clock, which never goes back."""
@@ -148,14 +153,9 @@ class Context:
         while endpoint.pending and self.now() < deadline:  # noqa: ASYNC110 - rare, short
             await asyncio.sleep(0.002)
 
-    def refresh_networks(self, source: str = "") -> None:
-        """Take in the networks that the proxy's interfaces are in now.
-
-        They are read every few seconds, and at once where a call comes from a ``source`` in none
-        of them: containers join networks while they run.
-        """
-        is_unknown = source and not is_inside(source, self.addressing.networks)
-        if is_unknown or self.now() - self._networks_read > NETWORKS_TTL:
+    def refresh_networks(self) -> None:
+        """Take in the networks of the proxy's interfaces, if these have changed."""
+        if self._network_changes.noticed(self.now()):
             self.read_networks()
 
     def read_networks(self) -> None:
@@ -163,7 +163,6 @@ class Context:
         self._proxy_addresses.clear()
         self._client_kinds.clear()
         self._client_networks = None
-        self._networks_read = self.now()
         # With --direction both the network of the default route leads outside, so it is not inside.
         configured = self.settings.inside_networks
         both = self.stand_ins.is_bidirectional

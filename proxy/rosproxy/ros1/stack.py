@@ -211,7 +211,7 @@ class Ros1:
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
         await asyncio.gather(self.tcpros.relays.stop(), *servers)
-        await self.context.upstream.close()
+        await self.context.close()
 
     @property
     def retired(self) -> bool:
@@ -233,7 +233,7 @@ class Ros1:
             return await self.probe(or_fast=True)
         finally:
             self.leases.close_all()
-            await self.context.upstream.close()
+            await self.context.close()
 
     async def apply_policy(self) -> EnforcementCounts:
         """Make everything fit the policy. Raises Unreachable, MasterError."""

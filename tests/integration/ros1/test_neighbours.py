@@ -7,6 +7,7 @@ import pytest
 
 from examples.demo.fake_http import value
 from examples.demo.fake_node import FakeNode
+from rosproxy.net.network_changes import NetworkChanges
 from tests.integration.net import (
     HOST,
     NODE,
@@ -212,11 +213,19 @@ async def test_outside_nodes_are_never_touched(proxy, master, node, make_node):
     assert stranger.slave.connections == 0
 
 
+class EverythingChanges(NetworkChanges):
+    """As if the kernel told of a change before each call."""
+
+    def noticed(self, _now: float) -> bool:
+        return True
+
+
 async def test_a_network_that_the_proxy_joins_while_it_runs_counts_at_once(
     make_proxy, make_node, monkeypatch: pytest.MonkeyPatch
 ):
     networks = [ip_network("127.0.5.0/24")]
     monkeypatch.setattr("rosproxy.ros1.context.interface_networks", lambda **_: tuple(networks))
+    monkeypatch.setattr("rosproxy.ros1.context.NetworkChanges", EverythingChanges)
     proxy = await make_proxy(inside_network=())
     talker = await make_node("/talker")
     listener = await make_node("/listener", OTHER_NODE)

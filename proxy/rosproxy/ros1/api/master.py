@@ -159,7 +159,7 @@ class MasterApi:
         while the calls are on their way. If the caller goes away meanwhile, the master is told
         nothing.
         """
-        self._context.refresh_networks(request.caller.address)
+        self._context.refresh_networks()
         outcomes = list[CallOutcome]()
         pending = list[Endpoint]()
         try:

@@ -95,10 +95,10 @@ class Callers:
 
     def _client_kind(self, source: str) -> ClientKind:
         self._context.refresh_networks()
-        if self._context.client_kind(source) is ClientKind.ADMITTED or is_own(source):
+        kind = self._context.client_kind(source)
+        if kind is not ClientKind.ADMITTED and is_own(source):
             return ClientKind.ADMITTED
-        self._context.refresh_networks(source)
-        return self._context.client_kind(source)
+        return kind
 
     async def _wait_for_update(self, source: str) -> None:
         """Wait until an operator has selected a source, up to UPDATE_TIMEOUT.

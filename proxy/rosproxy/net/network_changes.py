@@ -1,0 +1,71 @@
+"""Notices that this machine's addresses or routes change: containers join networks at any time.
+
+To read the networks from /proc takes as long as a quarter of a call; the kernel tells of changes
+for the price of one system call (rtnetlink(7)).
+"""
+
+import contextlib
+import socket
+
+LOOK_INTERVAL_S = 5.0
+"""How often the networks count as changed where the kernel does not tell."""
+_ROUTE_FAMILY = 0  # NETLINK_ROUTE (linux/netlink.h), which Python's module lacks
+_GROUPS = 0x1 | 0x10 | 0x40 | 0x100 | 0x400
+"""RTMGRP_LINK, RTMGRP_IPV4_IFADDR, RTMGRP_IPV4_ROUTE, RTMGRP_IPV6_IFADDR and RTMGRP_IPV6_ROUTE
+(linux/rtnetlink.h). Of routes that go with their link the kernel does not tell.
+"""
+_READ_BYTES = 64 * 1024
+
+
+class NetworkChanges:
+    """Says whether the networks may have changed; times are seconds of a monotonic clock."""
+
+    def __init__(self) -> None:
+        self._socket: socket.socket | None = None
+        self._last: float | None = None
+
+    def noticed(self, now: float) -> bool:
+        """Whether the networks may have changed since the last time; True the first time."""
+        if self._socket is not None:
+            return _drain(self._socket)
+        if self._last is None:
+            self._socket = _subscribe()
+        elif now - self._last < LOOK_INTERVAL_S:
+            return False
+        self._last = now
+        return True
+
+    def close(self) -> None:
+        """Notice nothing any more."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _subscribe() -> socket.socket | None:
+    """A socket that the kernel tells of changes; None where it has none, as in gVisor."""
+    with contextlib.suppress(OSError):
+        sock = socket.socket(
+            socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _ROUTE_FAMILY
+        )
+        try:
+            sock.setblocking(False)
+            sock.bind((0, _GROUPS))
+        except OSError:
+            sock.close()
+            raise
+        return sock
+    return None
+
+
+def _drain(sock: socket.socket) -> bool:
+    """Take what the kernel has told; whether it has told anything."""
+    has_told = False
+    while True:
+        try:
+            sock.recv(_READ_BYTES)
+        except BlockingIOError:
+            return has_told
+        except OSError:  # more has changed than the socket could hold (ENOBUFS)
+            return True
+        has_told = True
