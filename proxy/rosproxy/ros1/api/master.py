@@ -120,6 +120,8 @@ class MasterApi:
             # rosmaster would shut it down for its new URI (registrations.py, _register_node_api).
             await self._recovery.ensure()
             await self._services.find_for(request)
+        elif self._access.idle:
+            return await self._context.upstream.pass_to_master(request.body)
         replies = await self._access.judge_request(request)
         if request.plain and not any(replies) and not self._access.has_to_read_reply(request):
             return await self._context.upstream.pass_to_master(request.body)
