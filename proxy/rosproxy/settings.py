@@ -255,16 +255,15 @@ class Settings:
         DataPlane,
         Option(
             "How topics are forwarded. `kernel`: by the kernel. `splice`, `copy`: by the "
-            "proxy. `auto`: by the kernel if possible, else as `splice`. See [Data "
-            "plane](#data-plane) in the reference of options."
+            "proxy. `auto`: by the kernel if possible, else as `splice`. See "
+            "[docs/reference/options.md](#data-plane)."
         ),
     ] = "auto"
     max_lease_call: Annotated[
         int,
         Option(
-            "Longest call from outside to a node, with 10,000 XML elements for each MiB. For "
-            "the bounds of this option and the next five, see "
-            "[docs/reference/limits.md](limits.md).",
+            "Longest call from outside to a node, with 10,000 XML elements for each MiB. "
+            "[docs/reference/limits.md](limits.md) explains this option and the next five.",
             kinds.MEBIBYTES,
         ),
     ] = 1
@@ -286,8 +285,8 @@ class Settings:
     max_buffered: Annotated[
         int,
         Option(
-            "Memory for all calls and replies that the proxy is reading. One source gets at "
-            "most half of this memory.",
+            "Memory for all calls and replies that the proxy is reading. A source gets at most "
+            "half of this memory.",
             kinds.MEBIBYTES,
         ),
     ] = 32
@@ -295,7 +294,7 @@ class Settings:
         int,
         Option(
             "Most connections from one address. Behind NAT or Docker's port proxy, many "
-            "machines share one address.",
+            "machines have the same address.",
             kinds.CONNECTIONS,
         ),
     ] = 4096
@@ -318,8 +317,8 @@ class Settings:
         Option(
             "ROS 2: outside host to which the proxy announces inside participants, at the "
             "well-known ports of the host's first participants (at least 32). Or another "
-            "proxy, with the first port of that proxy's range: possible with a single domain "
-            "only. Repeatable.",
+            "proxy, with the first port of that proxy's range; then this proxy can serve a "
+            "single domain only. Repeatable.",
             kinds.PEER,
             variables=("ROSPROXY_ROS2_PEERS",),
             repeatable=True,
@@ -382,7 +381,7 @@ class Settings:
     def _check_ros2(self) -> None:
         count = len(self.domains)
         if len(self.port_range) < LEAST_PER_DOMAIN * count:
-            text = f"{self.port_range} is too short: each of {count} domains needs"
+            text = f"{self.port_range} is too small: each of {count} domains needs"
             raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
         # An announcement need not name its domain, so that one port can serve one domain alone.
         fix = "start a proxy for each domain"

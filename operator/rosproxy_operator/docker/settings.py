@@ -112,7 +112,7 @@ class PlanSettings:
     udp: Annotated[
         bool,
         Option(
-            "Proxies of both directions also publish their ports for UDP, so that "
+            "Proxies with the direction `both` also publish their ports for UDP, so that "
             "[UDPROS](../guide/docker.md#udpros) from outside nodes reaches containers."
         ),
     ] = False
@@ -167,7 +167,7 @@ class PlanSettings:
     allow_data_plane: Annotated[
         tuple[DataPlane, ...],
         Option(
-            "Data plane that labels may ask for. The one of `--data-plane` is always allowed. "
+            "Data plane that labels may ask for. The value of `--data-plane` is always allowed. "
             "Repeatable.",
             repeatable=True,
             default="all but kernel",
@@ -177,8 +177,8 @@ class PlanSettings:
         int,
         Option(
             "Most memory of each proxy, such as `512m` or `1g`: at least 64m, or 0 for no "
-            "bound. A thousand connections at full rate take 0.2 GiB. Where the kernel counts "
-            "socket buffers, too (cgroup v2), they take 0.8 GiB.",
+            "bound. A thousand connections at full rate take 0.2 GiB, or 0.8 GiB if the kernel "
+            "counts socket buffers, too (cgroup v2).",
             option_values.MEMORY,
             default="1g",
         ),
@@ -187,8 +187,8 @@ class PlanSettings:
         int,
         Option(
             "Most threads and processes of each proxy: at least 256, or 0 for no bound. A "
-            "connection takes one or two. The default is for 4,000 connections that carry data "
-            "both ways.",
+            "connection takes one or two threads. The default is enough for 4,000 connections "
+            "that carry data both ways.",
             option_values.PIDS,
         ),
     ] = 8192
