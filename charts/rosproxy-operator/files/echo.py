@@ -1,4 +1,4 @@
-"""Inside, in a labelled pod: sends back what it receives."""
+"""The inside node, in a labelled pod: sends each message back."""
 
 import os
 import sys

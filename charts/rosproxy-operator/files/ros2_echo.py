@@ -1,4 +1,4 @@
-"""In a labelled pod: sends back what it receives, and on which node it is."""
+"""The node in a labelled pod that sends each message back, with the name of the cluster's node."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""In a labelled pod: sends a message to a node in another one, and waits for the answer."""
+"""The test in a labelled pod: sends a message to a node in another pod, and waits for the answer."""
 
 import os
 import sys
@@ -26,7 +26,7 @@ def fail(what, advice):
 
 
 def wait_for_answer():
-    """On which node the answer comes from; None if none has come in time."""
+    """Return the cluster's node from which the answer comes; None if no answer comes in time."""
     question = uuid.uuid4().hex
     found = []
     questions = node.create_publisher(String, ECHO + "/ping", 10)

@@ -1,4 +1,4 @@
-"""Outside: a node that is not proxied sends a message to one that is, and waits for the answer."""
+"""The outside node: sends a message to the node behind the proxy, and waits for the answer."""
 
 import os
 import re
@@ -16,7 +16,7 @@ DEADLINE = STARTED + float(os.environ["TIMEOUT"])
 HOST = os.environ.get(os.environ["MASTER_HOST_VARIABLE"]) or os.environ["MASTER_NAME"]
 os.environ["ROS_MASTER_URI"] = "http://%s:11311" % ("[%s]" % HOST if ":" in HOST else HOST)
 
-import rosgraph  # noqa: E402 - they read ROS_MASTER_URI
+import rosgraph  # noqa: E402 - these modules read ROS_MASTER_URI
 import rospy  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
@@ -26,7 +26,7 @@ def say(text):
 
 
 def wait_for(found, what, advice):
-    """Wait until something is found, and return it; give up with an advice."""
+    """Return the first result that is not empty; after the deadline, fail with an advice."""
     why = ""
     while time.monotonic() < DEADLINE:
         try:
@@ -42,7 +42,7 @@ def wait_for(found, what, advice):
 
 
 def proxied_address():
-    """Where outside finds the echo node; each proxy notes its ports in a parameter."""
+    """Return the address of the echo node at a proxy. Each proxy notes the ports in a parameter."""
     uri = urlsplit(master.lookupNode(ECHO))
     noted = "\n".join(map(str, master.getParam("/rosproxy").values()))
     return uri.netloc if re.search(r"^%s /" % uri.port, noted, re.MULTILINE) else None
