@@ -199,7 +199,7 @@ class PlanSettings:
         Option(
             "File with the secret from which the operator makes the tokens of the proxies: at "
             "least 32 characters (`openssl rand -hex 32`). If the secret changes, the operator "
-            "makes the proxies anew on the same ports, and the nodes keep running.",
+            "recreates the proxies on the same ports, and the nodes keep running.",
             option_values.SECRET,
             name="--secret-file",
             default="a random secret, kept as a label of the uplink network",
