@@ -60,7 +60,7 @@ class PlanSettings:
             "Name or address under which outside nodes and masters reach this host. Required "
             "unless the operator runs in the host's network.",
             kinds.HOST,
-            default="the host's address towards the master",
+            default="the address from which this host reaches the master",
         ),
     ] = None
     ports: Annotated[
@@ -89,7 +89,7 @@ class PlanSettings:
     proxy_image: Annotated[
         str,
         Option(
-            "Image of the proxies. When this name stands for a new image, the operator "
+            "Image of the proxies. When the engine has a new image under this name, the operator "
             "replaces the proxies, one after the other.",
             IMAGE,
         ),
@@ -97,7 +97,7 @@ class PlanSettings:
     data_plane: Annotated[
         DataPlane,
         Option(
-            "How proxies forward topics, for containers without a label about the data plane. "
+            "How proxies forward topics, for containers without the label `rosproxy.data-plane`. "
             "With `kernel`, the proxies get the capability NET_ADMIN."
         ),
     ] = "auto"
@@ -105,8 +105,8 @@ class PlanSettings:
         Direction,
         Option(
             "`both`: inside nodes reach outside nodes through the proxy, too. A proxy with a "
-            "container on an internal network always does `both`, unless the container's label "
-            "says `out`."
+            "container on an internal network always has the direction `both`, unless the "
+            "container's label says `out`."
         ),
     ] = "out"
     udp: Annotated[
@@ -234,7 +234,7 @@ class PlanSettings:
             "ROS 2: this host's IPv4 address on the LAN whose multicast the [LAN "
             "relays](../guide/docker.md#ros-2) receive. `none`: no LAN relays.",
             option_values.LAN,
-            default="the advertised address, else the address towards distant hosts",
+            default="the advertised address, else the address on the default route",
         ),
     ] = ""
     expose_by_default: Annotated[
