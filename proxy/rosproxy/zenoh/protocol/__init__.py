@@ -1,0 +1,1 @@
+"""What rmw_zenoh and zenoh's routers tell, as data."""

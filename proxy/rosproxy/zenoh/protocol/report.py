@@ -1,0 +1,90 @@
+"""What the router process tells the proxy: a line of JSON for each look at the routers.
+
+A router describes itself in zenoh's admin space at ``@/ZID/router``; the report keeps the sessions
+of this description. The router process bounds a report, and the proxy bounds the line.
+"""
+
+from typing import NamedTuple
+
+import msgspec
+
+from rosproxy.net.addresses import HostPort, parse_authority
+
+LONGEST_REPORT = 16 * 1024 * 1024
+"""Bytes of a line. All sessions that routers accept, and all tokens, take some 10 MB."""
+MOST_TOKENS = 8192
+"""Tokens in a report. A host with fifty nodes has some 1,000."""
+MOST_SESSIONS = 1000
+"""Sessions that a router accepts: its setting ``transport/unicast/max_sessions``."""
+
+
+class Link(msgspec.Struct, frozen=True):
+    """A connection of a session, with both ends as ``tcp/address:port``."""
+
+    src: str = ""
+    dst: str = ""
+
+
+class RouterSession(msgspec.Struct, frozen=True):
+    """A session of a router: the zenoh ID and the mode of the other end."""
+
+    peer: str = ""
+    whatami: str = ""
+    links: tuple[Link, ...] = ()
+
+
+class RouterReport(msgspec.Struct, frozen=True):
+    """A router: its zenoh ID and its sessions."""
+
+    zid: str
+    sessions: tuple[RouterSession, ...] = ()
+
+
+class Report(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A report: the routers in the order of their configurations, and the liveliness tokens.
+
+    ``tokens`` is None if nothing has changed since the last report. ``tokens_left_out`` counts
+    tokens above the bound. If ``error`` is set, the routers do not run, and it says why.
+    """
+
+    routers: tuple[RouterReport, ...] = ()
+    tokens: tuple[str, ...] | None = None
+    tokens_left_out: int = 0
+    error: str = ""
+
+
+class Ends(NamedTuple):
+    """The two ends of a session, as the router sees them."""
+
+    local: HostPort
+    remote: HostPort
+
+
+def read_report(line: bytes) -> Report:
+    """The report in a line. Raises ValueError."""
+    try:
+        return msgspec.json.decode(line, type=Report)
+    except msgspec.MsgspecError as error:
+        raise ValueError(f"a report that is not valid: {error}") from None
+
+
+def write_report(report: Report) -> bytes:
+    """A line with a report."""
+    return msgspec.json.encode(report) + b"\n"
+
+
+def ends_of(session: RouterSession) -> Ends | None:
+    """The two ends of the first link of a session; None if the session has no link of TCP."""
+    for link in session.links:
+        local = _end(link.src)
+        remote = _end(link.dst)
+        if local and remote:
+            return Ends(local, remote)
+    return None
+
+
+def _end(locator: str) -> HostPort | None:
+    """The address and port of a locator such as ``tcp/192.0.2.7:7447?prio=1-7``."""
+    protocol, _, rest = locator.partition("/")
+    address = rest.partition("?")[0].partition("#")[0]
+    return parse_authority(f"//{address}") if protocol in ("tcp", "tls", "quic") else None

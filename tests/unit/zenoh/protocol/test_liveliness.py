@@ -1,0 +1,85 @@
+"""Liveliness tokens: what rmw_zenoh writes is read, and nothing else raises or is taken for it."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.zenoh.protocol.liveliness import (
+    LONGEST_TOKEN,
+    Entity,
+    EntityKind,
+    ZenohNode,
+    nodes_of,
+    parse_token,
+)
+
+ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
+HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+STRING = "std_msgs::msg::dds_::String_"
+NODE = f"@ros2_lv/0/{ZID}/0/0/NN/%/%/talker"
+PUBLISHER = f"@ros2_lv/0/{ZID}/0/10/MP/%/%/talker/%chatter/{STRING}/{HASH}/::,10:,:,:,,"
+NAME = st.from_regex(r"[a-z][a-z0-9_]{0,9}", fullmatch=True)
+NAMES = st.lists(NAME, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(parts))
+
+
+def test_a_node_and_its_publisher() -> None:
+    assert parse_token(NODE) == Entity(0, ZID, 0, EntityKind.NODE, "/talker")
+    publisher = Entity(0, ZID, 0, EntityKind.PUBLISHER, "/talker", "/chatter")
+    assert parse_token(PUBLISHER) == publisher
+
+
+@given(
+    st.integers(0, 232),
+    st.text("0123456789abcdef", min_size=1, max_size=32),
+    st.sampled_from([kind for kind in EntityKind if kind is not EntityKind.NODE]),
+    st.one_of(st.just(""), NAMES),
+    NAME,
+    NAMES,
+)
+def test_what_rmw_zenoh_writes_is_read(
+    domain: int, session: str, kind: EntityKind, namespace: str, node: str, topic: str
+) -> None:
+    mangled = namespace.replace("/", "%") or "%"
+    named = topic.replace("/", "%")
+    key = (
+        f"@ros2_lv/{domain}/{session}/3/4/{kind.value}/%/{mangled}/{node}/{named}/T_/H/::,1:,:,:,,"
+    )
+    assert parse_token(key) == Entity(domain, session, 3, kind, f"{namespace}/{node}", topic)
+
+
+@given(st.one_of(st.text(), st.lists(st.text(max_size=8), min_size=8, max_size=14).map("/".join)))
+def test_any_other_key_is_none(key: str) -> None:
+    assert parse_token(key) is None
+
+
+@given(st.integers(0, len(PUBLISHER)), st.text(max_size=3))
+def test_a_changed_token_never_raises(place: int, text: str) -> None:
+    entity = parse_token(PUBLISHER[:place] + text + PUBLISHER[place + 1 :])
+    assert entity is None or entity.kind in EntityKind
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        NODE.replace("/0/", "/x/", 1),
+        NODE.replace("/0/", "/" + "9" * 5000 + "/", 1),
+        NODE.replace(ZID, "x" * 32),
+        NODE.replace("NN", "MP"),
+        PUBLISHER.replace("MP", "NN"),
+        PUBLISHER.replace("MP", "XX"),
+        PUBLISHER.replace("%chatter", "x" * LONGEST_TOKEN),
+        PUBLISHER.replace("%chatter", ""),
+    ],
+)
+def test_what_is_no_token(key: str) -> None:
+    assert parse_token(key) is None
+
+
+def test_entities_become_nodes() -> None:
+    keys = [NODE, PUBLISHER, PUBLISHER.replace("MP", "MS"), PUBLISHER.replace("MP", "SC")]
+    keys.append(NODE.replace("/0/", "/5/", 1))
+    entities = [entity for key in keys if (entity := parse_token(key))]
+    assert nodes_of(reversed(entities)) == (
+        ZenohNode(0, ZID, "/talker", ("/chatter",), ("/chatter",), ()),
+        ZenohNode(5, ZID, "/talker", (), (), ()),
+    )

@@ -1,0 +1,58 @@
+"""Reports of the router process: read as written, and nothing raises but ValueError."""
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.zenoh.protocol.report import (
+    Ends,
+    Link,
+    Report,
+    RouterReport,
+    RouterSession,
+    ends_of,
+    read_report,
+    write_report,
+)
+
+ADMIN_SPACE = b"""{"routers": [{"zid": "e5e8", "locators": ["tcp/127.0.0.1:7448"], "sessions": [
+  {"links": [{"dst": "tcp/172.18.0.3:60546", "src": "tcp/172.18.0.2:7448"}], "peer": "86c4",
+   "shm": true, "weight": null, "whatami": "peer"}], "version": "v1.7.2"}]}"""
+"""What a router of zenoh 1.7.2 says of itself, in a report."""
+
+
+def test_what_a_router_says_of_itself_is_read() -> None:
+    (router,) = read_report(ADMIN_SPACE).routers
+    (session,) = router.sessions
+    assert (router.zid, session.peer, session.whatami) == ("e5e8", "86c4", "peer")
+    assert ends_of(session) == Ends(HostPort("172.18.0.2", 7448), HostPort("172.18.0.3", 60546))
+
+
+def test_a_report_is_read_as_written() -> None:
+    session = RouterSession("ab", "client", (Link("tcp/[::1]:7448", "tcp/[::1]:5"),))
+    report = Report((RouterReport("cd", (session,)),), ("a", "b"), 3)
+    line = write_report(report)
+    assert line.endswith(b"\n")
+    assert read_report(line) == report
+    assert read_report(write_report(Report())).tokens is None
+
+
+@pytest.mark.parametrize("locator", ["unixpipe/x", "tcp/", "tcp/1.2.3.4", "tcp/1.2.3.4:0", "x"])
+def test_a_session_without_a_link_of_tcp_has_no_ends(locator: str) -> None:
+    assert ends_of(RouterSession("a", "peer", (Link(locator, locator),))) is None
+
+
+def test_what_follows_an_address_does_not_count() -> None:
+    link = Link("tcp/1.2.3.4:5?prio=1-7", "tcp/1.2.3.5:6#iface=eth0")
+    ends = Ends(HostPort("1.2.3.4", 5), HostPort("1.2.3.5", 6))
+    assert ends_of(RouterSession("a", "peer", (link,))) == ends
+
+
+@given(
+    st.one_of(st.binary(), st.recursive(st.none() | st.text(), st.lists).map(msgspec.json.encode))
+)
+def test_anything_else_is_a_value_error(line: bytes) -> None:
+    with pytest.raises(ValueError, match=r"not valid"):
+        read_report(line)
