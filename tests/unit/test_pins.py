@@ -6,7 +6,7 @@ import pytest
 from scripts.pins import ROOT, pins
 
 EXTRAS = (
-    *("uvloop", "docker", "kubernetes", "operator"),
+    *("uvloop", "zenoh", "docker", "kubernetes", "operator"),
     *("bench", "dev", "docs", "release", "build-system"),
 )
 

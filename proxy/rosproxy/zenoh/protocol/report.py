@@ -68,6 +68,14 @@ def read_report(line: bytes) -> Report:
         raise ValueError(f"a report that is not valid: {error}") from None
 
 
+def read_router(description: bytes) -> RouterReport:
+    """What a router says of itself in the admin space. Raises ValueError."""
+    try:
+        return msgspec.json.decode(description, type=RouterReport)
+    except msgspec.MsgspecError as error:
+        raise ValueError(f"a router's description that is not valid: {error}") from None
+
+
 def write_report(report: Report) -> bytes:
     """A line with a report."""
     return msgspec.json.encode(report) + b"\n"

@@ -1,0 +1,149 @@
+"""Keeps the router process alive: starts it, takes its reports, and starts it again after its end.
+
+Nodes of rmw_zenoh dial a router again 1, 3, 7 and 11 seconds after the connection has ended. So if
+the routers are back within a second, the first of these tries succeeds. A process without reports
+counts as hung, and the proxy kills it.
+"""
+
+import asyncio
+import contextlib
+import json
+import logging
+import signal
+import sys
+from asyncio.subprocess import PIPE, Process
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from rosproxy.net.tasks import Tasks
+from rosproxy.telemetry.text import brief
+from rosproxy.zenoh.protocol.report import LONGEST_REPORT, Report, read_report
+from rosproxy.zenoh.router_configs import RouterConfig
+
+log = logging.getLogger(__name__)
+
+REPORT_TIMEOUT_S = 10.0
+"""Time without a report after which the process counts as hung."""
+START_TIMEOUT_S = 30.0
+"""Time to the first report of the first process."""
+LEAST_START_INTERVAL_S = 1.0
+"""A process that has lived longer starts again at once."""
+MOST_LOG_LINES = 20
+"""Lines of the library's own log that the proxy logs, for each process."""
+LONGEST_LOG_LINE = 300
+_Stream = TypeVar("_Stream")
+PROGRAM = (sys.executable, "-m", "rosproxy.zenoh.router_process")
+
+
+class RoutersFailed(Exception):
+    """The routers do not run; the text says why."""
+
+
+class RouterKeeper:
+    """The router process of a proxy.
+
+    ``failure`` says why no routers run; it is empty while they do. ``restarts`` counts the
+    processes that have ended.
+    """
+
+    def __init__(
+        self,
+        tasks: Tasks,
+        configs: Sequence[RouterConfig],
+        take_report: Callable[[Report], None],
+        program: Sequence[str] = PROGRAM,
+    ) -> None:
+        self._tasks = tasks
+        self._configs = json.dumps(configs).encode() + b"\n"
+        self._take_report = take_report
+        self._program = program
+        self._changed = asyncio.Event()
+        self.failure = "the routers have not started yet"
+        self.restarts = 0
+
+    async def start(self) -> None:
+        """Start the process, and wait until the routers run. Raises RoutersFailed."""
+        self._tasks.spawn(self._keep_running(), "running the zenoh routers")
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(START_TIMEOUT_S):
+                await self._changed.wait()
+        if self.failure:
+            raise RoutersFailed(self.failure)
+
+    async def _keep_running(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            began = loop.time()
+            self.failure = await self._run_once()
+            self._changed.set()
+            self.restarts += 1
+            log.error("zenoh routers ended: %s; starting the routers again", self.failure)
+            await asyncio.sleep(max(began + LEAST_START_INTERVAL_S - loop.time(), 0.0))
+
+    async def _run_once(self) -> str:
+        """Run a process to its end; returns the reason of the end."""
+        process = await asyncio.create_subprocess_exec(
+            *self._program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT
+        )
+        logging_task = self._tasks.spawn(
+            _log_lines(_piped(process.stderr)), "reading the log of routers"
+        )
+        try:
+            _piped(process.stdin).write(self._configs)
+            return await self._read_reports(process)
+        finally:
+            # Zenoh's own end of a session may hang. Nodes see the end of the connections alike.
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+            logging_task.cancel()
+
+    async def _read_reports(self, process: Process) -> str:
+        """Take reports until there are no more; returns the reason."""
+        reports = _piped(process.stdout)
+        while True:
+            try:
+                async with asyncio.timeout(REPORT_TIMEOUT_S):
+                    line = await reports.readline()
+                if not line:
+                    return _exit_reason(await process.wait())
+                report = read_report(line)
+            except TimeoutError:
+                return f"no report for {REPORT_TIMEOUT_S:g} s"
+            except ValueError as error:  # not valid, or longer than the limit
+                return brief(error, LONGEST_LOG_LINE)
+            if report.error:
+                return brief(report.error, LONGEST_LOG_LINE)
+            self._take_report(report)
+            self.failure = ""
+            self._changed.set()
+
+
+def _piped(stream: _Stream | None) -> _Stream:
+    """A stream of a process that was started with pipes."""
+    if stream is None:
+        raise ValueError("the process has no such pipe")
+    return stream
+
+
+def _exit_reason(status: int) -> str:
+    if status >= 0:
+        return f"the process ended with status {status}"
+    return f"the process was ended by {signal.Signals(-status).name}"
+
+
+async def _log_lines(stream: asyncio.StreamReader) -> None:
+    """Log what the library prints, up to a bound, and read the rest."""
+    count = 0
+    while line := await _read_line(stream):
+        count += 1
+        if count <= MOST_LOG_LINES:
+            log.warning("zenoh: %s", brief(line.decode(errors="replace").strip(), LONGEST_LOG_LINE))
+
+
+async def _read_line(stream: asyncio.StreamReader) -> bytes:
+    """The next line, or a part of a line that is too long; empty at the end."""
+    try:
+        return await stream.readline()
+    except ValueError:  # asyncio has dropped the line (streams.py, StreamReader.readline)
+        return b"(a line that is too long)"

@@ -1,0 +1,105 @@
+"""The router process: started again after its end, killed if it hangs, with the reason told.
+
+Small programs stand in for the router process, which needs the zenoh library.
+"""
+
+import asyncio
+import os
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from rosproxy.net.tasks import Tasks
+from rosproxy.zenoh import router_keeper
+from rosproxy.zenoh.protocol.report import Report
+from rosproxy.zenoh.router_keeper import RouterKeeper, RoutersFailed
+from tests.integration.net import until
+
+REPORTS = """
+import os, sys, time
+config = sys.stdin.readline()
+while True:
+    print('{"tokens": ["%d"]}' % os.getpid(), flush=True)
+    time.sleep(0.05)
+"""
+FAILS = """
+print('{"error": "Can not create a new TCP listener: Address already in use"}', flush=True)
+"""
+HANGS = "import time; time.sleep(60)"
+TALKS = 'print("no report", flush=True)'
+ENDS = "import sys; sys.stderr.write('thread panicked\\n'); sys.exit(3)"
+
+
+class Kept:
+    """A keeper with a small program as its process."""
+
+    def __init__(self, tasks: Tasks, program: str) -> None:
+        self.reports: list[Report] = []
+        command = (sys.executable, "-c", program)
+        self.keeper = RouterKeeper(tasks, [{"mode": '"router"'}], self.reports.append, command)
+
+    @property
+    def pid(self) -> int:
+        """The process of the last report."""
+        (pid,) = self.reports[-1].tokens or ()
+        return int(pid)
+
+
+@pytest.fixture
+async def tasks() -> AsyncIterator[Tasks]:
+    tasks = Tasks()
+    yield tasks
+    await tasks.cancel()
+
+
+async def test_reports_are_taken_and_the_process_ends_with_the_tasks(tasks: Tasks) -> None:
+    kept = Kept(tasks, REPORTS)
+    await kept.keeper.start()
+    assert (kept.keeper.failure, kept.keeper.restarts) == ("", 0)
+    pid = kept.pid
+    await tasks.cancel()
+    assert not Path(f"/proc/{pid}").exists()
+
+
+async def test_a_process_that_is_killed_starts_again(
+    tasks: Tasks, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = Kept(tasks, REPORTS)
+    await kept.keeper.start()
+    first = kept.pid
+    os.kill(first, 9)
+    await until(lambda: kept.pid != first, "another process reports")
+    assert kept.keeper.restarts == 1
+    assert kept.keeper.failure == ""
+    assert "zenoh routers ended: the process was ended by SIGKILL" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        (FAILS, "Can not create a new TCP listener: Address already in use"),
+        (HANGS, "no report for 0.2 s"),
+        (TALKS, "a report that is not valid"),
+        (ENDS, "the process ended with status 3"),
+    ],
+)
+async def test_the_reason_of_a_failed_start_is_told(
+    tasks: Tasks, program: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if program is HANGS:
+        monkeypatch.setattr(router_keeper, "REPORT_TIMEOUT_S", 0.2)
+    with pytest.raises(RoutersFailed, match=reason):
+        await Kept(tasks, program).keeper.start()
+
+
+async def test_what_the_library_prints_is_logged_up_to_a_bound(
+    tasks: Tasks, caplog: pytest.LogCaptureFixture
+) -> None:
+    program = "import sys\nfor _ in range(99): print('panic\\x1b', file=sys.stderr)\n" + REPORTS
+    await Kept(tasks, program).keeper.start()
+    await until(lambda: "zenoh: panic" in caplog.text, "a line is logged")
+    await asyncio.sleep(0.1)
+    assert caplog.text.count("zenoh: panic") == router_keeper.MOST_LOG_LINES
+    assert "\x1b" not in caplog.text

@@ -1,0 +1,49 @@
+"""The configurations of the routers: which router listens where, and which router dials which."""
+
+import json
+
+import pytest
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.zenoh.router_configs import RouterConfig, router_configs
+
+PORTS = PortRange(7448, 7449)
+
+
+def endpoints(config: RouterConfig, key: str) -> list[str]:
+    given = json.loads(config[f"{key}/endpoints"])
+    assert isinstance(given, list)
+    return given
+
+
+def test_a_router_for_each_port_and_a_hub_that_dials_all() -> None:
+    peers = (HostPort("robot", 7447), HostPort("fd00::7", 7448))
+    *routers, hub = router_configs("0.0.0.0", PORTS, None, peers)
+    assert [endpoints(router, "listen") for router in routers] == [
+        ["tcp/0.0.0.0:7448"],
+        ["tcp/0.0.0.0:7449"],
+    ]
+    assert [endpoints(router, "connect") for router in routers] == [[], []]
+    assert endpoints(hub, "listen") == []
+    own = ["tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"]
+    assert endpoints(hub, "connect") == [*own, "tcp/robot:7447", "tcp/[fd00::7]:7448"]
+
+
+@pytest.mark.parametrize(
+    ("bind", "listens", "dialed"),
+    [
+        ("::", "tcp/[::]:7447", "tcp/[::1]:7448"),
+        ("172.18.0.2", "tcp/172.18.0.2:7447", "tcp/172.18.0.2:7448"),
+    ],
+)
+def test_the_hub_reaches_routers_at_the_bound_address(bind: str, listens: str, dialed: str) -> None:
+    hub = router_configs(bind, PORTS, 7447, ())[-1]
+    assert endpoints(hub, "listen") == [listens]
+    assert endpoints(hub, "connect")[0] == dialed
+
+
+def test_every_value_is_json() -> None:
+    for config in router_configs("0.0.0.0", PORTS, 7447, ()):
+        assert config["mode"] == '"router"'
+        assert {key: json.loads(value) for key, value in config.items()}
