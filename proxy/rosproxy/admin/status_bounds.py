@@ -19,7 +19,12 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rosproxy.admin.status_document import DomainStatus, PolicyStatus, ProxyStatus
+from rosproxy.admin.status_document import (
+    DomainStatus,
+    PolicyStatus,
+    ProxyStatus,
+    ZenohStatus,
+)
 from rosproxy.net.addresses import parse_authority
 
 MOST_BYTES = 1024 * 1024
@@ -30,7 +35,7 @@ _MOST_LISTS = 8
 """Lists of a row at most."""
 _COUNTERS = 4096
 """The same for all counters that belong to no row."""
-_FIRST = ("nodes", "inside", "outside", "stand_ins", "udpros", "layers", "peers")
+_FIRST = ("nodes", "inside", "outside", "sessions", "stand_ins", "udpros", "layers", "peers")
 """Tables whose rows an owner keeps before those of the other tables."""
 _NOT_COUNTED = "types"
 """The list whose entries ``left_out`` does not count: each entry belongs to a name."""
@@ -75,6 +80,8 @@ def left_out(status: ProxyStatus) -> int:
     for domain in status.domains:
         counts += [domain.left_out, domain.mismatches_left_out]
         counts += [participant.left_out for participant in (*domain.inside, *domain.outside)]
+    zenoh = status.zenoh or ZenohStatus()
+    counts += [zenoh.left_out, *(node.left_out for node in zenoh.nodes)]
     return sum(counts)
 
 
@@ -165,8 +172,14 @@ def _visit_tables(status: ProxyStatus, visit: VisitTable) -> ProxyStatus:
         )
         for domain in status.domains
     )
+    zenoh = status.zenoh and _with_tables(
+        status.zenoh,
+        visit,
+        sessions=lambda session: _host(f"//{session.remote}"),
+        nodes=lambda node: node.address,
+    )
     return _with_tables(
-        msgspec.structs.replace(status, policy=policy, domains=domains),
+        msgspec.structs.replace(status, policy=policy, domains=domains, zenoh=zenoh),
         visit,
         nodes=lambda node: _host(f"//{node.address}"),
         stand_ins=lambda stand_in: _host(stand_in.uri),

@@ -340,12 +340,66 @@ class DomainStatus(msgspec.Struct, frozen=True):
     left_out: Count = 0
 
 
+class ZenohLinkStatus(msgspec.Struct, frozen=True):
+    """A link of the hub router to a router outside, ``peer``; ``since``: how long it is so.
+
+    ``error``: why the link is not up, one of `rosproxy.zenoh.links.LinkFault`.
+    """
+
+    peer: str = ""
+    up: bool = False
+    error: str = ""
+    since: Seconds = 0.0
+
+
+class ZenohSessionStatus(msgspec.Struct, frozen=True):
+    """A session of a router of the proxy: both addresses, and the mode of the other end.
+
+    ``port`` is that of the router; None: the hub. ``mode``: client, peer or router.
+    """
+
+    port: Count | None = None
+    mode: str = ""
+    zid: str = ""
+    local: str = ""
+    remote: str = ""
+
+
+class ZenohNodeStatus(msgspec.Struct, frozen=True):
+    """A node of rmw_zenoh; ``address`` is empty if the node is beyond a router outside."""
+
+    name: str = ""
+    domain: Count = 0
+    address: str = ""
+    publishes: Names = ()
+    subscribes: Names = ()
+    services: Names = ()
+    left_out: Count = 0
+
+
+class ZenohStatus(msgspec.Struct, frozen=True):
+    """The routers for rmw_zenoh: ports for containers, and the port ``listen`` for outside.
+
+    ``failure``: why the routers do not run. ``restarts``: how often they have ended.
+    """
+
+    ports: str = ""
+    listen: Count | None = None
+    failure: str = ""
+    restarts: Count = 0
+    links: tuple[ZenohLinkStatus, ...] = ()
+    sessions: tuple[ZenohSessionStatus, ...] = ()
+    nodes: tuple[ZenohNodeStatus, ...] = ()
+    left_out: Count = 0
+
+
 class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
     ``instance`` differs after each start; ``retired``: it registers nothing any more;
     ``range_probe`` is None before the first try; ``stand_ins`` are the ports that stand in for
-    nodes outside; ``udpros`` the subscriptions by UDPROS; ``domains`` those of ROS 2.
+    nodes outside; ``udpros`` the subscriptions by UDPROS; ``domains`` those of ROS 2; ``zenoh`` the
+    routers for rmw_zenoh, None without any.
     """
 
     version: str = ""
@@ -363,6 +417,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     policy: PolicyStatus | None = None
     nodes: tuple[EndpointStatus, ...] = ()
     domains: tuple[DomainStatus, ...] = ()
+    zenoh: ZenohStatus | None = None
     problems: tuple[ProblemStatus, ...] = ()
     left_out: Count = 0
 

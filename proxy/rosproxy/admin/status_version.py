@@ -8,7 +8,7 @@ import hashlib
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxyStatus
+from rosproxy.admin.status_document import DomainStatus, EndpointStatus, ProxyStatus, ZenohStatus
 
 
 def version_of(status: ProxyStatus) -> str:
@@ -20,6 +20,7 @@ def version_of(status: ProxyStatus) -> str:
         status.master.error,
         [_node(node) for node in status.nodes],
         [_domain(domain) for domain in status.domains],
+        _zenoh(status.zenoh) if status.zenoh else None,
         sorted((problem.subject, problem.text) for problem in status.problems),
         replace(status.range_probe, age=0.0) if status.range_probe else None,
     )
@@ -42,3 +43,8 @@ def _domain(domain: DomainStatus) -> object:
         for participant in domain.inside
     ]
     return domain.domain, inside
+
+
+def _zenoh(zenoh: ZenohStatus) -> object:
+    links = [(link.peer, link.up, link.error) for link in zenoh.links]
+    return zenoh.failure, links, zenoh.sessions, zenoh.nodes

@@ -36,7 +36,7 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
     ports = settings.ports
     facts = DoctorFacts(
         advertise_host=host,
-        advertised_addresses=tuple(await resolve(host)),
+        advertised_addresses=tuple(await resolve(host)) if host else (),
         is_all_local=not settings.for_ros1 and all(is_loopback(p.host) for p in settings.ros2_peer),
         # The master is not asked for its graph here; None would be reported as its silence.
         graph=SystemState(),

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from rosproxy.admin import status_document as document
 from rosproxy.admin.status_bounds import left_out
 from rosproxy.cli.domain_table import domain_lines
+from rosproxy.cli.zenoh_table import zenoh_lines
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.tables import GAP, besides_first, table
 from rosproxy.telemetry.text import clean, duration, listed, plural, size, wrap
@@ -32,6 +33,8 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
     problems = [*_problems(status, columns)]
     hidden = [*_hidden(status, columns)]
     domains = [line for domain in status.domains for line in domain_lines(domain, columns)]
+    if status.zenoh:
+        domains += zenoh_lines(status.zenoh, columns)
     nodes, brief = (["", *_nodes(status, columns, details)] for details in (True, False))
     if not status.settings.for_ros1:
         nodes = []
@@ -51,18 +54,11 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     yield f"rosproxy {clean(status.version)}, pid {status.pid}, up {duration(status.uptime)}"
     if settings.for_ros1:
         yield f"master   {_master(status.master)}"
-    yield f"ports    {_ports(status)}"
-    if settings.for_ros1 and (plane := status.data_plane):
-        yield f"topics   {_plane(plane)}"
+    yield from _range(status)
     if (policy := status.policy) and policy.layers:
         yield f"policy   {_policy(policy)}"
-    networks = listed(map(clean, settings.inside_networks)) or "none"
-    inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
-    if not settings.for_ros1:
-        inside = f"ROS 2, domain {listed(str(domain.domain) for domain in status.domains)}"
-    selected = settings.selected
-    chosen = "" if selected is None else f", {plural(selected, 'address')} selected"
-    yield f"inside   {inside}, networks {networks}{chosen}"
+    if inside := _inside(status):
+        yield f"inside   {inside}"
     if stand_ins := status.stand_ins:
         yield f"outside  {_stand_ins(stand_ins)}"
     if settings.publish_master:
@@ -71,6 +67,29 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     if missing := left_out(status):
         entries = f"{plural(missing, 'name')} and entries"
         yield f"left out {entries}: /status is bounded, see docs/reference/limits.md"
+
+
+def _range(status: document.ProxyStatus) -> Iterator[str]:
+    """The range and the data plane; rmw_zenoh alone has no range."""
+    if status.ports.listen:
+        yield f"ports    {_ports(status)}"
+    if status.settings.for_ros1 and (plane := status.data_plane):
+        yield f"topics   {_plane(plane)}"
+
+
+def _inside(status: document.ProxyStatus) -> str:
+    """How nodes inside find the proxy; empty if the proxy serves rmw_zenoh alone."""
+    settings = status.settings
+    networks = listed(map(clean, settings.inside_networks)) or "none"
+    selected = settings.selected
+    chosen = "" if selected is None else f", {plural(selected, 'address')} selected"
+    if settings.for_ros1:
+        inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
+    elif status.domains or not status.zenoh:
+        inside = f"ROS 2, domain {listed(str(domain.domain) for domain in status.domains)}"
+    else:
+        return ""
+    return f"{inside}, networks {networks}{chosen}"
 
 
 def _master(master: document.MasterStatus) -> str:

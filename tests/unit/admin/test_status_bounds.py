@@ -16,6 +16,7 @@ from rosproxy.admin.status_bounds import (
     fair_choice,
     fair_shares,
     fair_shares_by_owner,
+    left_out,
 )
 from rosproxy.admin.status_document import (
     ConnectionStatus,
@@ -32,6 +33,9 @@ from rosproxy.admin.status_document import (
     ProxyStatus,
     StandInStatus,
     UdprosStatus,
+    ZenohNodeStatus,
+    ZenohSessionStatus,
+    ZenohStatus,
     parse_status,
 )
 
@@ -155,6 +159,29 @@ def test_every_list_is_bounded_and_hides_nothing_of_others(flood: str) -> None:
     assert set(GOOD_STATUS.policy.layers) <= set(shown.policy.layers)
     assert _rows(shown) + _rows_left_out(shown) == _rows(status)
     assert re.search(rb'left_out":[1-9]', encode(shown))
+
+
+@pytest.mark.parametrize(
+    "flood",
+    [
+        {"nodes": (ZenohNodeStatus("/evil", address=EVIL, publishes=MANY),) * 2},
+        {"nodes": tuple(ZenohNodeStatus(name, address=EVIL) for name in MANY)},
+        {"sessions": (ZenohSessionStatus(zid=LONG, remote=f"{EVIL}:40000"),) * 2000},
+    ],
+)
+def test_what_zenoh_tells_is_bounded(flood: dict[str, Any]) -> None:
+    good_node = ZenohNodeStatus("/good", address=GOOD, publishes=("/scan",))
+    good_session = ZenohSessionStatus(zid="01", remote=f"{GOOD}:40000")
+    flood = {"nodes": (), "sessions": ()} | flood
+    zenoh = ZenohStatus(
+        nodes=(*flood["nodes"], good_node), sessions=(*flood["sessions"], good_session)
+    )
+    shown = bounded(ProxyStatus(zenoh=zenoh))
+    assert 0.5 * MOST_BYTES < len(encode(shown)) <= MOST_BYTES
+    assert shown.zenoh is not None
+    assert good_node in shown.zenoh.nodes
+    assert good_session in shown.zenoh.sessions
+    assert left_out(shown) > 0
 
 
 def _rows(status: ProxyStatus) -> int:

@@ -13,12 +13,15 @@ MEMBER = {
     "address": "10.0.0.6",
     "leases": [{"port": 11401, "datagrams": 3}],
 }
+LINK = {"peer": "robot:7447", "up": True, "since": 3.0}
+ZENOH: dict[str, Any] = {"ports": "7448-7467", "links": [LINK]}
 STATUS: dict[str, Any] = {
     "instance": "a",
     "uptime": 3.0,
     "master": {"up": True, "since": 2.0},
     "nodes": [NODE],
     "domains": [{"domain": 7, "inside": [MEMBER]}],
+    "zenoh": ZENOH,
     "range_probe": {"reached": True, "age": 3.0},
     "problems": [{"age": 1.0, "subject": "master", "text": "refused"}],
 }
@@ -37,6 +40,7 @@ def version(**more: Any) -> str:
         {"domains": [{"domain": 7, "inside": [{**MEMBER, "leases": [{"port": 11401}]}]}]},
         {"problems": [{"age": 9.0, "subject": "master", "text": "refused"}]},
         {"range_probe": {"reached": True, "age": 300.0}},
+        {"zenoh": {**ZENOH, "restarts": 1, "links": [{**LINK, "since": 9.0}]}},
     ],
 )
 def test_what_only_passes_makes_no_version(change: dict[str, Any]) -> None:
@@ -60,6 +64,10 @@ def test_what_only_passes_makes_no_version(change: dict[str, Any]) -> None:
         {"range_probe": {"reached": False}},
         {"range_probe": {"reached": True, "from_proxy": "refused"}},
         {"range_probe": None},
+        {"zenoh": None},
+        {"zenoh": {**ZENOH, "failure": "no report for 10 s"}},
+        {"zenoh": {**ZENOH, "links": [{**LINK, "up": False}]}},
+        {"zenoh": {**ZENOH, "nodes": [{"name": "/talker"}]}},
     ],
 )
 def test_each_change_of_nodes_and_ports_makes_a_version(change: dict[str, Any]) -> None:

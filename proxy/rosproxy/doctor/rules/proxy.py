@@ -144,7 +144,7 @@ def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 
 
 def _ports(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    if facts.status is not None:
+    if facts.status is not None and facts.status.ports.listen:  # rmw_zenoh alone has no range
         yield from few_ports(facts.status.ports)
 
 

@@ -1,0 +1,71 @@
+"""The routers for rmw_zenoh in ``rosproxy status``: links, sessions and nodes."""
+
+from collections.abc import Iterator
+
+from rosproxy.admin.status_document import ZenohLinkStatus, ZenohNodeStatus, ZenohStatus
+from rosproxy.telemetry.tables import GAP, besides_first, table
+from rosproxy.telemetry.text import clean, duration, listed, plural, wrap
+
+SESSIONS_HEADING = ("REMOTE", "MODE", "LOCAL", "ROUTER")
+NODES_HEADING = ("NODE", "DOMAIN", "ADDRESS", "PUB", "SUB", "SRV")
+MOST_LINES = 3
+"""Lines that the topics or services of a node may take, each."""
+INDENT = "    "
+
+
+def zenoh_lines(zenoh: ZenohStatus, columns: int) -> Iterator[str]:
+    """The routers, with each session and each node."""
+    yield ""
+    yield from wrap(_summary(zenoh), columns, INDENT)
+    if zenoh.sessions:
+        rows = [
+            (
+                clean(session.remote),
+                clean(session.mode),
+                clean(session.local),
+                "hub" if session.port is None else f"port {session.port}",
+            )
+            for session in zenoh.sessions
+        ]
+        yield from _table([SESSIONS_HEADING, *rows], 4, columns)
+    if zenoh.nodes:
+        heading, *lines = _table([NODES_HEADING, *map(_node, zenoh.nodes)], 3, columns)
+        yield heading
+        for node, line in zip(zenoh.nodes, lines, strict=True):
+            yield line
+            yield from _details(node, columns)
+
+
+def _summary(zenoh: ZenohStatus) -> str:
+    ended = f", ended {plural(zenoh.restarts, 'time')}" if zenoh.restarts else ""
+    state = f"do not run: {clean(zenoh.failure)}" if zenoh.failure else f"run{ended}"
+    listens = "" if zenoh.listen is None else f"; port {zenoh.listen} for outside"
+    links = listed(map(_link, zenoh.links)) or "none"
+    ports = f"ports {clean(zenoh.ports)} for containers{listens}"
+    return f"zenoh routers {state}; {ports}; links to outside: {links}"
+
+
+def _link(link: ZenohLinkStatus) -> str:
+    state = "up" if link.up else f"DOWN ({clean(link.error)})"
+    return f"{clean(link.peer)} {state} for {duration(link.since)}"
+
+
+def _table(rows: list[tuple[str, ...]], left: int, columns: int) -> list[str]:
+    return table(rows, left, max(columns - besides_first(rows), len(rows[0][0])))
+
+
+def _node(node: ZenohNodeStatus) -> tuple[str, ...]:
+    names = (node.publishes, node.subscribes, node.services)
+    counts = (str(len(listed_names)) for listed_names in names)
+    return (clean(node.name), str(node.domain), clean(node.address) or "outside", *counts)
+
+
+def _details(node: ZenohNodeStatus, columns: int) -> Iterator[str]:
+    for label, text in (
+        ("publishes", GAP.join(map(clean, node.publishes))),
+        ("subscribes", GAP.join(map(clean, node.subscribes))),
+        ("services", GAP.join(map(clean, node.services))),
+        ("not shown", plural(node.left_out, "name") if node.left_out else ""),
+    ):
+        lead = f"{INDENT}{label:<11}"
+        yield from wrap(text, columns, " " * len(lead), lead, MOST_LINES)

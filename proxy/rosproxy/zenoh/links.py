@@ -1,0 +1,59 @@
+"""The links of the hub router to routers outside: which link is up, and why another is not.
+
+The hub dials each peer again and again by itself, and tells which sessions it has, but not why a
+peer has none. So the proxy tries to connect to such a peer.
+"""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.zenoh.protocol.report import Ends
+
+
+class LinkFault(Enum):
+    """Why a link is not up."""
+
+    NOT_TRIED = "not tried yet"
+    UNRESOLVABLE = "unresolvable"
+    REFUSED = "refused"
+    SILENT = "silent"
+    UNREACHABLE = "unreachable"
+    NO_SESSION = "no session"
+
+
+@dataclass
+class Link:
+    """A link to a peer. ``addresses`` are those of the peer's name.
+
+    ``fault`` is None if the link is up. ``since`` is the time at which it went up or down.
+    """
+
+    peer: HostPort
+    since: float
+    addresses: tuple[str, ...] = ()
+    fault: LinkFault | None = LinkFault.NOT_TRIED
+
+    def note(self, fault: LinkFault | None, now: float) -> bool:
+        """Note the state of the link; returns whether the state differs."""
+        if fault == self.fault:
+            return False
+        if fault is None or self.fault is None:
+            self.since = now
+        self.fault = fault
+        return True
+
+
+def is_linked(
+    peer: HostPort, addresses: Collection[str], routers: Iterable[Ends], listen: int | None
+) -> bool:
+    """Whether one of the hub's sessions with ``routers`` is with a peer at these addresses.
+
+    The peer may have dialed the hub, at the port ``listen``. Two routers keep a single session.
+    """
+    return any(
+        ends.remote.host in addresses
+        and (ends.remote.port == peer.port or ends.local.port == listen)
+        for ends in routers
+    )
