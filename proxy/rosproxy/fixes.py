@@ -111,6 +111,11 @@ FIXES = {
         "operator with --ros2-peer ADDRESS",
         "add ADDRESS to spec.peers",
     ),
+    "zenoh outside": Fix(
+        "set --zenoh-peer HOST to connect to a router, or --zenoh-listen 7447 to be reached",
+        "start a proxy for rmw_zenoh by hand: docs/guide/zenoh.md",
+        "start a proxy for rmw_zenoh by hand: docs/guide/zenoh.md",
+    ),
     "LAN relay": Fix(
         "run rosproxy lan-relay and set --ros2-lan-relay",
         "start the operator with --ros2-lan and this host's address on the LAN",

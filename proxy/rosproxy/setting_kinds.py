@@ -34,6 +34,8 @@ Direction = Literal["out", "both"]
 SlaveControl = Literal["any", "master"]
 """Who may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
 DAY = 86400
+ZENOH_PORT = 7447
+"""The port at which rmw_zenohd listens by default."""
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
 _TOKEN = re.compile(r"[!-~]{8,200}")
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -207,6 +209,14 @@ def read_peer(text: str) -> HostPort:
         return read_host_port(text, "HOST or HOST:PORT, such as robot or 192.0.2.7:11400")
 
 
+def read_zenoh_peer(text: str) -> HostPort:
+    """A zenoh router: a host, or ``host:port``; without a port 7447. Raises ValueError."""
+    try:
+        return HostPort(read_host(text), ZENOH_PORT)
+    except ValueError:
+        return read_host_port(text, "HOST or HOST:PORT, such as robot or 192.0.2.7:7447")
+
+
 def read_network(text: str) -> Network:
     """A network as CIDR. Raises ValueError."""
     try:
@@ -292,6 +302,7 @@ ADDRESS = Text("ADDRESS", read_address)
 BIND_ADDRESS = Text("ADDRESS", read_bind_address)
 HOST_PORT = Text("ADDRESS:PORT", read_host_port)
 PEER = Text("HOST[:PORT]", read_peer)
+ZENOH_PEER = Text("HOST[:PORT]", read_zenoh_peer)
 NETWORK = Text("CIDR", read_network)
 MASTER_URI = Text("URI", read_master_uri)
 TOKEN = Text("TOKEN", read_token)

@@ -5,6 +5,7 @@ option of ``rosproxy run``, the variable, the key in the file of ``--config``, t
 and the row in docs/reference/options.md.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -20,6 +21,11 @@ LEAST_PER_DOMAIN = 4
 """Ports of the range for a domain of ROS 2: one for discovery, three for a participant."""
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DEFAULT_RANGE = PortRange(11000, 11099)
+DEFAULT_ZENOH_PORTS = PortRange(7448, 7467)
+MOST_ZENOH_PORTS = 256
+"""Routers of a proxy; each takes half a megabyte."""
+MOST_ZENOH_PEERS = 64
+"""Links of the hub router to other routers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,10 +40,11 @@ class Settings:
     """
 
     ros: Annotated[
-        tuple[Literal["1", "2"], ...],
+        tuple[Literal["1", "2", "zenoh"], ...],
         Option(
-            "ROS version that the proxy serves. Repeatable: one process then serves both "
-            "versions with one range. ROS 1 uses the range for TCP, ROS 2 for UDP.",
+            "ROS version that the proxy serves: `1`, `2` (DDS), or `zenoh` ([rmw_zenoh]"
+            "(../guide/zenoh.md)). Repeatable: one process then serves several, ROS 1 and ROS 2 "
+            "with one range. ROS 1 uses the range for TCP, ROS 2 for UDP.",
             repeatable=True,
             note="`1 2` for both",
         ),
@@ -69,8 +76,9 @@ class Settings:
             "Name or address under which outside nodes and the master reach this host. All of "
             "them must be able to resolve the name.",
             kinds.HOST,
+            default="required for ROS 1 and 2",
         ),
-    ]
+    ] = ""
     master_port: Annotated[
         int,
         Option(
@@ -345,6 +353,36 @@ class Settings:
             default="none",
         ),
     ] = field(default=None, repr=False)
+    zenoh_ports: Annotated[
+        PortRange,
+        Option(
+            "[rmw_zenoh](../guide/zenoh.md): ports for containers, with a zenoh router at each. "
+            "Containers whose nodes are clients may share a port. A container with nodes in the "
+            "default mode needs a port of its own. Only containers need these ports.",
+            kinds.PORT_RANGE,
+        ),
+    ] = DEFAULT_ZENOH_PORTS
+    zenoh_peer: Annotated[
+        tuple[HostPort, ...],
+        Option(
+            "rmw_zenoh: router outside to which the proxy connects, for example the "
+            "`rmw_zenohd` of a robot. Without a port: 7447. Repeatable.",
+            kinds.ZENOH_PEER,
+            variables=("ROSPROXY_ZENOH_PEERS",),
+            repeatable=True,
+            default="none",
+            note="separated by spaces",
+        ),
+    ] = ()
+    zenoh_listen: Annotated[
+        int | None,
+        Option(
+            "rmw_zenoh: port at which laptops, and routers of other sites, connect to the proxy, "
+            "usually 7447. Publish this port.",
+            kinds.PORT,
+            default="off",
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:
@@ -353,12 +391,18 @@ class Settings:
             check_bounds((*self.policy, *self.policy_layers))
         except ValueError as error:
             raise SettingError("--policy", str(error)) from None
+        if self.range_versions and not self.advertise_host:
+            text = "missing; give name or address under which outside nodes and the master reach "
+            text += "this host (ROSPROXY_ADVERTISE_HOST)"
+            raise SettingError("--advertise-host", text)
         if self.for_ros1 and not self.master_uri:
             text = "missing; give the real ROS master, e.g. http://robot:11311 (ROS_MASTER_URI)"
             raise SettingError("--master-uri", text)
         self._check_ports()
         if self.for_ros2:
             self._check_ros2()
+        if self.for_zenoh:
+            self._check_zenoh()
 
     def _check_ports(self) -> None:
         ports = self.port_range
@@ -377,6 +421,10 @@ class Settings:
                 raise SettingError(option, f"port {port} {uses[port]}; move one of them")
             if port is not None:
                 uses[port] = f"is taken by {option}"
+        for option, port in self.zenoh_listeners():
+            if port in uses:
+                raise SettingError(option, f"port {port} {uses[port]}; move one of them")
+            uses[port] = f"is taken by {option}"
 
     def _check_ros2(self) -> None:
         count = len(self.domains)
@@ -395,6 +443,23 @@ class Settings:
             if peer.port and count > 1:
                 text = f"{peer} has a port, which is for one domain: {fix}"
                 raise SettingError("--ros2-peer", text)
+
+    def _check_zenoh(self) -> None:
+        if len(self.zenoh_ports) > MOST_ZENOH_PORTS:
+            text = f"{self.zenoh_ports} has {len(self.zenoh_ports)} ports; give at most"
+            raise SettingError("--zenoh-ports", f"{text} {MOST_ZENOH_PORTS}")
+        if len(self.zenoh_peer) > MOST_ZENOH_PEERS:
+            text = f"{len(self.zenoh_peer)} routers; give at most {MOST_ZENOH_PEERS}"
+            raise SettingError("--zenoh-peer", text)
+        rules = {
+            "--policy": self.policy_rules,
+            "--policy-file": self.policy_file,
+            "--policy-layers": self.policy_layers,
+        }
+        for option, given in rules.items():
+            if given:  # rules that only seem to hold would be worse than none
+                text = "has no effect on rmw_zenoh. Remove this option, or --ros zenoh"
+                raise SettingError(option, text)
 
     @property
     def ports(self) -> PortMap:
@@ -416,6 +481,23 @@ class Settings:
     def for_ros2(self) -> bool:
         """Whether the proxy serves ROS 2."""
         return "2" in self.ros
+
+    @property
+    def for_zenoh(self) -> bool:
+        """Whether the proxy serves rmw_zenoh."""
+        return "zenoh" in self.ros
+
+    def zenoh_listeners(self) -> Iterator[tuple[str, int]]:
+        """The ports of zenoh routers, each with its option; none without rmw_zenoh."""
+        if self.for_zenoh:
+            yield from (("--zenoh-ports", port) for port in self.zenoh_ports.ports())
+        if self.for_zenoh and self.zenoh_listen is not None:
+            yield "--zenoh-listen", self.zenoh_listen
+
+    @property
+    def range_versions(self) -> tuple[str, ...]:
+        """The versions of ROS that use the range and the advertised host: 1 and 2."""
+        return tuple(version for version in self.ros if version != "zenoh")
 
     @property
     def domains(self) -> tuple[int, ...]:

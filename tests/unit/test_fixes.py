@@ -13,7 +13,10 @@ from rosproxy.settings import Settings
 
 FIELDS = dict.fromkeys(("ports", "published", "uri", "host", "port", "nodes", "domain"), "x")
 OPTIONS = [setting.name for setting in declared(Settings)]
-SOURCES = ("doctor/rules/*.py", "admin/setup_rules.py", "ros2/domain_problems.py", "net/gate.py")
+SOURCES = (
+    *("doctor/rules/*.py", "admin/setup_rules.py", "net/gate.py"),
+    *("ros2/domain_problems.py", "zenoh/findings.py"),
+)
 
 
 @pytest.fixture

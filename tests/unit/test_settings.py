@@ -114,7 +114,11 @@ BAD: list[tuple[str, str, list[Any]]] = [
         ["short", "with a space", "new\nline-1234", "ümlaut-1234", "x" * 201],
     ),
     ("admin_token_hash", "64 hex digits", ["0123456789abcdef", "x" * 64, f"{HASH}0"]),
-    ("advertise_host", "missing", [None]),
+    (
+        "advertise_host",
+        "missing; give name or address under which outside nodes and the master reach this host",
+        [None],
+    ),
     ("advertise_host", "neither a host name nor an address", ["", "robot:45000", "http://robot"]),
     ("advertise_host", "neither a host name nor an address", ["ro bot", "user@robot", "robot/x"]),
     ("advertise_host", "neither a host name nor an address", ["fd00::x", "[]"]),
@@ -163,6 +167,38 @@ def test_what_has_one_port_is_for_one_domain(name: str, value: object, complaint
     with pytest.raises(SettingError, match=complaint) as caught:
         parse_settings({**given, "ros2_domain": (0, 1)})
     assert caught.value.option == "--" + name.replace("_", "-")
+
+
+def test_rmw_zenoh_alone_needs_neither_master_nor_advertised_host() -> None:
+    settings = parse_settings({"ros": ("zenoh",), "zenoh_peer": ("robot", "[fd00::7]:7448")})
+    assert settings.zenoh_peer == (HostPort("robot", 7447), HostPort("fd00::7", 7448))
+    assert settings.range_versions == ()
+    listeners = dict.fromkeys(port for _, port in settings.zenoh_listeners())
+    assert [*listeners] == [*range(7448, 7468)]
+    both = parse_settings({**GIVEN, "ros": ("1", "zenoh"), "zenoh_listen": 7447})
+    assert both.range_versions == ("1",)
+    assert ("--zenoh-listen", 7447) in both.zenoh_listeners()
+    assert not [*parse_settings(GIVEN).zenoh_listeners()]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("zenoh_ports", "7000-7256", "--zenoh-ports: 7000-7256 has 257 ports; give at most 256"),
+        ("zenoh_ports", "11311-11311", "--zenoh-ports: port 11311 is taken by --master-port"),
+        ("zenoh_ports", "45090-45110", "--zenoh-ports: port 45090 lies in --port-range"),
+        ("zenoh_listen", 7450, "--zenoh-listen: port 7450 is taken by --zenoh-ports"),
+        ("zenoh_listen", 0, "--zenoh-listen: 0 is not in the range"),
+        ("zenoh_peer", ("robot:x",), "--zenoh-peer: 'robot:x' is not of the form HOST or HOST"),
+        ("zenoh_peer", tuple(f"h{n}" for n in range(65)), "--zenoh-peer: 65 routers; give at"),
+        ("policy", "deny publish *", "--policy: has no effect on rmw_zenoh. Remove this option"),
+        ("policy_file", "/rules", "--policy-file: has no effect on rmw_zenoh"),
+    ],
+)
+def test_what_rmw_zenoh_can_not_have(name: str, value: object, complaint: str) -> None:
+    with pytest.raises(SettingError) as caught:
+        parse_settings({**GIVEN, "ros": ("1", "zenoh"), name: value})
+    assert str(caught.value).startswith(complaint)
 
 
 def test_a_lan_relay_needs_a_secret() -> None:

@@ -41,7 +41,11 @@ def common_status(runtime: Runtime) -> ProxyStatus:
             bind=settings.bind,
             direction=settings.direction,
         ),
-        ports=PortsStatus(str(ports.listen), str(ports.advertise)),
+        ports=(
+            PortsStatus(str(ports.listen), str(ports.advertise))
+            if settings.range_versions
+            else PortsStatus()
+        ),
         policy=_layers(runtime),
         problems=_problems(runtime.problems),
     )

@@ -1,4 +1,4 @@
-"""One proxy: for ROS 1, for ROS 2, or for both, with one admin endpoint."""
+"""One proxy: for ROS 1, ROS 2, rmw_zenoh, or several of these, with one admin endpoint."""
 
 import asyncio
 import contextlib
@@ -86,8 +86,9 @@ class App:
             await stack.start()
         with setting_error_if_taken("--admin-bind", settings.admin):
             await self._admin.start(settings.admin)
-        ports = settings.ports.listen
-        self._sign = proxy_signs.publish_sign(settings.ros, ports.first, ports.last, settings.admin)
+        if versions := settings.range_versions:
+            ports = settings.ports.listen
+            self._sign = proxy_signs.publish_sign(versions, ports.first, ports.last, settings.admin)
         await self._check.start()
         log.info("listening: %s", "; ".join(stack.greeting for stack in self.stacks))
 
@@ -129,7 +130,8 @@ class App:
 
 def _own_names(settings: Settings) -> frozenset[str]:
     """The names that the proxy is known by, in lower case."""
-    return frozenset({settings.advertise_host.lower(), socket.gethostname().lower()})
+    names = {settings.advertise_host.lower(), socket.gethostname().lower()}
+    return frozenset(names - {""})
 
 
 def _together(actions: list[Action]) -> Action:

@@ -12,6 +12,7 @@ from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.ros1.stack import Ros1
 from rosproxy.ros2.stack import Ros2
 from rosproxy.runtime import Runtime
+from rosproxy.zenoh.stack import Zenoh
 
 
 class Stack(Protocol):
@@ -61,4 +62,6 @@ def make_stacks(runtime: Runtime) -> tuple[Stack, ...]:
         stacks.append(Ros1(runtime))
     if runtime.settings.for_ros2:
         stacks.append(Ros2(runtime))
+    if runtime.settings.for_zenoh:
+        stacks.append(Zenoh(runtime))
     return tuple(stacks)

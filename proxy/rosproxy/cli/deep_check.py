@@ -42,7 +42,11 @@ async def _check(settings: Settings) -> list[DoctorFinding]:
         graph=SystemState(),
         status=ProxyStatus(
             settings=StatusSettings(ros=settings.ros, advertise_host=host),
-            ports=PortsStatus(str(ports.listen), str(ports.advertise), free=len(ports.listen)),
+            ports=(
+                PortsStatus(str(ports.listen), str(ports.advertise), free=len(ports.listen))
+                if settings.range_versions
+                else PortsStatus()
+            ),
         ),
     )
     if settings.for_ros1:

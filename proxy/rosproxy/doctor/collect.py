@@ -101,7 +101,7 @@ async def collect_running(
         admin=admin,
         status=status,
         advertise_host=host,
-        advertised_addresses=tuple(await resolve(host)),
+        advertised_addresses=tuple(await resolve(host)) if host else (),
     )
     uri = master.uri if status.settings.for_ros1 else ""
     return await ask_graph(facts, uri, master.address if master.pinned else None, choose)

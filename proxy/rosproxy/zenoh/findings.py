@@ -1,14 +1,14 @@
 """What is wrong with the routers for rmw_zenoh: rules from their status to findings.
 
-The proxy reports the faults by itself; the doctor reports all findings.
+The proxy reports these faults by itself, and the doctor reports them, too.
 """
 
 from collections.abc import Iterator
 
-from rosproxy.admin.doctor_finding import DoctorFinding, error, note, ok, warning
+from rosproxy.admin.doctor_finding import DoctorFinding, error, warning
 from rosproxy.admin.status_document import ZenohLinkStatus, ZenohStatus
 from rosproxy.net.addresses import parse_host_port
-from rosproxy.telemetry.text import listed, plural, quoted
+from rosproxy.telemetry.text import listed, quoted
 from rosproxy.zenoh.links import LinkFault
 
 ROUTERS = "zenoh routers"
@@ -18,7 +18,7 @@ _REMOTE = "check the address, the port and the firewall of the peer"
 _LINK_FAULTS = {
     LinkFault.UNRESOLVABLE: (
         "the host name can't be resolved here",
-        "give the address of the router instead of the name: --zenoh-peer ADDRESS",
+        "give the address of the router instead of the name",
     ),
     LinkFault.REFUSED: (
         "connection refused: no router listens there",
@@ -28,7 +28,7 @@ _LINK_FAULTS = {
     LinkFault.UNREACHABLE: ("there is no route to this address", _REMOTE),
     LinkFault.NO_SESSION: (
         "a program accepts connections there, but zenoh opens no session. The program is no zenoh "
-        "router, or another --zenoh-peer leads to the same router",
+        "router, or two peers lead to the same router",
         "check the port, and give each router once",
     ),
 }
@@ -38,7 +38,8 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
     """What keeps nodes apart, the first cause first."""
     if zenoh.failure:
         text = f"do not run: {zenoh.failure}"
-        fix = "the proxy starts the routers again each second; if that does not help, restart it"
+        fix = "wait some seconds, since the proxy starts the routers again. If the finding stays, "
+        fix += "restart the proxy"
         yield error("routers", ROUTERS, text, fix)
         return
     for link in zenoh.links:
@@ -46,30 +47,6 @@ def faults(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
         if not link.up and is_tried and link.since >= LINK_GRACE_S:
             yield _link_fault(link)
     yield from _shared_routers(zenoh)
-
-
-def check(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
-    """All findings."""
-    yield from faults(zenoh)
-    if zenoh.failure:
-        return
-    for link in zenoh.links:
-        if link.up:
-            yield ok("link", f"zenoh peer {link.peer}", "linked")
-    if not zenoh.links and zenoh.listen is None:
-        text = "no router outside is set, and the proxy listens for none. Nodes in containers "
-        text += "reach only each other"
-        fix = "set --zenoh-peer HOST to connect to a router, or --zenoh-listen 7447 to be reached"
-        yield warning("link", ROUTERS, text, fix)
-    if not any(session.port is not None for session in zenoh.sessions):
-        port = zenoh.ports.partition("-")[0]
-        text = f"no node has connected to a port of {zenoh.ports}"
-        fix = "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and ZENOH_CONFIG_"
-        fix += f"""OVERRIDE='mode="client";connect/endpoints=["tcp/PROXY:{port}"]'"""
-        yield note("nodes", ROUTERS, text, fix)
-    inside = sum(1 for node in zenoh.nodes if node.address)
-    text = f"{plural(inside, 'node')} connected here, {len(zenoh.nodes) - inside} outside"
-    yield ok("nodes", ROUTERS, text)
 
 
 def _link_fault(link: ZenohLinkStatus) -> DoctorFinding:

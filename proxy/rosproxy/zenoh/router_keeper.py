@@ -51,13 +51,12 @@ class RouterKeeper:
         tasks: Tasks,
         configs: Sequence[RouterConfig],
         take_report: Callable[[Report], None],
-        program: Sequence[str] = PROGRAM,
     ) -> None:
         self._tasks = tasks
         self._configs = json.dumps(configs).encode() + b"\n"
         self._take_report = take_report
-        self._program = program
         self._changed = asyncio.Event()
+        self.program: Sequence[str] = PROGRAM
         self.failure = "the routers have not started yet"
         self.restarts = 0
 
@@ -83,7 +82,7 @@ class RouterKeeper:
     async def _run_once(self) -> str:
         """Run a process to its end; returns the reason of the end."""
         process = await asyncio.create_subprocess_exec(
-            *self._program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT
+            *self.program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT
         )
         logging_task = self._tasks.spawn(
             _log_lines(_piped(process.stderr)), "reading the log of routers"

@@ -37,8 +37,8 @@ class Kept:
 
     def __init__(self, tasks: Tasks, program: str) -> None:
         self.reports: list[Report] = []
-        command = (sys.executable, "-c", program)
-        self.keeper = RouterKeeper(tasks, [{"mode": '"router"'}], self.reports.append, command)
+        self.keeper = RouterKeeper(tasks, [{"mode": '"router"'}], self.reports.append)
+        self.keeper.program = (sys.executable, "-c", program)
 
     @property
     def pid(self) -> int:

@@ -2,16 +2,13 @@
 
 from rosproxy.admin.doctor_finding import DoctorFinding, warning
 from rosproxy.doctor.facts import DoctorFacts
-from rosproxy.doctor.rules import node, pair, participant
+from rosproxy.doctor.rules import node, pair, participant, zenoh
 from rosproxy.doctor.rules import proxy as proxy_rules
-from rosproxy.zenoh import findings as zenoh_rules
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
     """All findings: about the proxy, the nodes, and the names asked for."""
-    domains = participant.check(facts)
-    if facts.proxy.zenoh:
-        domains += zenoh_rules.check(facts.proxy.zenoh)
+    domains = [*participant.check(facts), *zenoh.check(facts)]
     if not facts.proxy.settings.for_ros1:
         return [*proxy_rules.alive(facts), *proxy_rules.setup(facts), *domains]
     return [*proxy_rules.check(facts), *node.check(facts), *pair.check(facts), *domains]

@@ -57,7 +57,7 @@ def check(facts: DoctorFacts) -> list[DoctorFinding]:
         for problem in facts.proxy.problems
         if domains and problem.subject in _REFUSED and problem.age < RECENT
     ]
-    if not facts.proxy.settings.for_ros1:
+    if domains and not facts.proxy.settings.for_ros1:
         findings += [finding for name in facts.names for finding in _name_in_domains(name, domains)]
     return findings
 

@@ -1,0 +1,75 @@
+"""Rules about rmw_zenoh: the routers of the proxy, and the topics that the user asked for."""
+
+from collections.abc import Iterator
+
+from rosproxy.admin.doctor_finding import UNKNOWN_NAME, DoctorFinding, error, note, ok, warning
+from rosproxy.admin.status_document import ZenohNodeStatus, ZenohStatus
+from rosproxy.doctor.facts import DoctorFacts
+from rosproxy.fixes import how_to
+from rosproxy.telemetry.text import listed, plural
+from rosproxy.zenoh.findings import ROUTERS, faults
+
+
+def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    """All findings; none without routers."""
+    zenoh = facts.proxy.zenoh
+    if zenoh is None:
+        return
+    yield from faults(zenoh)
+    if zenoh.failure:
+        return
+    yield from _outside(zenoh)
+    yield from _nodes(zenoh)
+    is_alone = not facts.proxy.settings.for_ros1 and not facts.proxy.domains
+    for name in facts.names:
+        told = [*_about(zenoh, name)]
+        yield from told
+        if not told and is_alone:
+            text = "no node has this name, and no node has a topic or service of this name"
+            fix = f"compare with the names in the status: {how_to('status')}"
+            yield error(UNKNOWN_NAME, name, text, fix)
+
+
+def _outside(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
+    for link in zenoh.links:
+        if link.up:
+            yield ok("link", f"zenoh peer {link.peer}", "linked")
+    if not zenoh.links and zenoh.listen is None:
+        text = "no router outside is set, and the proxy listens for none. Nodes in containers "
+        text += "reach only each other"
+        yield warning("link", ROUTERS, text, how_to("zenoh outside"))
+
+
+def _nodes(zenoh: ZenohStatus) -> Iterator[DoctorFinding]:
+    if not any(session.port is not None for session in zenoh.sessions):
+        port = zenoh.ports.partition("-")[0]
+        text = f"no node has connected to a port of {zenoh.ports}"
+        override = f"""mode="client";connect/endpoints=["tcp/PROXY:{port}"]"""
+        fix = "set for the nodes in containers: RMW_IMPLEMENTATION=rmw_zenoh_cpp and "
+        yield note("nodes", ROUTERS, text, f"{fix}ZENOH_CONFIG_OVERRIDE='{override}'")
+    inside = sum(1 for node in zenoh.nodes if node.address)
+    text = f"{plural(inside, 'node')} connected here, {len(zenoh.nodes) - inside} outside"
+    yield ok("nodes", ROUTERS, text)
+
+
+def _about(zenoh: ZenohStatus, name: str) -> Iterator[DoctorFinding]:
+    """The nodes of a name, and those with a topic or service of this name."""
+    for node in zenoh.nodes:
+        if node.name == name:
+            yield ok("node", name, f"connected from {node.address or 'outside'}")
+    publishers = [_place(node) for node in zenoh.nodes if name in node.publishes]
+    subscribers = [_place(node) for node in zenoh.nodes if name in node.subscribes]
+    servers = [_place(node) for node in zenoh.nodes if name in node.services]
+    if publishers or subscribers:
+        text = f"published by {listed(publishers) or 'no node'}; "
+        text += f"subscribed to by {listed(subscribers) or 'no node'}"
+        if publishers and subscribers:
+            yield ok("topic", name, text)
+        else:
+            yield note("topic", name, text, "check the name; check that the other program runs")
+    if servers:
+        yield ok("service", name, f"served by {listed(servers)}")
+
+
+def _place(node: ZenohNodeStatus) -> str:
+    return f"{node.name} ({node.address or 'outside'})"

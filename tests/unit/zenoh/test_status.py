@@ -1,0 +1,117 @@
+"""The state of the routers, from reports: sessions with both addresses, links, nodes, metrics."""
+
+from dataclasses import dataclass
+
+from prometheus_client import CollectorRegistry, generate_latest
+
+from rosproxy.admin.status_document import ZenohSessionStatus
+from rosproxy.zenoh.protocol.report import Link, Report, RouterReport, RouterSession
+from rosproxy.zenoh.status import ZenohState
+from tests.run_options import parse_settings
+
+NODE_ZID = "aa"
+TOKENS = (
+    f"@ros2_lv/0/{NODE_ZID}/0/0/NN/%/%/talker",
+    f"@ros2_lv/0/{NODE_ZID}/0/10/MP/%/%/talker/%chatter/T_/H/::,10:,:,:,,",
+    "@ros2_lv/0/bb/0/0/NN/%/%/robot",
+    "@ros2_lv/no/token",
+)
+
+
+@dataclass
+class FakeProcess:
+    """A process of routers."""
+
+    failure: str = ""
+    restarts: int = 2
+
+
+def session(zid: str, mode: str, local: str, remote: str) -> RouterSession:
+    return RouterSession(zid, mode, (Link(f"tcp/{local}", f"tcp/{remote}"),))
+
+
+REPORT = Report(
+    (
+        RouterReport(
+            "01",
+            (
+                session("03", "router", "127.0.0.1:7448", "127.0.0.1:50001"),
+                session(NODE_ZID, "peer", "172.18.0.2:7448", "172.18.0.3:50002"),
+            ),
+        ),
+        RouterReport("02"),
+        RouterReport(
+            "03",
+            (
+                session("01", "router", "127.0.0.1:50001", "127.0.0.1:7448"),
+                session("04", "router", "172.18.0.2:50003", "192.0.2.7:7447"),
+            ),
+        ),
+    ),
+    TOKENS,
+    tokens_left_out=5,
+)
+
+
+def make_state(process: FakeProcess) -> ZenohState:
+    options = {
+        "ros": ("zenoh",),
+        "zenoh_ports": "7448-7449",
+        "zenoh_peer": ("192.0.2.7", "192.0.2.8"),
+    }
+    state = ZenohState(parse_settings(options), process, lambda: 10.0)
+    for link in state.links:
+        link.addresses = (link.peer.host,)
+    state.take(REPORT)
+    return state
+
+
+def test_sessions_have_both_addresses_and_their_router() -> None:
+    status = make_state(FakeProcess()).status()
+    assert status.sessions == (
+        ZenohSessionStatus(7448, "peer", NODE_ZID, "172.18.0.2:7448", "172.18.0.3:50002"),
+        ZenohSessionStatus(None, "router", "04", "172.18.0.2:50003", "192.0.2.7:7447"),
+    )
+    assert (status.ports, status.restarts, status.left_out) == ("7448-7449", 2, 6)
+
+
+def test_nodes_here_have_an_address() -> None:
+    talker, robot = reversed(make_state(FakeProcess()).status().nodes)
+    assert (talker.name, talker.address, talker.publishes) == (
+        "/talker",
+        "172.18.0.3",
+        ("/chatter",),
+    )
+    assert (robot.name, robot.address) == ("/robot", "")
+
+
+def test_tokens_stay_until_a_report_has_others() -> None:
+    state = make_state(FakeProcess())
+    state.take(Report(REPORT.routers))
+    assert len(state.status().nodes) == 2
+    state.take(Report(REPORT.routers, ()))
+    assert not state.status().nodes
+
+
+def test_a_link_is_up_while_the_routers_run() -> None:
+    process = FakeProcess()
+    state = make_state(process)
+    assert [state.is_up(link) for link in state.links] == [True, False]
+    process.failure = "no report for 10 s"
+    assert not state.is_up(state.links[0])
+    status = state.status()
+    assert (status.sessions, status.nodes) == ((), ())
+
+
+def test_metrics() -> None:
+    registry = CollectorRegistry()
+    registry.register(make_state(FakeProcess()))
+    lines = generate_latest(registry).decode().splitlines()
+    for line in (
+        "rosproxy_zenoh_routers_up 1.0",
+        "rosproxy_zenoh_restarts_total 2.0",
+        'rosproxy_zenoh_link_up{peer="192.0.2.7:7447"} 0.0',
+        'rosproxy_zenoh_sessions{mode="peer"} 1.0',
+        'rosproxy_zenoh_nodes{side="inside"} 1.0',
+    ):
+        assert line in lines
