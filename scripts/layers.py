@@ -25,6 +25,7 @@ CLIENTS = "install-clients"
 CHROMIUM = "install-browser"
 JAZZY = "install-jazzy"
 ROS2 = "install-ros2"
+ZENOH = "install-zenoh"
 NODES = "compile-nodes"
 ENGINE = "install-docker"
 COMPOSE = "install-compose"
@@ -37,6 +38,7 @@ PREPARATIONS = (
     CHROMIUM,
     JAZZY,
     ROS2,
+    ZENOH,
     NODES,
     ENGINE,
     COMPOSE,
@@ -175,6 +177,7 @@ ROS1_CLIENTS = Layer(
     "clients", setup=(ROS, NODES, CLIENTS), workers=2, obstacle=debian_root_obstacle
 )
 ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
+ZENOH_NODES = Layer("zenoh", setup=(ZENOH,), workers=2, obstacle=debian_root_obstacle)
 BROWSER = Layer("browser", setup=(ROS, NODES, ROS2, CHROMIUM), obstacle=debian_root_obstacle)
 DOCKER_ENGINE = Layer(
     "docker",
@@ -198,13 +201,14 @@ ROS2_CLUSTER = Layer(
 )
 LAYERS = (
     *(UNIT, INTEGRATION, ABUSE, CHART, IMAGE),
-    *(ROS_NODES, ISOLATED, ROS1_CLIENTS, ROS2_NODES, BROWSER, DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
+    *(ROS_NODES, ISOLATED, ROS1_CLIENTS, ROS2_NODES, ZENOH_NODES, BROWSER),
+    *(DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
 )
 
 BESIDE_PREPARATION = (UNIT,)
 ALONE_FIRST = (INTEGRATION,)
 ON_THE_ENGINE = (DOCKER_ENGINE, IMAGE, CLUSTER)
-SIDE_BY_SIDE = (ROS_NODES, ROS2_NODES, ISOLATED, ROS1_CLIENTS, BROWSER, CHART)
+SIDE_BY_SIDE = (ROS_NODES, ROS2_NODES, ISOLATED, ROS1_CLIENTS, ZENOH_NODES, BROWSER, CHART)
 ALONE_LAST = (ABUSE, ROS2_CLUSTER)
 """When which layers run, in this order; ON_THE_ENGINE and SIDE_BY_SIDE begin together.
 

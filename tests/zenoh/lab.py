@@ -1,0 +1,169 @@
+"""What a test drives: the robot's router, the proxy, and nodes with the sessions of rmw_zenoh."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+
+from rosproxy.admin.status_document import ProxyStatus, ZenohStatus, parse_status
+from tests.ros.processes import Process, stop_all, wait_until
+from tests.ros.topology import Plan, PortMap, Topology, run_command
+
+ENVIRONMENTS = (
+    Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rosproxy" / "zenoh"
+)
+VERSIONS = ("1.6.2", "1.7.2", "1.10.2")
+"""The library of the nodes and of the robot's router."""
+OWN_VERSION = "1.7.2"
+"""The library of the proxy, which the extra `zenoh` pins."""
+NODES = Path(__file__).parent / "nodes"
+ROUTER_PORT = 7447
+PLAN = Plan("z", (("c1", "c2"),), PortMap(ROUTER_PORT, ROUTER_PORT, ROUTER_PORT))
+PORTS = {"c1": 7448, "c2": 7449}
+"""The port of the proxy for each container."""
+ADMIN_PORT = 11312
+_REDIRECT = """
+table ip zenoh_redirect {{
+  chain out {{ type nat hook output priority -100;
+    ip daddr 127.0.0.1 tcp dport {router} dnat to {proxy}:{port}; }}
+  chain leave {{ type nat hook postrouting priority 100;
+    ip saddr 127.0.0.0/8 oifname "eth0" masquerade; }}
+}}
+"""
+
+
+class Lab:
+    """A robot with a router, two containers, and the proxy beside the containers."""
+
+    def __init__(self, topology: Topology, folder: Path) -> None:
+        self.topology = topology
+        self.folder = folder
+        self.proxy: Process | None = None
+        self.processes: list[Process] = []
+        self._numbers = itertools.count(1)
+
+    def unique(self, stem: str) -> str:
+        """A name that no other node has."""
+        return f"{stem}_{next(self._numbers)}"
+
+    def start_proxy(self, *options: str, with_robot: bool = True) -> None:
+        """Start the proxy and wait until it listens."""
+        argv = [sys.executable, "-m", "rosproxy", "run", "--ros", "zenoh"]
+        argv += ["--zenoh-ports", f"{min(PORTS.values())}-{max(PORTS.values())}"]
+        argv += ["--zenoh-peer", self.topology.plan.robot] if with_robot else []
+        argv += options
+        (packages,) = (ENVIRONMENTS / OWN_VERSION).glob("lib/python3*/site-packages")
+        paths = [*(path for path in sys.path if path), str(packages)]
+        self.proxy = self.start("px", argv, {"PYTHONPATH": os.pathsep.join(paths)})
+        self.proxy.wait_for("listening: ")
+
+    def restart_proxy(self) -> None:
+        """Kill the process of the proxy, and start another."""
+        assert self.proxy is not None
+        os.kill(self.proxy.pid, 9)
+        self.proxy.wait()
+        self.start_proxy()
+
+    def start_router(self, version: str) -> Process:
+        """Start the router of the robot."""
+        router = self._program(version, "out", "router.py")
+        router.wait_for("router runs")
+        return router
+
+    def node(
+        self, version: str, role: str, kind: str, topic: str = "chatter", **environment: str
+    ) -> Process:
+        """Start a node, whose name is the title; in a container without a redirect a client."""
+        name = self.unique(kind)
+        if not environment and role != "out" and not self.is_redirected(role):
+            environment = self.as_client()
+        node = self._program(version, role, "node.py", kind, name, topic, **environment)
+        node.title = name
+        return node
+
+    def as_client(self, port: int = min(PORTS.values())) -> dict[str, str]:
+        """The variable that makes nodes clients of a port of the proxy."""
+        proxy = self.topology.places["px"].address
+        override = f'mode="client";connect/endpoints=["tcp/{proxy}:{port}"]'
+        return {"ZENOH_CONFIG_OVERRIDE": override}
+
+    def redirect(self, role: str) -> None:
+        """Lead localhost:7447 in a container to the port of the container at the proxy."""
+        place = self.topology.places[role]
+        enter = ("ip", "netns", "exec", place.namespace)
+        run_command(*enter, "sysctl", "-qw", "net.ipv4.conf.all.route_localnet=1")
+        proxy = self.topology.places["px"].address
+        rules = _REDIRECT.format(router=ROUTER_PORT, proxy=proxy, port=PORTS[role])
+        run_command(*enter, "nft", "-f", "-", text=rules)
+
+    def is_redirected(self, role: str) -> bool:
+        """Whether `redirect` is in force."""
+        enter = ("ip", "netns", "exec", self.topology.places[role].namespace)
+        return "table ip zenoh_redirect" in run_command(*enter, "nft", "list", "tables")
+
+    def end_redirects(self) -> None:
+        """Take all redirects away."""
+        for role in filter(self.is_redirected, PORTS):
+            enter = ("ip", "netns", "exec", self.topology.places[role].namespace)
+            run_command(*enter, "nft", "delete", "table", "ip", "zenoh_redirect")
+
+    def status(self) -> ProxyStatus:
+        """What the proxy tells of itself."""
+        with self.topology.places["px"].entered():
+            asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
+            with closing(asking):
+                asking.request("GET", "/status")
+                return parse_status(asking.getresponse().read())
+
+    def zenoh(self) -> ZenohStatus:
+        """What the proxy tells of its routers."""
+        zenoh = self.status().zenoh
+        assert zenoh is not None
+        return zenoh
+
+    def wait_for_link(self) -> None:
+        """Wait until the hub is linked with the router of the robot."""
+        wait_until("the link is up", lambda: self.zenoh().links[0].up, 30)
+
+    def router_process(self) -> int:
+        """The process of the routers."""
+        assert self.proxy is not None
+        (child,) = (
+            Path(f"/proc/{self.proxy.pid}/task/{self.proxy.pid}/children").read_text().split()
+        )
+        return int(child)
+
+    def start(self, role: str, argv: list[str], environment: Mapping[str, str]) -> Process:
+        """Start a program on a machine."""
+        usual = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONUNBUFFERED": "1"}
+        log = self.folder / f"{next(self._numbers):04d}.log"
+        place = self.topology.places[role]
+        process = Process(" ".join(argv[-3:]), place, argv, {**usual, **environment}, log)
+        self.processes.append(process)
+        return process
+
+    def _program(self, version: str, role: str, *words: str, **environment: str) -> Process:
+        python = str(ENVIRONMENTS / version / "bin/python")
+        program, *arguments = words
+        return self.start(role, [python, str(NODES / program), *arguments], environment)
+
+    @contextmanager
+    def used(self) -> Iterator[None]:
+        """End what was started, and check the proxy, when the lab is not used any more."""
+        try:
+            yield
+            if self.proxy is not None:
+                assert self.proxy.returncode is None, self.proxy.output()
+                assert "Traceback" not in self.proxy.output(), self.proxy.output()
+        finally:
+            stop_all(self.processes, patience=2.0)
+            self.end_redirects()
+
+    def transcripts(self) -> list[tuple[str, str]]:
+        """What the programs have printed."""
+        return [(process.title, process.output()[-3000:]) for process in self.processes]
