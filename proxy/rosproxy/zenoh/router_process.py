@@ -6,6 +6,8 @@ the proxy alone. The proxy then starts the process again (`rosproxy.zenoh.router
 Standard input has a line of JSON, a list of `RouterConfig`. Standard output gets a `Report` each
 second. The process ends with an error in the last report if a router cannot be opened, or does not
 answer.
+
+Nodes wait for the process, so the process loads little: msgspec would take as long as all the rest.
 """
 
 import ctypes
@@ -14,20 +16,12 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from typing import Any, BinaryIO
+from collections.abc import Mapping, Sequence
+from typing import Any, TextIO
 
 import zenoh
 
-from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, LONGEST_TOKEN
-from rosproxy.zenoh.protocol.report import (
-    MOST_TOKENS,
-    Report,
-    RouterReport,
-    read_router,
-    write_report,
-)
-from rosproxy.zenoh.router_configs import RouterConfig
+from rosproxy.zenoh.protocol.liveliness import ALL_TOKENS, LONGEST_TOKEN, MOST_TOKENS
 
 REPORT_INTERVAL_S = 1.0
 ANSWER_TIMEOUT_S = 5.0
@@ -56,15 +50,15 @@ class Tokens:
             self.left_out += not is_kept
         self._changed = True
 
-    def changed(self) -> tuple[str, ...] | None:
+    def changed(self) -> list[str] | None:
         """All tokens; None if none has changed since the last call."""
         if not self._changed:
             return None
         self._changed = False
-        return tuple(self._keys.copy())
+        return list(self._keys.copy())
 
 
-def open_router(config: RouterConfig) -> Any:
+def open_router(config: Mapping[str, str]) -> Any:
     """A router that runs. Raises zenoh.ZError."""
     made = zenoh.Config()
     for key, value in config.items():
@@ -72,24 +66,30 @@ def open_router(config: RouterConfig) -> Any:
     return zenoh.open(made)
 
 
-def describe(router: Any) -> RouterReport:
+def describe(router: Any) -> dict[str, Any]:
     """What a router says of itself. Raises ValueError if it does not answer."""
     for reply in router.get(f"@/{router.info.zid()}/router", timeout=ANSWER_TIMEOUT_S):
         if reply.ok is not None:
-            return read_router(reply.ok.payload.to_bytes())
+            told = json.loads(reply.ok.payload.to_bytes())
+            return {"zid": told["zid"], "sessions": told["sessions"]}
     raise ValueError(f"a router does not answer within {ANSWER_TIMEOUT_S:g} s")
 
 
-def run(configs: Sequence[RouterConfig], output: BinaryIO) -> None:
-    """Run routers and report, without end. Raises zenoh.ZError, ValueError, OSError."""
+def report(output: TextIO, **fields: Any) -> None:
+    """Write a report. Raises BrokenPipeError if the proxy has ended."""
+    print(json.dumps(fields), file=output, flush=True)
+
+
+def run(configs: Sequence[Mapping[str, str]], output: TextIO) -> None:
+    """Run routers and report, without end. Raises zenoh.ZError, ValueError, BrokenPipeError."""
     routers = [open_router(config) for config in configs]
     tokens = Tokens()
     # The subscriber ends with its object, which has to have a name.
     _subscriber = routers[-1].liveliness().declare_subscriber(ALL_TOKENS, tokens.take, history=True)
     while True:
-        described = tuple(describe(router) for router in routers)
-        output.write(write_report(Report(described, tokens.changed(), tokens.left_out)))
-        output.flush()
+        described = [describe(router) for router in routers]
+        changed = tokens.changed()
+        report(output, routers=described, tokens=changed, tokens_left_out=tokens.left_out)
         time.sleep(REPORT_INTERVAL_S)
 
 
@@ -100,14 +100,13 @@ def main() -> int:
     # Ctrl-C goes to all programs of a terminal; the proxy ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Only reports go to the proxy, whatever the library prints.
-    output = os.fdopen(os.dup(1), "wb")
+    output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     zenoh.init_log_from_env_or("error")
     try:
         run(json.loads(sys.stdin.readline()), output)
     except (zenoh.ZError, ValueError) as error:
-        output.write(write_report(Report(error=str(error))))
-        output.flush()
+        report(output, error=str(error))
     except BrokenPipeError:
         pass  # the proxy has ended
     return 1

@@ -17,6 +17,8 @@ ALL_TOKENS = "@ros2_lv/**"
 """The key expression of all tokens."""
 LONGEST_TOKEN = 1024
 """Characters of a token that is read. A name of ROS 2 has 255 at most, a type some tens."""
+MOST_TOKENS = 8192
+"""Tokens in a report. A host with fifty nodes has some 1,000."""
 _NODE_PARTS = 9
 _TOPIC_PARTS = 13
 _NUMBER = re.compile(r"[0-9]{1,9}")

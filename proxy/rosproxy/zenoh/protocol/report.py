@@ -12,8 +12,6 @@ from rosproxy.net.addresses import HostPort, parse_authority
 
 LONGEST_REPORT = 16 * 1024 * 1024
 """Bytes of a line. All sessions that routers accept, and all tokens, take some 10 MB."""
-MOST_TOKENS = 8192
-"""Tokens in a report. A host with fifty nodes has some 1,000."""
 MOST_SESSIONS = 1000
 """Sessions that a router accepts: its setting ``transport/unicast/max_sessions``."""
 
@@ -40,7 +38,7 @@ class RouterReport(msgspec.Struct, frozen=True):
     sessions: tuple[RouterSession, ...] = ()
 
 
-class Report(msgspec.Struct, frozen=True, omit_defaults=True):
+class Report(msgspec.Struct, frozen=True):
     """A report: the routers in the order of their configurations, and the liveliness tokens.
 
     ``tokens`` is None if nothing has changed since the last report. ``tokens_left_out`` counts
@@ -66,19 +64,6 @@ def read_report(line: bytes) -> Report:
         return msgspec.json.decode(line, type=Report)
     except msgspec.MsgspecError as error:
         raise ValueError(f"a report that is not valid: {error}") from None
-
-
-def read_router(description: bytes) -> RouterReport:
-    """What a router says of itself in the admin space. Raises ValueError."""
-    try:
-        return msgspec.json.decode(description, type=RouterReport)
-    except msgspec.MsgspecError as error:
-        raise ValueError(f"a router's description that is not valid: {error}") from None
-
-
-def write_report(report: Report) -> bytes:
-    """A line with a report."""
-    return msgspec.json.encode(report) + b"\n"
 
 
 def ends_of(session: RouterSession) -> Ends | None:
