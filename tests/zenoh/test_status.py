@@ -42,6 +42,19 @@ def test_nodes_outside_are_told_with_their_topics(lab: Lab) -> None:
     wait_until("the node is gone", lambda: not lab.zenoh().nodes, 30)
 
 
+def test_a_link_does_not_wait_for_another(lab: Lab) -> None:
+    lab.start_router(VERSION)
+    peers = ("--zenoh-peer", "10.77.0.99", "--zenoh-peer", "robot")
+    lab.start_proxy(*peers, with_robot=False)
+    wait_until(
+        "one link is up", lambda: [link.up for link in lab.zenoh().links] == [False, True], 30
+    )
+    wait_until("the other is tried", lambda: lab.zenoh().links[0].error == "unreachable", 30)
+    subscriber = lab.node(VERSION, "out", "sub")
+    lab.node(VERSION, "c1", "pub")
+    subscriber.wait_for_count("^got hello ", 5, timeout=30)
+
+
 def test_two_containers_at_one_port_are_told(lab: Lab) -> None:
     lab.start_proxy(with_robot=False)
     proxy = lab.topology.places["px"].address

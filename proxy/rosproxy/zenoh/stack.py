@@ -122,6 +122,10 @@ class Zenoh:
         fault = None
         if not self.state.is_up(link):
             fault = await try_link(link.addresses, link.peer.port)
+        if self.keeper.failure:  # no router dials
+            return
+        # The link may have come up during the try, which takes some seconds.
+        fault = None if self.state.is_up(link) else fault
         if link.note(fault, self._runtime.now()):
             state = f"down, {fault.value}" if fault else "up"
             log.info("zenoh link %s: %s", state, link.peer)

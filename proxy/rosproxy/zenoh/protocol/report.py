@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from rosproxy.net.addresses import HostPort, parse_authority
+from rosproxy.net.addresses import HostPort, parse_authority, plain_address
 
 LONGEST_REPORT = 16 * 1024 * 1024
 """Bytes of a line. All sessions that routers accept, and all tokens, take some 10 MB."""
@@ -80,4 +80,6 @@ def _end(locator: str) -> HostPort | None:
     """The address and port of a locator such as ``tcp/192.0.2.7:7447?prio=1-7``."""
     protocol, _, rest = locator.partition("/")
     address = rest.partition("?")[0].partition("#")[0]
-    return parse_authority(f"//{address}") if protocol in ("tcp", "tls", "quic") else None
+    end = parse_authority(f"//{address}") if protocol in ("tcp", "tls", "quic") else None
+    # A router that listens on [::] sees IPv4 as ::ffff:192.0.2.7.
+    return HostPort(plain_address(end.host), end.port) if end else None
