@@ -25,12 +25,14 @@ log = logging.getLogger(__name__)
 REPORT_TIMEOUT_S = 10.0
 """Time without a report after which the process counts as hung."""
 START_TIMEOUT_S = 30.0
-"""Time to the first report of the first process."""
+"""The same for the first report of a process."""
 LEAST_START_INTERVAL_S = 1.0
 """A process that has lived longer starts again at once."""
 MOST_LOG_LINES = 20
 """Lines of the library's own log that the proxy logs, for each process."""
 LONGEST_LOG_LINE = 300
+LAST_LINES_TIMEOUT_S = 0.2
+"""Time to read such lines after the end of the process."""
 _Stream = TypeVar("_Stream")
 PROGRAM = (sys.executable, "-m", "rosproxy.zenoh.router_process")
 
@@ -63,9 +65,7 @@ class RouterKeeper:
     async def start(self) -> None:
         """Start the process, and wait until the routers run. Raises RoutersFailed."""
         self._tasks.spawn(self._keep_running(), "running the zenoh routers")
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(START_TIMEOUT_S):
-                await self._changed.wait()
+        await self._changed.wait()
         if self.failure:
             raise RoutersFailed(self.failure)
 
@@ -81,9 +81,12 @@ class RouterKeeper:
 
     async def _run_once(self) -> str:
         """Run a process to its end; returns the reason of the end."""
-        process = await asyncio.create_subprocess_exec(
-            *self.program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT
-        )
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *self.program, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=LONGEST_REPORT
+            )
+        except OSError as error:  # no memory, or too many processes
+            return f"the process can't be started: {error.strerror}"
         logging_task = self._tasks.spawn(
             _log_lines(_piped(process.stderr)), "reading the log of routers"
         )
@@ -95,24 +98,28 @@ class RouterKeeper:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
+            # The last lines may name the cause of the end.
+            await asyncio.wait({logging_task}, timeout=LAST_LINES_TIMEOUT_S)
             logging_task.cancel()
 
     async def _read_reports(self, process: Process) -> str:
         """Take reports until there are no more; returns the reason."""
         reports = _piped(process.stdout)
+        patience = START_TIMEOUT_S
         while True:
             try:
-                async with asyncio.timeout(REPORT_TIMEOUT_S):
+                async with asyncio.timeout(patience):
                     line = await reports.readline()
                 if not line:
                     return _exit_reason(await process.wait())
                 report = read_report(line)
             except TimeoutError:
-                return f"no report for {REPORT_TIMEOUT_S:g} s"
+                return f"no report for {patience:g} s"
             except ValueError as error:  # not valid, or longer than the limit
                 return brief(error, LONGEST_LOG_LINE)
             if report.error:
                 return brief(report.error, LONGEST_LOG_LINE)
+            patience = REPORT_TIMEOUT_S
             self._take_report(report)
             self.failure = ""
             self._changed.set()

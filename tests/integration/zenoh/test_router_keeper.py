@@ -5,6 +5,7 @@ Small programs stand in for the router process, which needs the zenoh library.
 
 import asyncio
 import os
+import signal
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -69,7 +70,7 @@ async def test_a_process_that_is_killed_starts_again(
     kept = Kept(tasks, REPORTS)
     await kept.keeper.start()
     first = kept.pid
-    os.kill(first, 9)
+    os.kill(first, signal.SIGKILL)
     await until(lambda: kept.pid != first, "another process reports")
     assert kept.keeper.restarts == 1
     assert kept.keeper.failure == ""
@@ -86,12 +87,40 @@ async def test_a_process_that_is_killed_starts_again(
     ],
 )
 async def test_the_reason_of_a_failed_start_is_told(
-    tasks: Tasks, program: str, reason: str, monkeypatch: pytest.MonkeyPatch
+    tasks: Tasks,
+    program: str,
+    reason: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     if program is HANGS:
-        monkeypatch.setattr(router_keeper, "REPORT_TIMEOUT_S", 0.2)
+        monkeypatch.setattr(router_keeper, "START_TIMEOUT_S", 0.2)
     with pytest.raises(RoutersFailed, match=reason):
         await Kept(tasks, program).keeper.start()
+    if program is ENDS:
+        assert "zenoh: thread panicked" in caplog.text
+
+
+async def test_a_process_that_falls_silent_is_killed(
+    tasks: Tasks, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(router_keeper, "REPORT_TIMEOUT_S", 0.5)
+    kept = Kept(tasks, REPORTS)
+    await kept.keeper.start()
+    first = kept.pid
+    os.kill(first, signal.SIGSTOP)
+    await until(lambda: kept.pid != first, "another process reports")
+    assert not Path(f"/proc/{first}").exists()
+    assert "zenoh routers ended: no report for 0.5 s" in caplog.text
+
+
+async def test_a_process_that_can_not_start_is_told(tasks: Tasks) -> None:
+    kept = Kept(tasks, REPORTS)
+    kept.keeper.program = ("/nothing/here",)
+    with pytest.raises(RoutersFailed, match="can't be started: No such file or directory"):
+        await kept.keeper.start()
+    kept.keeper.program = (sys.executable, "-c", REPORTS)
+    await until(lambda: kept.reports, "the next start succeeds")
 
 
 async def test_what_the_library_prints_is_logged_up_to_a_bound(
