@@ -109,7 +109,8 @@ async def crowd(
                 robot.meta.sendto(announcement, (APART, first))
         for number, prefix in enumerate(hostile):
             if prefix not in present:
-                announcement = spdp(prefix, EVIL, 9500 + 2 * number, lease=LEASE)
+                port = last.port if prefix == last.prefix else 9500 + 2 * number
+                announcement = spdp(prefix, EVIL, port, lease=LEASE)
                 last.meta.sendto(announcement, ANNOUNCED)
         return present >= expected
 
