@@ -31,6 +31,7 @@ ENGINE = "install-docker"
 COMPOSE = "install-compose"
 PROMETHEUS = "install-prometheus"
 KUBERNETES = "install-kubernetes"
+REGISTRY = "install-registry"
 IMAGES = "build-images"
 PREPARATIONS = (
     ROS,
@@ -44,6 +45,7 @@ PREPARATIONS = (
     COMPOSE,
     PROMETHEUS,
     KUBERNETES,
+    REGISTRY,
     IMAGES,
 )
 ABUSE_TOOLS = "install-abuse"
@@ -189,7 +191,7 @@ DOCKER_ENGINE = Layer(
 _ROS2_PODS = "tests/kubernetes/test_ros2.py"
 CLUSTER = Layer(
     "kubernetes",
-    setup=(ENGINE, KUBERNETES, PROMETHEUS, IMAGES),
+    setup=(ENGINE, KUBERNETES, REGISTRY, PROMETHEUS, IMAGES),
     obstacle=debian_root_obstacle,
     tests=("tests/kubernetes", f"--ignore={_ROS2_PODS}"),
 )

@@ -5,6 +5,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from scripts.release_check import running_registry
+
 from tests.docker.engine import ROOT, run, wait_until
 from tests.docker.images import PROXY
 from tests.kubernetes import api
@@ -13,6 +15,7 @@ from tests.kubernetes.cluster.images import load_images
 from tests.kubernetes.cluster.layout import BIN, KUBECONFIG
 from tests.kubernetes.pods import Namespace, Pod
 
+CHART = ROOT / "charts/rosproxy-operator"
 NAMESPACE = "rosproxy-system"
 NAME = "rosproxy"
 FULL_NAME = "rosproxy-operator"
@@ -51,6 +54,18 @@ def install() -> None:
 def install_again(**values: Any) -> None:
     """Install the chart where `uninstall` has removed it, with these values besides."""
     _apply("install", **values)
+
+
+def install_from_a_registry(directory: Path) -> None:
+    """Install the chart from a registry, as users of a release do; the directory is empty."""
+    helm("package", CHART, "--destination", directory)
+    (package,) = directory.iterdir()
+    with running_registry(directory) as address:
+        helm("push", package, f"oci://{address}/charts", "--plain-http")
+        version = package.stem.removeprefix(f"{CHART.name}-")
+        chart = f"oci://{address}/charts/{CHART.name}"
+        _helm_with(_IMAGES, "install", chart, "--version", version, "--plain-http",
+                   "--create-namespace")  # fmt: skip
 
 
 def upgrade(**values: Any) -> None:
@@ -135,10 +150,14 @@ def _webhook_answers() -> bool:
 
 
 def _apply(verb: str, **values: Any) -> None:
+    _helm_with(_merged(_IMAGES, values), verb, CHART)
+
+
+def _helm_with(values: Json, verb: str, chart: str | Path, *options: str) -> None:
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
-        json.dump(_merged(_IMAGES, values), file)
+        json.dump(values, file)
         file.flush()
-        helm(verb, NAME, ROOT / "charts/rosproxy-operator", "--namespace", NAMESPACE,
+        helm(verb, NAME, chart, *options, "--namespace", NAMESPACE,
              "--values", file.name, "--wait", "--timeout", "2m")  # fmt: skip
 
 

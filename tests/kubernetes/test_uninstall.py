@@ -1,5 +1,7 @@
 """helm uninstall leaves nothing behind, or by default the RosProxies alone."""
 
+from pathlib import Path
+
 from tests.docker.engine import wait_until
 from tests.kubernetes import api, release
 from tests.kubernetes.cluster.control_plane import kubectl
@@ -45,8 +47,21 @@ def test_nothing_is_left(net: Namespace, robot: Robot) -> None:
     assert "rosproxy.io" not in kubectl("api-resources", "-o", "name")
 
 
+def test_a_release_from_a_registry(net: Namespace, tmp_path: Path) -> None:
+    """The command of docs/releasing.md."""
+    release.remove()
+    release.install_from_a_registry(tmp_path)
+    release.wait_operator()
+    made = rosproxy(net.name, master=NOWHERE, ports=4)
+    net.idle()
+    wait_until(lambda: bool(made.proxies), 60, made.tell)
+    made.remove()
+    wait_until(lambda: not made.proxies and not made.service, 40, made.tell)
+    release.uninstall()
+
+
 def test_rosproxies_stay_until_their_definition_is_deleted(net: Namespace) -> None:
-    """What `crds.keep` promises, which is on by default. The release is not there any more."""
+    """What `crds.keep` promises, which is on by default."""
     release.install_again(crds={"keep": True})
     release.wait_operator()
     made = rosproxy(net.name, master=NOWHERE, ports=4)
