@@ -4,7 +4,7 @@ After each event what must always hold is checked, see `Clusters.check`. From ti
 else happens: then the operator must come to rest, with everything as wished.
 """
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.unit.operator.kubernetes.clusters import Clusters
@@ -33,7 +33,12 @@ EVENTS = st.tuples(
 )
 
 
+BAD_IMAGE = (Clusters.change, 0, 9)
+OTHER_MASTER = (Clusters.change, 0, 4)
+
+
 @given(st.integers(1, 3), st.lists(EVENTS, min_size=10, max_size=30))
+@example(1, [BAD_IMAGE, OTHER_MASTER])
 def test_everything_comes_to_rest_as_wished(pods: int, events: list) -> None:
     world = Clusters()
     for number in range(pods):

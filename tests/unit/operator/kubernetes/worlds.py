@@ -83,11 +83,11 @@ class World:
             assert proxy is not None
             yield pod, proxy
 
-    def phases(self) -> dict[str, str]:
-        """The phase of each pod, by its uid."""
-        return {
-            meta(pod)["uid"]: pod["status"]["phase"] for pod in self.cluster.state.pods.values()
-        }
+    def statuses(self) -> dict[str, str]:
+        """The status of each pod, by its uid, and the address that it has already."""
+        addresses = self.cluster.addresses
+        pods = ((meta(pod)["uid"], pod) for pod in self.cluster.state.pods.values())
+        return {uid: f"{pod['status']} {addresses.get(uid)}" for uid, pod in pods}
 
     # what the operator does
 
@@ -216,11 +216,11 @@ class World:
         for _ in range(100):
             plan = self.seen()
             self.carry_out(plan)
-            phases = self.phases()
+            statuses = self.statuses()
             self.cluster.step()
             self.check()
-            # A pod that has come into another phase makes the operator look again.
-            if not plan.actions and plan.next_look_in is None and phases == self.phases():
+            # A pod with another status makes the operator look again.
+            if not plan.actions and plan.next_look_in is None and statuses == self.statuses():
                 break
             self.controller.now += 1.0 if plan.next_look_in is None else plan.next_look_in
         else:
@@ -298,8 +298,14 @@ class World:
             assert not deleting(pod)
             container = pod["spec"]["containers"][0]
             image = rosproxy.get("image", "rosproxy:1")
-            assert container["image"] == image or image == BAD_IMAGE  # others keep theirs
+            assert container["image"] == image or image == BAD_IMAGE
             assert pod["status"]["phase"] == "Running" or container["image"] == BAD_IMAGE
+            if (
+                container["image"] != image
+            ):  # no proxy changes before the image was usable on a node
+                told = [(problem.reason, problem.of) for problem in plan.problems]
+                assert ("ImageUnusable", place.of) in told
+                continue
             assert len(proxy.range) == rosproxy["ports"] or self.told(plan, place, "PortsExhausted")
             env = {variable["name"]: variable["value"] for variable in container["env"]}
             self.check_versions(place, proxy, env)
