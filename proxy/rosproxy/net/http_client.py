@@ -1,9 +1,9 @@
 """The client's side of XML-RPC: POST over kept connections.
 
-aiohttp's connection and parser do the work. Its ClientSession is left out: with cookies, redirects,
-proxies and the like a call takes 1.7 times as long, and it closes the connection of a call that is
-given up, which ends roslisp nodes (`rosproxy.net.late_answers`). Nothing is ever inflated: ROS does
-not compress, and a small body could become a huge one.
+aiohttp's parser (llhttp) reads the responses. Its ClientSession is left out: with cookies,
+redirects, proxies and the like a call takes twice as long, and it closes the connection of a call
+that is given up, which ends roslisp nodes (`rosproxy.net.late_answers`). Nothing is ever inflated:
+ROS does not compress, and a small body could become a huge one.
 
 Bodies that need not be read here, requests and replies alike, go through piece by piece: who can't
 write does not read, so that they take some 100 KiB whatever their length.
@@ -13,16 +13,18 @@ import asyncio
 import errno
 import re
 import socket
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
 from functools import partial
 from typing import Protocol
 
 import aiohttp
-from aiohttp.client_proto import ResponseHandler
-from aiohttp.http import StreamWriter
+from aiohttp.http import HttpResponseParser, RawResponseMessage
+from aiohttp.http_exceptions import HttpProcessingError
 
 from rosproxy.net import resolver
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_protocol import HttpProtocol, wake
 from rosproxy.net.late_answers import LateAnswers
 from rosproxy.net.sockets import dial
 
@@ -40,8 +42,6 @@ CONNECT_TIMEOUT = 2.0
 rosmaster calls all subscribers from three threads (master_api.py, NUM_WORKERS): those that don't
 answer hold up the others.
 """
-SEPARATE_BODY = 64 * 1024
-"""Bytes from which on a body is not copied to stand behind its header."""
 
 _SENDABLE = re.compile(r"[^\x00-\x20\x7f]+")
 
@@ -77,6 +77,86 @@ class LongReply:
         self._finish()
 
 
+class ClientConnection(HttpProtocol):
+    """A connection to a peer, for one call at a time."""
+
+    def __init__(self) -> None:
+        loop = asyncio.get_running_loop()
+        # A reply that tells no length ends with its connection, as in HTTP/1.0 (read_until_eof).
+        self._responses = HttpResponseParser(
+            self,
+            loop,
+            LONG,
+            payload_exception=aiohttp.ClientPayloadError,
+            read_until_eof=True,
+            auto_decompress=False,
+        )
+        super().__init__(loop, self._responses)
+        self._messages: deque[tuple[RawResponseMessage, aiohttp.StreamReader]] = deque()
+        self._content: aiohttp.StreamReader | None = None
+        """The body of the latest response."""
+        self._arrival: asyncio.Future[None] | None = None
+        self._failure: Exception | None = None
+        self._lasts = True
+
+    @property
+    def reusable(self) -> bool:
+        """Whether the connection can carry another call."""
+        is_read = self._content is None or self._content.is_eof()
+        is_open = self.transport is not None and not self.transport.is_closing()
+        return self._lasts and is_read and is_open and not self._messages
+
+    def data_received(self, data: bytes) -> None:
+        """Take in what has come; also called with nothing, when the parser may go on."""
+        if self._failure is not None:
+            return
+        try:
+            messages, _, _ = self._responses.feed_data(data)
+        except HttpProcessingError as error:
+            self._fail(ValueError(f"the answer is not HTTP: {error.message}"))
+            return
+        for message, content in messages:
+            self._messages.append((message, content))
+            self._content = content
+            self._lasts = self._lasts and not message.should_close
+        if messages:
+            wake(self._arrival)
+
+    def eof_received(self) -> None:
+        """Close the connection, as the peer has closed its side."""
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        """End the call that is under way."""
+        try:
+            self._responses.feed_eof()  # ends a body that tells no length
+        except Exception as error:
+            if self._content is not None:
+                text = f"the body is not complete: {exc or error}"
+                self._content.set_exception(aiohttp.ClientPayloadError(text))
+        super().connection_lost(exc)
+        self._fail(exc if isinstance(exc, OSError) else aiohttp.ServerDisconnectedError())
+
+    async def response(self) -> tuple[RawResponseMessage, aiohttp.StreamReader]:
+        """The next response. Raises OSError, aiohttp.ClientError, ValueError."""
+        while not self._messages:
+            if self._failure is not None:
+                raise self._failure
+            self._arrival = self._loop.create_future()
+            await self._arrival
+        return self._messages.popleft()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._lasts = False
+        if self.transport is not None:
+            self.transport.close()
+
+    def _fail(self, error: Exception) -> None:
+        self._lasts = False
+        self._failure = self._failure or error
+        wake(self._arrival)
+
+
 class HttpClient:
     """Calls one kind of peer.
 
@@ -101,8 +181,8 @@ class HttpClient:
         self._limit = asyncio.Semaphore(most)
         self._source = source
         self._longest = longest
-        self._idle: dict[HostPort, list[tuple[float, ResponseHandler]]] = {}
-        self._used: set[ResponseHandler] = set()
+        self._idle: dict[HostPort, list[tuple[float, ClientConnection]]] = {}
+        self._used: set[ClientConnection] = set()
         self.late = LateAnswers()
         self._sweeper: asyncio.TimerHandle | None = None
         self._closed = False
@@ -124,8 +204,8 @@ class HttpClient:
         """
         head = self._head(path, host, len(body))
         async with asyncio.timeout(within), self._limit:
-            handler, stream, _ = await self._ask(peer, head, body)
-            return await self._read_whole(peer, handler, stream, longest or self._longest)
+            connection, stream, _ = await self._ask(peer, head, body)
+            return await self._read_whole(peer, connection, stream, longest or self._longest)
 
     async def pass_on(
         self, peer: HostPort, path: str, host: str, body: bytes | LongBody, within: float
@@ -143,15 +223,15 @@ class HttpClient:
         # A long body takes no place among the ``most``, or short calls would have to wait for it.
         head = self._head(path, host, body.size)
         async with asyncio.timeout(within):
-            handler = await self._connect(peer)
-        self._used.add(handler)
+            connection = await self._connect(peer)
+        self._used.add(connection)
         try:
             async with asyncio.timeout(LONG_TIMEOUT):
-                await _upload(handler, head, body)
+                await _upload(connection, head, body)
             async with asyncio.timeout(within):
-                return await self._pass_reply(peer, handler, *await _answer(handler))
+                return await self._pass_reply(peer, connection, *await _answer(connection))
         except BaseException:
-            self._drop(handler)
+            self._drop(connection)
             raise
 
     def request(self, path: str, host: str, body: bytes) -> bytes:
@@ -163,8 +243,8 @@ class HttpClient:
         self._closed = True
         if self._sweeper is not None:
             self._sweeper.cancel()
-        for handler in [*self._used, *(h for idle in self._idle.values() for _, h in idle)]:
-            handler.close()
+        for connection in [*self._used, *(h for idle in self._idle.values() for _, h in idle)]:
+            connection.close()
         self._idle.clear()
         await self.late.end()
         await asyncio.sleep(0)  # asyncio closes a transport's socket in the loop's next turn
@@ -184,7 +264,7 @@ class HttpClient:
 
     async def _ask(
         self, peer: HostPort, head: bytes, body: bytes
-    ) -> tuple[ResponseHandler, aiohttp.StreamReader, int | None]:
+    ) -> tuple[ClientConnection, aiohttp.StreamReader, int | None]:
         """Send a request and wait for a response: its connection, body and length."""
         kept = self._take(peer)
         if kept is not None:
@@ -193,62 +273,62 @@ class HttpClient:
             except (aiohttp.ClientError, ConnectionError) as error:
                 if not _was_closed(error):
                     raise
-        handler = await self._connect(peer)
-        return handler, *await self._exchange(handler, head, body)
+        connection = await self._connect(peer)
+        return connection, *await self._exchange(connection, head, body)
 
     async def _exchange(
-        self, handler: ResponseHandler, head: bytes, body: bytes
+        self, connection: ClientConnection, head: bytes, body: bytes
     ) -> tuple[aiohttp.StreamReader, int | None]:
-        self._used.add(handler)
+        self._used.add(connection)
         try:
-            _expect(handler)
-            if handler.transport is None:
-                raise aiohttp.ServerDisconnectedError
-            for piece in pieces(head, body):
-                handler.transport.write(piece)
-            return await _answer(handler)
+            connection.write_message(head, body)
+            return await _answer(connection)
         except asyncio.CancelledError:  # too late, or nobody wants it any more
-            self._used.discard(handler)
-            self.late.wait(partial(_drain_answer, handler), handler.close)
+            self._used.discard(connection)
+            self.late.wait(partial(_drain_answer, connection), connection.close)
             raise
         except BaseException:
-            self._drop(handler)
+            self._drop(connection)
             raise
 
     async def _read_whole(
-        self, peer: HostPort, handler: ResponseHandler, stream: aiohttp.StreamReader, longest: int
+        self,
+        peer: HostPort,
+        connection: ClientConnection,
+        stream: aiohttp.StreamReader,
+        longest: int,
     ) -> bytes:
         try:
             reply = await read_bounded(stream, longest)
         except BaseException:
-            self._drop(handler)
+            self._drop(connection)
             raise
-        self._finish(peer, handler)
+        self._finish(peer, connection)
         return reply
 
     async def _pass_reply(
         self,
         peer: HostPort,
-        handler: ResponseHandler,
+        connection: ClientConnection,
         stream: aiohttp.StreamReader,
         size: int | None,
     ) -> bytes | LongReply:
         if size is None or size <= LONG:
-            return await self._read_whole(peer, handler, stream, self._longest)
+            return await self._read_whole(peer, connection, stream, self._longest)
         if size > self._longest:
-            self._drop(handler)
+            self._drop(connection)
             raise TooLong(self._longest)
-        return LongReply(size, stream, partial(self._finish, peer, handler))
+        return LongReply(size, stream, partial(self._finish, peer, connection))
 
-    def _drop(self, handler: ResponseHandler) -> None:
-        self._used.discard(handler)
-        handler.close()
+    def _drop(self, connection: ClientConnection) -> None:
+        self._used.discard(connection)
+        connection.close()
 
-    def _finish(self, peer: HostPort, handler: ResponseHandler) -> None:
-        self._used.discard(handler)
-        self._keep(peer, handler)
+    def _finish(self, peer: HostPort, connection: ClientConnection) -> None:
+        self._used.discard(connection)
+        self._keep(peer, connection)
 
-    async def _connect(self, peer: HostPort) -> ResponseHandler:
+    async def _connect(self, peer: HostPort) -> ClientConnection:
         """A new connection; never redirected or led elsewhere than to ``peer``."""
         if self._closed:
             raise ConnectionAbortedError("the proxy is stopping")
@@ -260,27 +340,27 @@ class HttpClient:
             except OSError as error:
                 failure = error
                 continue
-            _, handler = await loop.create_connection(lambda: ResponseHandler(loop), sock=sock)
+            _, connection = await loop.create_connection(ClientConnection, sock=sock)
             self.last_address = address
-            return handler
+            return connection
         raise failure
 
-    def _take(self, peer: HostPort) -> ResponseHandler | None:
+    def _take(self, peer: HostPort) -> ClientConnection | None:
         """The connection that was used last, if one is left that can still be used."""
         idle = self._idle.get(peer, [])
         while idle:
-            _, handler = idle.pop()
-            if handler.is_connected() and not handler.should_close:
-                return handler
-            handler.close()
+            _, connection = idle.pop()
+            if connection.reusable:
+                return connection
+            connection.close()
         return None
 
-    def _keep(self, peer: HostPort, handler: ResponseHandler) -> None:
-        if handler.should_close or not handler.is_connected() or self._closed:
-            handler.close()
+    def _keep(self, peer: HostPort, connection: ClientConnection) -> None:
+        if not connection.reusable or self._closed:
+            connection.close()
             return
         loop = asyncio.get_running_loop()
-        self._idle.setdefault(peer, []).append((loop.time(), handler))
+        self._idle.setdefault(peer, []).append((loop.time(), connection))
         if self._sweeper is None:
             self._sweeper = loop.call_later(self._keepalive, self._sweep)
 
@@ -290,17 +370,12 @@ class HttpClient:
         expiry = loop.time() - self._keepalive
         self._sweeper = None
         for peer, idle in self._idle.items():
-            for _, handler in (pair for pair in idle if pair[0] <= expiry):
-                handler.close()
+            for _, connection in (pair for pair in idle if pair[0] <= expiry):
+                connection.close()
             self._idle[peer] = [pair for pair in idle if pair[0] > expiry]
         self._idle = {peer: idle for peer, idle in self._idle.items() if idle}
         if self._idle:
             self._sweeper = loop.call_later(self._keepalive / 2, self._sweep)
-
-
-def pieces(head: bytes, body: bytes) -> tuple[bytes, ...]:
-    """What to write one after the other: both at once, unless that would copy a long body."""
-    return (head + body,) if len(body) < SEPARATE_BODY else (head, body)
 
 
 class BadResponse(ValueError):
@@ -338,29 +413,20 @@ async def read_bounded(
     return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
 
-def _expect(handler: ResponseHandler) -> None:
-    # read_until_eof: a reply that tells no length ends with its connection, as in HTTP/1.0.
-    handler.set_response_params(read_until_eof=True, auto_decompress=False, read_bufsize=LONG)
-
-
-async def _upload(handler: ResponseHandler, head: bytes, body: LongBody) -> None:
+async def _upload(connection: ClientConnection, head: bytes, body: LongBody) -> None:
     """Send a long body, as fast as the peer takes it."""
-    _expect(handler)
-    writer = StreamWriter(handler, asyncio.get_running_loop())
-    await writer.write(head)
+    connection.write(head)
     async for piece in body.pieces():
         async with asyncio.timeout(PIECE_TIMEOUT):
-            await writer.write(piece)
+            connection.write(piece)
+            await connection.drain()
 
 
-async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int | None]:
+async def _answer(connection: ClientConnection) -> tuple[aiohttp.StreamReader, int | None]:
     """The body of a response with status 200, and its length if that is told."""
-    try:
-        message, payload = await handler.read()
-        while 100 <= message.code < 200:
-            message, payload = await handler.read()
-    except aiohttp.http.HttpProcessingError as error:
-        raise ValueError(f"the answer is not HTTP: {error.message}") from error
+    message, payload = await connection.response()
+    while 100 <= message.code < 200:
+        message, payload = await connection.response()
     if message.code != 200:
         raise BadResponse(f"HTTP status {message.code}")
     if not is_plain(message.headers):
@@ -369,8 +435,8 @@ async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int |
     return payload, int(length) if length else None
 
 
-async def _drain_answer(handler: ResponseHandler) -> None:
-    stream, _ = await _answer(handler)
+async def _drain_answer(connection: ClientConnection) -> None:
+    stream, _ = await _answer(connection)
     while not stream.at_eof():
         await stream.readany()
 

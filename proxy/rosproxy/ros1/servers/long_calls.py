@@ -4,9 +4,10 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import TYPE_CHECKING, Protocol
 
-from aiohttp import StreamReader, web
+from aiohttp import StreamReader
 
 from rosproxy.net.http_client import PIECE_TIMEOUT, LongReply
+from rosproxy.net.http_server import BadBody
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch, cut
 
@@ -44,7 +45,7 @@ class LongCall:
             try:
                 async with asyncio.timeout(PIECE_TIMEOUT):
                     piece = await self._rest.readany()
-            except (OSError, web.RequestPayloadError) as error:  # a time-out is one of the former
+            except (OSError, BadBody) as error:  # a time-out is one of the former
                 raise Unreachable(f"the caller did not send the whole body: {error}") from error
             self._watch.see(piece)
             yield previous

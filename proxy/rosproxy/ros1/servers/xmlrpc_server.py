@@ -1,4 +1,4 @@
-"""The HTTP server of XML-RPC: aiohttp reads requests, a service makes the replies.
+"""The server of XML-RPC: `rosproxy.net.http_server` reads requests, a service makes the replies.
 
 What peers expect (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client): a Content-Length always,
 no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 200.
@@ -14,15 +14,22 @@ import logging
 import socket
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
-from functools import lru_cache, partial
-from typing import Any, TypeVar
+from functools import partial
+from typing import TypeVar
 
-import aiohttp
-from aiohttp import web
+from aiohttp import ClientError
 
-from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
+from rosproxy.net.addresses import parse_host_port
 from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.net.http_client import LongReply, TooLong, is_plain, read_bounded
+from rosproxy.net.http_server import (
+    BadBody,
+    HttpConnection,
+    HttpReply,
+    HttpRequest,
+    HttpServer,
+    text_reply,
+)
 from rosproxy.net.sockets import end_if_stalled, hang_up, peek
 from rosproxy.ros1.clients.master_client import LOOP_HEADER, Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
@@ -31,7 +38,6 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.servers.long_calls import LongCall, LongCalls
-from rosproxy.ros1.servers.replies import DocumentReply, invite, refuse
 from rosproxy.settings import MEBIBYTE
 from rosproxy.telemetry.metrics import Metrics
 
@@ -43,11 +49,6 @@ HEADER_TIMEOUT = 30.0
 """Seconds in which the header of a connection's first request must arrive."""
 STOP_TIMEOUT = 0.5
 """Seconds that calls under way get to end when the server stops."""
-READ_AHEAD = 64 * 1024
-"""Bytes of a body that wait to be read, before the client has to wait."""
-MOST_LINE = 4096
-MOST_FIELDS = 64
-"""Longest line of a request's header in bytes, and how many fields it has: ROS's have five."""
 VALUE = 400
 """Bytes of memory that a value of a document takes while its call is answered."""
 
@@ -61,20 +62,19 @@ class IncomingCall:
     OverBudget.
     """
 
-    def __init__(self, request: web.BaseRequest, hold: Callable[[int], None]) -> None:
-        protocol = request.protocol
+    def __init__(self, request: HttpRequest, hold: Callable[[int], None]) -> None:
         self.body = b""
         self.charge = hold
         self._request = request
-        self.source = _source(request)
-        self.local = _address(protocol.sockname)
+        self.source = request.connection.source.host
+        self.local = request.connection.local
         self.host_header = request.headers.get("Host", "")
         self.loop_id = request.headers.get(LOOP_HEADER, "")
 
     @property
     def path(self) -> str:
         """The path that is called, with what follows a question mark."""
-        return self._request.path_qs
+        return self._request.path
 
     def comes_from(self, instance: str) -> bool:
         """Whether a proxy itself made this call."""
@@ -83,7 +83,7 @@ class IncomingCall:
     @property
     def gone(self) -> bool:
         """Whether the caller has closed the connection."""
-        return self._request.transport is None
+        return self._request.connection.gone
 
     @property
     def reached_locally(self) -> bool:
@@ -125,7 +125,7 @@ class HttpRefusal(Exception):
         self.reason = reason
 
 
-class XmlRpcServer(web.Server):
+class XmlRpcServer(HttpServer):
     """Turns accepted sockets into XML-RPC calls to a service, for those whom the guard lets in.
 
     ``limits`` are those of calls that the service reads; ``long_calls`` take those that it need not
@@ -141,25 +141,15 @@ class XmlRpcServer(web.Server):
         long_calls: LongCalls | None = None,
         guard: Guard | None = None,
     ) -> None:
-        super().__init__(
-            self._handle,
-            access_log=None,
-            keepalive_timeout=75,
-            auto_decompress=False,
-            read_bufsize=READ_AHEAD,
-            max_line_size=MOST_LINE,
-            max_field_size=MOST_LINE,
-            max_headers=MOST_FIELDS,
-        )
+        super().__init__()
         self._context = context
         self._service = service
         self._greeting = greeting
         self._limits = limits
         self._long_calls = long_calls
         self._guard = guard
-        self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
-        self._busy: set[web.RequestHandler] = set()
-        self._mute: dict[web.RequestHandler, Callable[[], None]] = {}
+        self._by_port: defaultdict[int, set[HttpConnection]] = defaultdict(set)
+        self._mute: dict[HttpConnection, Callable[[], None]] = {}
 
     async def dispatch(
         self,
@@ -189,59 +179,57 @@ class XmlRpcServer(web.Server):
 
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
-        for handler in list(self._by_port[port]):
-            if handler in self._busy:
-                handler.close()
+        for connection in list(self._by_port[port]):
+            if connection.busy:
+                connection.close()
             else:
-                handler.force_close()
+                connection.force_close()
 
     async def close(self) -> None:
         """Close all connections."""
         await self.shutdown(STOP_TIMEOUT)
 
-    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+    def connection_made(self, connection: HttpConnection) -> None:
         """Know a connection by the port that it came in on, and wait for its first request."""
-        super().connection_made(handler, transport)
-        port = _address(handler.sockname).port
-        source = _address(handler.peername).host
-        self._by_port[port].add(handler)
+        super().connection_made(connection)
+        port = connection.local.port
+        source = connection.source.host
+        self._by_port[port].add(connection)
         self._context.gate.enter(source, port)  # the acceptor counts until `dispatch` has ended
-        self._mute[handler] = self._context.gate.wait(source, handler.force_close)
-        asyncio.get_running_loop().call_later(HEADER_TIMEOUT, self._close_mute, handler)
+        self._mute[connection] = self._context.gate.wait(source, connection.force_close)
+        asyncio.get_running_loop().call_later(HEADER_TIMEOUT, self._close_mute, connection)
 
-    def connection_lost(
-        self, handler: web.RequestHandler, exc: BaseException | None = None
-    ) -> None:
+    def connection_lost(self, connection: HttpConnection) -> None:
         """Forget a connection."""
-        super().connection_lost(handler, exc)
-        self._mute.pop(handler, _nothing)()
-        port = _address(handler.sockname).port
-        if handler in self._by_port[port]:
-            self._by_port[port].discard(handler)
-            self._context.gate.leave(_address(handler.peername).host, port)
+        super().connection_lost(connection)
+        self._mute.pop(connection, _nothing)()
+        port = connection.local.port
+        if connection in self._by_port[port]:
+            self._by_port[port].discard(connection)
+            self._context.gate.leave(connection.source.host, port)
 
-    def _close_mute(self, handler: web.RequestHandler) -> None:
-        if handler in self._mute:
-            self._mute.pop(handler)()
-            handler.force_close()
+    def _close_mute(self, connection: HttpConnection) -> None:
+        if connection in self._mute:
+            self._mute.pop(connection)()
+            connection.force_close()
 
-    async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
-        self._mute.pop(request.protocol, _nothing)()
-        self._busy.add(request.protocol)
-        try:
-            return await self._respond(request)
-        finally:
-            self._busy.discard(request.protocol)
+    async def answer(self, request: HttpRequest) -> None:
+        """Answer a request. Raises ConnectionError."""
+        self._mute.pop(request.connection, _nothing)()
+        reply = await self._reply(request)
+        if reply is not None:
+            await request.send(reply)
 
-    async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
+    async def _reply(self, request: HttpRequest) -> HttpReply | None:
+        """The reply to a request; None if it was sent, or if the connection was reset."""
         if request.method in ("GET", "HEAD"):  # never forwarded: roscpp's server hangs on a GET
-            return web.Response(text=self._greeting)
+            return text_reply(self._greeting)
         if request.method != "POST":
-            return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
-        source = _source(request)
+            return text_reply("XML-RPC uses POST\n", 405, lines="Allow: POST\r\n")
+        source = request.connection.source.host
         denial = await self._guard(source) if self._guard else None
-        if denial:
-            return _forbid(denial)
+        if denial:  # rospy shows the reason phrase, people the text
+            return text_reply(f"{denial}\n", 403, denial, lasts=False)
         try:
             with Charge(self._context.buffered, source) as charge:
                 return await self._answer(request, IncomingCall(request, charge.add))
@@ -254,35 +242,38 @@ class XmlRpcServer(web.Server):
             reason = "over_budget"
             text = str(error)
         self._context.refusals.note(reason, source, text)
-        return web.Response(status=status, text=f"rosproxy: {text}\n")
+        return text_reply(f"rosproxy: {text}\n", status)
 
-    async def _answer(self, request: web.BaseRequest, call: IncomingCall) -> web.StreamResponse:
-        """Read a call, and send the reply. Raises HttpRefusal, OverBudget."""
+    async def _answer(self, request: HttpRequest, call: IncomingCall) -> HttpReply | None:
+        """Read a call, and answer it. Raises HttpRefusal, OverBudget, ConnectionError."""
         try:
             answer = await self._read(request, call)
             reply = await (answer or self._service(call))
         except xmlrpc.XmlRpcError as error:
             reply = xmlrpc.dump_fault(error.code, f"rosproxy: {error}")
         except (ConnectionResetError, Unreachable) as error:
-            log.debug("no answer for %s: %s", request.remote, error)
-            return refuse(request)
+            log.debug("no answer for %s: %s", call.source, error)
+            request.reset()
+            return None
         except (HttpRefusal, OverBudget):
             raise
-        except web.RequestPayloadError as error:
-            return web.Response(status=400, text=f"{error}\n")
+        except BadBody as error:
+            return text_reply(f"{error}\n", 400)
         except Exception:
-            log.exception("a call from %s failed in the proxy", request.remote)
+            log.exception("a call from %s failed in the proxy", call.source)
             reply = xmlrpc.dump_fault(
                 xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see the proxy's log"
             )
         if isinstance(reply, LongReply):
-            return await self._send_long(request, call, reply)
+            await self._send_long(request, call, reply)
+            return None
         if len(reply) > passing.SHORT:
             call.charge(len(reply))
-        return await _send(request, DocumentReply(reply))
+        await request.send(HttpReply(reply))  # here, since the charge ends with this method
+        return None
 
     async def _read(
-        self, request: web.BaseRequest, call: IncomingCall
+        self, request: HttpRequest, call: IncomingCall
     ) -> Awaitable[bytes | LongReply] | None:
         """Read a call's body; the answer to one that passes, of which only the head is read.
 
@@ -297,7 +288,7 @@ class XmlRpcServer(web.Server):
                 await self._take_in(call, request.content.read_nowait())
                 return self._pass_unread(request, call)
             async with asyncio.timeout(BODY_TIMEOUT):
-                invite(request)
+                request.invite()
                 if size > passing.SHORT and self._long_calls is not None:
                     long_call = await self._read_head(request, call, size, self._long_calls)
                     if long_call is not None:
@@ -313,7 +304,7 @@ class XmlRpcServer(web.Server):
         return self._pass_unread(request, call)
 
     def _pass_unread(
-        self, request: web.BaseRequest, call: IncomingCall
+        self, request: HttpRequest, call: IncomingCall
     ) -> Awaitable[bytes | LongReply] | None:
         """The answer to a whole call with more elements than are read, if it need not be read."""
         service = self._long_calls
@@ -328,7 +319,7 @@ class XmlRpcServer(web.Server):
         return self._pass_on(service, call, long_call)
 
     async def _read_head(
-        self, request: web.BaseRequest, call: IncomingCall, size: int, service: LongCalls
+        self, request: HttpRequest, call: IncomingCall, size: int, service: LongCalls
     ) -> LongCall | None:
         """Read so much of a long body that its method is known; the call if it passes.
 
@@ -347,7 +338,7 @@ class XmlRpcServer(web.Server):
             raise TooLong(longest)
         return LongCall(method, size, call.body, request.content, watch)
 
-    async def _read_rest(self, request: web.BaseRequest, call: IncomingCall) -> None:
+    async def _read_rest(self, request: HttpRequest, call: IncomingCall) -> None:
         rest = await read_bounded(request.content, self._limits.size - len(call.body), call.charge)
         await self._take_in(call, call.body + rest, len(call.body) + len(rest))
 
@@ -368,49 +359,20 @@ class XmlRpcServer(web.Server):
             charge.add(1)
             return await service.pass_on(call, long_call)
 
-    async def _send_long(
-        self, request: web.BaseRequest, call: IncomingCall, reply: LongReply
-    ) -> web.StreamResponse:
+    async def _send_long(self, request: HttpRequest, call: IncomingCall, reply: LongReply) -> None:
         """Send a reply on, piece by piece. Raises OverBudget."""
-        response = DocumentReply(b"", reply.size)
         try:
             with Charge(self._context.unread_calls, call.source) as charge:
                 charge.add(1)
-                await response.prepare(request)
+                await request.begin(reply.size)
                 async for piece in reply.pieces():
-                    await request.writer.write(piece)
-        except (OSError, aiohttp.ClientError) as error:  # a time-out is one of the former
-            log.debug("a long reply for %s was cut: %s", request.remote, error)
-            return refuse(request)
+                    await request.write(piece)
+        except (OSError, ClientError) as error:  # a time-out is one of the former
+            log.debug("a long reply for %s was cut: %s", call.source, error)
+            request.reset()
         finally:
             reply.close()
-        return response
 
 
 def _nothing() -> None:
     pass
-
-
-@lru_cache(maxsize=1024)
-def _address(sockname: Any) -> HostPort:
-    return HostPort(plain_address(sockname[0]), sockname[1]) if sockname else HostPort("", 0)
-
-
-def _source(request: web.BaseRequest) -> str:
-    return _address(request.protocol.peername).host
-
-
-def _forbid(text: str) -> web.StreamResponse:
-    """The answer to somebody who is not let in; rospy shows the reason phrase, people the text."""
-    response = web.Response(status=403, reason=text, text=f"{text}\n")
-    response.force_close()
-    return response
-
-
-async def _send(request: web.BaseRequest, response: DocumentReply) -> DocumentReply:
-    """Send a reply; that nobody is there any more the server sees for itself."""
-    try:
-        await response.prepare(request)
-    except ConnectionError as error:
-        log.debug("the caller %s has closed the connection: %s", request.remote, error)
-    return response
