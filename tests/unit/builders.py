@@ -13,12 +13,13 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind, method_spec
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.protocol.xmlrpc.values import Edit
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from rosproxy.ros1.rewriting.master_calls import CallOutcome, Refusal, RegistryChange
+from rosproxy.ros1.rewriting.master_calls import CallOutcome, CallResult, RegistryChange, refusal
 from rosproxy.settings import Settings
 
 HOST = "robot-host"
@@ -192,7 +193,12 @@ def exchange(
     facts = answer.registry_changes(7.0)
     for fact in facts:
         note(addressing.registry, fact)
-    return Exchange(exported.body, master_api.import_reply(answer, addressing), facts)
+    return Exchange(exported.body, master_api.import_reply(answer, addressing, unfiltered), facts)
+
+
+def unfiltered(result: CallResult, caller: Caller) -> list[Edit]:
+    """The edits of a policy without rules."""
+    return []
 
 
 def note(registry: Registry, fact: RegistryChange) -> None:
@@ -217,7 +223,7 @@ def _admit(addressing: Addressing, uri: str | None, caller: Caller, refuse: Refu
     if uri is None or node is None:
         return None
     if refuse(uri):
-        return Refusal("rosproxy: no port is left")
+        return refusal("rosproxy: no port is left")
     named = node.host.startswith("10.")
     location = NodeLocation(node.host if named else caller.address, named)
     return addressing.registry.admit(uri, node, location, caller.address)

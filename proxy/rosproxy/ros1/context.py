@@ -14,6 +14,8 @@ from rosproxy.net.interfaces import address_towards, interface_networks
 from rosproxy.net.network_changes import NetworkChanges
 from rosproxy.ros1.clients.master_client import MasterClient
 from rosproxy.ros1.clients.node_client import NodeClient
+from rosproxy.ros1.policy.checks import Ros1Policy
+from rosproxy.ros1.policy.service_finder import ServiceFinder
 from rosproxy.ros1.protocol.xmlrpc import limits
 from rosproxy.ros1.registry.client_kinds import ClientKind, client_kind
 from rosproxy.ros1.registry.endpoint import Endpoint
@@ -42,7 +44,7 @@ class Context:
     ``lease_call`` and ``master_call`` bound what is read of a call from outside and from inside.
     ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
     ``unread_calls`` the calls that pass unread; ``refusals`` tells what is over these and other
-    bounds. ``policy``: what outside may see and do.
+    bounds. ``policy``: what outside may see and do, and what inside may take from outside.
     """
 
     def __init__(self, runtime: Runtime) -> None:
@@ -54,7 +56,6 @@ class Context:
         self.problems = runtime.problems
         self.refusals = runtime.refusals
         self.outside_changed = runtime.outside_changed
-        self.policy = runtime.policy
         self.gate = Gate(
             settings.max_connections_per_source,
             settings.max_connections_per_lease,
@@ -79,6 +80,10 @@ class Context:
             settings.max_body * MEBIBYTE,
         )
         self.nodes = NodeClient(self.upstream, settings.probe_timeout)
+        finder = ServiceFinder(runtime.policy, self.registry, self.nodes, self.now)
+        self.policy = Ros1Policy(
+            runtime.policy, self.registry, self.addressing, self.upstream, finder
+        )
         self.retired = False
         self._selected: frozenset[str] | None = None
         self._proxy_addresses: dict[str, str] = {}

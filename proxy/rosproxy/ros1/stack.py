@@ -37,7 +37,6 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.ros1.range_probe import probe_range
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL, TcprosServer
@@ -55,7 +54,6 @@ from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
-from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
 
@@ -75,9 +73,6 @@ class Ros1:
         # Callers may make up methods without end; those of other names share one label.
         runtime.metrics.known_methods = KNOWN_METHODS
         self.context = context = Context(runtime)
-        self._access = access = AccessChecks(
-            context.policy, context.registry, context.addressing, context.upstream
-        )
         self.tcpros = TcprosServer(context)
         holders = BothSides(context.registry, context.stand_ins.by_port)
         table = TrackedTable(ConnectionTable(settings.master_port, settings.ports.listen), Tools())
@@ -86,7 +81,7 @@ class Ros1:
             settings, holders, context.tasks, context.problems, context.now, table, networks
         )
         self._callers = Callers(context)
-        self.stand_ins = StandInPorts(context, self._callers, self.tcpros, access, plane)
+        self.stand_ins = StandInPorts(context, self._callers, self.tcpros, plane)
         self._publisher_updates = publisher_updates = PublisherUpdates(context, self.stand_ins)
         self._memory = LeaseMemory(context)
         self.registrar = registrar = Registrar(context, publisher_updates, self._memory)
@@ -95,10 +90,10 @@ class Ros1:
         )
         self.leases = leases = self._make_leases()
         self._recovery = Recovery(
-            context, leases, registrar, self._resubscriber, plane, access, self._memory
+            context, leases, registrar, self._resubscriber, plane, self._memory
         )
         self._enforcer = PolicyEnforcer(
-            context, leases, registrar, self._recovery, self.tcpros, plane, access, self.stand_ins
+            context, leases, registrar, self._recovery, self.tcpros, plane, self.stand_ins
         )
         self._admission = NodeAdmission(context, leases, registrar, self._recovery)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
@@ -109,7 +104,7 @@ class Ros1:
         self._state = Ros1State(context, monitor, self.tcpros, self.stand_ins, plane, messages)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(
-            context, leases, self.stand_ins, self._adopter, self.tcpros, access
+            context, leases, self.stand_ins, self._adopter, self.tcpros
         )
         self._servers = [slave.server, self.stand_ins.server]
         self._acceptors: list[Acceptor] = []
@@ -143,13 +138,10 @@ class Ros1:
         return MasterApi(
             self.context,
             self._admission,
-            self.stand_ins,
-            self._recovery,
             self._adopter,
-            self._access,
+            self._recovery,
+            self.stand_ins,
             self._publisher_updates,
-            self._enforcer,
-            ServiceFinder(self.context),
             self._memory,
         )
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 
 import msgspec
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -16,9 +16,9 @@ from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
 from rosproxy.net import proxy_signs
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.policy.checks import RULE_KINDS
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import STATES, Endpoint
-from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
@@ -209,20 +209,20 @@ class Ros1State(Collector):
     def _hidden(self) -> tuple[list[document.HiddenStatus], int]:
         """What the policy keeps from the master, and how much of that is left out."""
         policy = self._context.policy
-        registrations = [
-            (KINDS[kind], name, node, endpoint.address)
-            for (kind, name), holders in self._context.registry.hidden.items()
-            for node, endpoint in holders.items()
-        ]
-        shown = fair_choice(registrations, itemgetter(3), MOST_HIDDEN)
-        shown.sort(key=str)
+        hidden = policy.hidden_registrations()
         rows = [
             document.HiddenStatus(
-                kind.value, name, node, policy.judge(kind, name, [node], address).reason, address
+                RULE_KINDS[registration.kind].value,
+                registration.name,
+                registration.caller_id,
+                policy.verdict(endpoint, registration).reason,
+                endpoint.address,
             )
-            for kind, name, node, address in shown
+            for endpoint, registration in fair_choice(
+                hidden, lambda pair: pair[0].address, MOST_HIDDEN
+            )
         ]
-        return rows, len(registrations) - len(rows)
+        return sorted(rows, key=str), len(hidden) - len(rows)
 
     def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
         problems = self._context.problems.at(endpoint.port)

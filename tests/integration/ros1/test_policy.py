@@ -426,7 +426,7 @@ async def test_a_bad_policy_names_what_is_wrong(proxy, body, says):
     reply = await post(proxy, "/policy", body)
     assert reply.status == 400
     assert says in reply.body
-    assert proxy.ros1.context.policy.layers == ()
+    assert proxy.ros1.context.policy.rules.layers == ()
 
 
 # 6. Restarts

@@ -1,13 +1,17 @@
 """The master port: inside nodes call it as their master.
 
-A call that registers or names an address goes one way: its node is admitted (`admission`), its
-addresses are exported, the master is called, what it accepted is noted in the registry, and the
-addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All other calls pass as
-they are; long ones, parameters above all, unread.
+A request that registers or names an address takes these steps (`MasterApi`):
 
-The policy is asked (`AccessChecks`) when it is settled what becomes of each call, and what it
-changes in the reply. What it denies the master does not get; the nodes inside that have to know are
-told (`PublisherUpdates`).
+1. Read: parse the calls (`rosproxy.ros1.rewriting.master_calls`).
+2. Check: ask the policy. The proxy itself answers what a rule denies, and finds what is hidden.
+3. Admit: give the node an endpoint, and ask the policy about the registration.
+4. Export the addresses (`rosproxy.ros1.rewriting.master_api`).
+5. Call the master.
+6. Record in the registry what the master has accepted, and tell subscribers of hidden publishers.
+7. Filter the reply by the policy, and import the addresses.
+
+A ``system.multicall`` takes the same steps, for each of its calls. All other requests pass as they
+are; long ones, parameters above all, unread.
 """
 
 import asyncio
@@ -25,28 +29,27 @@ from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.master_calls import (
     CallOutcome,
-    LocalReply,
-    Refusal,
+    ExportedRequest,
+    LocalAnswer,
+    MasterReply,
     RegistryChange,
     Request,
     caller_id_of,
+    refusal,
 )
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, count_reply
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
-from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
-from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 
 
 @dataclass(slots=True, eq=False)
@@ -55,13 +58,10 @@ class MasterApi:
 
     _context: Context
     _admission: NodeAdmission
-    _stand_ins: StandInPorts
-    _recovery: Recovery
     _adopter: Adopter
-    _access: AccessChecks
+    _recovery: Recovery
+    _stand_ins: StandInPorts
     _publisher_updates: PublisherUpdates
-    _enforcer: PolicyEnforcer
-    _services: ServiceFinder
     _memory: LeaseMemory
 
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
@@ -71,9 +71,9 @@ class MasterApi:
         caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics = self._context.metrics
         upstream = self._context.upstream
-        judges_params = self._access.judges_parameters(call.source)
+        reads_params = self._context.policy.reads_parameters(call.source)
         # roslaunch sets all its parameters by one multicall (launch.py, _load_parameters).
-        if not judges_params and await _is_long_and_passes(call.body):
+        if not reads_params and await _is_long_and_passes(call.body):
             return await count_reply(
                 metrics, "master", MULTICALL, upstream.pass_to_master(call.body)
             )
@@ -86,21 +86,23 @@ class MasterApi:
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        # A call for one parameter is judged by its head (`pass_on`). A multicall holds many, and of
-        # getParamNames the reply has to be filtered.
-        if method in (MULTICALL, "getParamNames") and self._access.judges_parameters(None):
+        # A call for one parameter is checked by its head (`pass_on`). A multicall holds many, and
+        # the reply to getParamNames has to be filtered.
+        is_checked = method in (MULTICALL, "getParamNames")
+        if is_checked and self._context.policy.reads_parameters(None):
             return None
         return _watch(method, size, self._context.master_call)
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
-        local_reply = self._access.judge_long(long_call.method, call.body, call.source)
-        if local_reply is not None:
-            self._context.metrics.count("master", long_call.method, "refused")
-            return xmlrpc.dump_reply(local_reply.triple())
+        metrics = self._context.metrics
+        denial = self._context.policy.check_unread(long_call.method, call.body, call.source)
+        if denial is not None:
+            metrics.count("master", long_call.method, "refused")
+            return xmlrpc.dump_reply(denial.answer.triple())
         reply = self._context.upstream.pass_to_master(long_call)
-        return await count_reply(self._context.metrics, "master", long_call.method, reply)
+        return await count_reply(metrics, "master", long_call.method, reply)
 
     def _refuse_loop(self, call: IncomingCall) -> None:
         """Refuse a call that the proxy itself has made. Raises XmlRpcError."""
@@ -113,52 +115,44 @@ class MasterApi:
                 )
             raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, text)
 
-    async def _answer(self, request: Request, call: IncomingCall) -> bytes | LongReply:
-        """The reply to a request that was read; what needs no change passes untouched."""
+    async def _answer(self, request: Request, incoming: IncomingCall) -> bytes | LongReply:
+        """The reply to a request that was read; a request without changes passes untouched."""
+        policy = self._context.policy
+        upstream = self._context.upstream
         if not request.plain:
             # A node that a former process of the proxy knew would get another port before that, and
             # rosmaster would shut it down for its new URI (registrations.py, _register_node_api).
             await self._recovery.ensure()
-            await self._services.find_for(request)
-        elif self._access.idle:
-            return await self._context.upstream.pass_to_master(request.body)
-        replies = await self._access.judge_request(request)
-        if request.plain and not any(replies) and not self._access.has_to_read_reply(request):
-            return await self._context.upstream.pass_to_master(request.body)
-        return await self._rewrite(request, replies, call)
-
-    async def _rewrite(
-        self, request: Request, replies: Sequence[LocalReply | None], call: IncomingCall
-    ) -> bytes:
-        """Admit nodes, export URIs, call the master, note what it accepted, import its URIs."""
-        addressing = self._context.addressing
-        version = self._context.policy.version
-        async with self._outcomes(request, replies, call) as outcomes:
-            exported = master_api.export_request(request, outcomes, addressing)
-            self._note(exported.registry_changes(), request.caller.address)
+        elif policy.idle:
+            return await upstream.pass_to_master(request.body)
+        version = policy.rules.version
+        answers = await policy.check_request(request)
+        if request.plain and not any(answers) and not policy.reads_reply(request):
+            return await upstream.pass_to_master(request.body)
+        async with self._admitted(request, answers, incoming) as outcomes:
+            exported = master_api.export_request(request, outcomes, self._context.addressing)
+            self._record(exported.registry_changes(), request.caller)
             if exported.body is None:
                 return exported.local_reply()
-            # Before the master knows the node: were the proxy killed in between, the next process
-            # would find a registration with this lease, and not know where its node is.
-            await self._memory.write()
-            limits = request.reply_limits
-            answer = await self._context.upstream.post_to_master(exported.body, limits)
-            reply = master_calls.read_reply(exported, answer)
-            self._note(reply.registry_changes(self._context.now()), request.caller.address)
+            reply = await self._call_master(exported, exported.body)
+            self._record(reply.registry_changes(self._context.now()), request.caller)
             await self._memory.write()  # the registry learns a service's port only now
             await self._stand_ins.listen_for(reply.uris(), request.caller)
-            if self._context.policy.version != version:  # what was judged may be denied by now
-                self._enforcer.look_again()
-            return master_api.import_reply(reply, addressing, self._access.reply_changes(reply))
+            if policy.rules.version != version:  # what was allowed may be denied by now
+                policy.must_enforce = True
+            return master_api.import_reply(reply, self._context.addressing, policy.filter_result)
 
     @asynccontextmanager
-    async def _outcomes(
-        self, request: Request, replies: Sequence[LocalReply | None], incoming: IncomingCall
+    async def _admitted(
+        self,
+        request: Request,
+        answers: Sequence[LocalAnswer | None],
+        incoming: IncomingCall,
     ) -> AsyncIterator[Sequence[CallOutcome]]:
-        """What becomes of each call of a request; some have a reply already. Raises Unreachable.
+        """The outcomes of a request's calls, some of which have an answer. Raises Unreachable.
 
-        Within the context the endpoints that they register are *pending*: their leases do not end
-        while the calls are on their way. If the caller goes away meanwhile, the master is told
+        Within the context the endpoints that the calls register are *pending*: their leases do not
+        end while the calls are on their way. If the caller goes away meanwhile, the master is told
         nothing.
         """
         self._context.refresh_networks()
@@ -166,11 +160,11 @@ class MasterApi:
         pending = list[Endpoint]()
         try:
             # One after the other: they may register the same new node.
-            for call, reply in zip(request.calls, replies, strict=True):
+            for call, answer in zip(request.calls, answers, strict=True):
                 if incoming.gone:
                     raise Unreachable("the caller has closed the connection")
-                outcome: CallOutcome = reply
-                if call and reply is None:
+                outcome: CallOutcome = answer
+                if call and answer is None:
                     outcome = await self._outcome(call, request, pending)
                 outcomes.append(outcome)
                 await asyncio.sleep(0)  # with many rules one call may take milliseconds
@@ -182,16 +176,22 @@ class MasterApi:
     async def _outcome(self, call: Call, request: Request, pending: list[Endpoint]) -> CallOutcome:
         """What becomes of a call; the endpoint that it registers is pending from now on."""
         caller = request.caller
+        policy = self._context.policy
         if method_spec(call.method).unregisters:
             endpoint = master_api.unregistering_endpoint(call, caller, self._context.addressing)
-            return self._access.judge_unregistration(call, endpoint, caller) or endpoint
+            if endpoint is None:
+                return None
+            return policy.answer_unregistration(call, endpoint, caller) or endpoint
         admission = await self._admit(call, request)
+        if isinstance(admission, LocalAnswer):
+            return admission
         if isinstance(admission, Endpoint):
             # Held before anything is awaited: nothing else keeps the lease from ending meanwhile.
             admission.hold()
             pending.append(admission)
             await self._adopter.take_over(admission, caller_id_of(call))
-        return self._access.judge_registration(call, admission, caller, self._context.now())
+        denial = policy.check_registration(call, admission, caller, self._context.now())
+        return denial.answer if denial else admission
 
     async def _admit(self, call: Call, request: Request) -> CallOutcome:
         """What becomes of one call; what is too long, or one too many, is refused."""
@@ -204,43 +204,40 @@ class MasterApi:
             return self._refuse("too_many_names", call, caller, text)
         return admission
 
-    def _refuse(self, reason: str, call: Call, caller: Caller, text: str) -> Refusal:
-        """Refuse a call that is over a bound, and tell of it."""
+    def _refuse(self, reason: str, call: Call, caller: Caller, text: str) -> LocalAnswer:
+        """Refuse a call that is over a bound, and report the refusal."""
         description = f"{call.method} of {caller.caller_id}: {text}"
         self._context.refusals.note(reason, caller.address, description)
-        return Refusal(f"rosproxy: {text}")
+        return refusal(f"rosproxy: {text}")
 
-    def _note(self, facts: Iterable[RegistryChange], source: str) -> None:
-        """Note what the master has accepted, and what the policy keeps from it.
+    async def _call_master(self, exported: ExportedRequest, body: bytes) -> MasterReply:
+        """The master's reply to a request. Raises XmlRpcError, Unreachable."""
+        # Before the master knows the node: were the proxy killed in between, the next process
+        # would find a registration with this lease, and not know where its node is.
+        await self._memory.write()
+        limits = exported.request.reply_limits
+        answer = await self._context.upstream.post_to_master(body, limits)
+        return master_calls.read_reply(exported, answer)
 
-        A service's port is believed only from the node's own address: anybody may register a
-        service in another node's name, and its port would be opened to outside.
+    def _record(self, changes: Iterable[RegistryChange], caller: Caller) -> None:
+        """Record what the master has accepted, and what the policy keeps from the master.
+
+        The registry takes a service's port only from the node's own address: any node may register
+        a service in another node's name, and the port would be open to outside.
         """
         registry = self._context.registry
-        for fact in facts:
-            registration = fact.registration
-            if fact.endpoint is None:
+        for change in changes:
+            registration = change.registration
+            endpoint = change.endpoint
+            if endpoint is None:
                 registry.unregister(registration.kind, registration.name, registration.caller_id)
-            elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:  # not forgotten since
-                own = source == fact.endpoint.location.address
-                registration = self._keep_shown(fact.endpoint, registration)
-                registry.register(
-                    fact.endpoint, registration if own else replace(registration, service_api=None)
-                )
+            elif registry.by_port.get(endpoint.port) is endpoint:  # not forgotten since
+                registration = self._context.policy.settle(endpoint, registration)
+                if caller.address == endpoint.location.address:
+                    registry.register(endpoint, registration)
+                else:
+                    registry.register(endpoint, replace(registration, service_api=None))
             self._publisher_updates.note_registration(registration)
-
-    def _keep_shown(self, endpoint: Endpoint, registration: Registration) -> Registration:
-        """A registration to note: one that the master has stays shown until it is taken back.
-
-        A policy that hides it now has just changed, and no topic of a node that hides anything may
-        bypass the proxy: in both cases the enforcer looks again.
-        """
-        previous = endpoint.registrations.get(registration.key)
-        was_shown = previous is not None and not previous.hidden
-        if registration.hidden and (was_shown or endpoint.fast_port is not None):
-            self._enforcer.look_again()
-        hide = registration.hidden and not was_shown
-        return registration if registration.hidden is hide else replace(registration, hidden=hide)
 
 
 @dataclass(slots=True, eq=False)

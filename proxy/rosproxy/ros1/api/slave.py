@@ -23,8 +23,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall, passing
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.node_health import ProbeResult
-from rosproxy.ros1.rewriting import policing, slave_api
-from rosproxy.ros1.servers.access_checks import AccessChecks
+from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.tcpros_server import InsideNodes, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
@@ -50,15 +49,14 @@ class SlaveApi:
         stand_ins: StandInPorts,
         adopter: Adopter,
         tcpros: TcprosServer,
-        access: AccessChecks,
     ) -> None:
         self._context = context
         self._leases = leases
         self._stand_ins = stand_ins
         self._adopter = adopter
         self._tcpros = tcpros
-        self._access = access
-        self._nodes = InsideNodes(context, access)
+        self._policy = context.policy
+        self._nodes = InsideNodes(context)
         greeting = "rosproxy: slave API of a ROS node behind the proxy\n"
         self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
 
@@ -103,7 +101,7 @@ class SlaveApi:
         method = long_call.method
         caller_id, parameter = passing.first_strings(call.body, 2)
         reason = await self._why_not(endpoint, method, caller_id or "", call.source)
-        if reason is None and caller_id is None and not self._access.idle:
+        if reason is None and caller_id is None and not self._policy.idle:
             reason = NO_CALLER_ID
         if reason is None and method == "paramUpdate":
             reason = await self._not_subscribed(endpoint, parameter)
@@ -162,10 +160,10 @@ class SlaveApi:
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
         if parsed.method == "requestTopic":
-            denied = self._access.outside_may_not_ask(parsed, endpoint, call.source)
-            if denied is not None:
+            denial = self._policy.check_outside_request(parsed, endpoint, call.source)
+            if denial is not None:
                 self._context.metrics.count("slave", parsed.method, "refused")
-                return xmlrpc.dump_reply(denied)
+                return xmlrpc.dump_reply(denial.answer.triple())
         reply = self._forward(endpoint, parsed, body, call)
         return await count_reply(self._context.metrics, "slave", parsed.method, reply)
 
@@ -206,7 +204,7 @@ class SlaveApi:
         topic_port = slave_api.topic_port(parsed, reply)
         if topic_port is not None:
             endpoint.note_topic_port(parsed.string(1) or "", topic_port)
-            if self._access.may_bypass(endpoint):
+            if self._policy.may_bypass(endpoint):
                 port = await self._leases.fast_port(endpoint, topic_port) or port
         reached = HostPort(call.local.host, port) if is_local else addressing.outside(port)
         return slave_api.rewrite_reply(parsed, reply, reached, view)
@@ -217,7 +215,7 @@ class SlaveApi:
         """A publisherUpdate with what the node is to hear of; as it came if that is the same."""
         topic = parsed.string(1) or ""
         announced = slave_api.announced_publishers(parsed)
-        publishers = policing.publishers_for(endpoint, topic, announced, self._context.addressing)
+        publishers = self._policy.publishers_for(endpoint, topic, announced)
         if publishers == [*dict.fromkeys(announced)]:
             return body, parsed
         body = xmlrpc.dump_call(parsed.method, parsed.string(0) or "", topic, publishers)
@@ -265,7 +263,8 @@ class SlaveApi:
         """Why a caller may not call a method of a node; None if he may."""
         if not await self._may_call(method, source):
             return NOT_THE_MASTER
-        return await self._access.outside_may_not_call(method, endpoint, source, caller_id)
+        denial = await self._policy.check_slave_call(method, endpoint, source, caller_id)
+        return denial.reason if denial else None
 
     async def _not_subscribed(self, endpoint: Endpoint, parameter: str | None) -> str | None:
         """Why a node is not told of a parameter; None if it may have subscribed to it.

@@ -61,11 +61,14 @@ MASTER_METHODS: dict[str, MethodSpec] = {
 
 NO_SPEC = MethodSpec()
 
+GRAPH_METHODS = frozenset({"getPublishedTopics", "getSystemState", "getTopicTypes"})
+"""The calls whose replies tell the graph: the names of topics, services and nodes."""
 _PARAMETERS = {"deleteParam", "getParam", "getParamNames", "hasParam", "searchParam", "setParam"}
-_GRAPH = {"getPublishedTopics", "getSystemState", "getTopicTypes", "system.multicall"}
 _NODES = {"getBusInfo", "getBusStats", "getMasterUri", "getName", "getPid", "shutdown"}
 _TOPICS = {"getPublications", "getSubscriptions", "publisherUpdate", "requestTopic", "paramUpdate"}
-KNOWN_METHODS = frozenset(MASTER_METHODS).union(_PARAMETERS, _GRAPH, _NODES, _TOPICS)
+KNOWN_METHODS = GRAPH_METHODS.union(
+    MASTER_METHODS, _PARAMETERS, _NODES, _TOPICS, {"system.multicall"}
+)
 """The methods of both APIs; metrics count calls of any other name together."""
 
 

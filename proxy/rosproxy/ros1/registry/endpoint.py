@@ -50,7 +50,7 @@ class Registration:
 
     ``type`` is the topic's message type, ``service_api`` the service URI as the node gave it
     (None after a recovery, when only the node knows it). ``hidden``: the policy denies it, so that
-    the master knows nothing of it; see `rosproxy.ros1.registry.hidden_registrations`.
+    the master knows nothing of it; see `rosproxy.ros1.policy.hidden`.
     """
 
     kind: Kind

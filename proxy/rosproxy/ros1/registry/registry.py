@@ -5,7 +5,7 @@ topics each a copy per call would make registration quadratic.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from rosproxy.fixes import how_to_in_a_sentence
@@ -16,6 +16,7 @@ from rosproxy.ros1.protocol.uris import parse_service_uri, service_uri
 from rosproxy.ros1.registry.endpoint import (
     LONGEST_REGISTRATION,
     Endpoint,
+    EndpointRegistration,
     NodeLocation,
     Registration,
 )
@@ -27,6 +28,8 @@ UNPROVEN_SHARE = 4
 """One part in so many of the range is for nodes of one source that have never answered. A node
 that is well answers within milliseconds of its first registration."""
 
+_NO_HOLDERS: Mapping[str, Endpoint] = {}
+
 
 class RangeExhausted(Exception):
     """No port of the range is left for another node; the message is meant for the node's user."""
@@ -35,9 +38,9 @@ class RangeExhausted(Exception):
 class Registry:
     """All endpoints, found by port, by address, by URI, by service and by node name.
 
-    ``by_port``, ``by_slave``, ``by_caller``, ``services`` and ``hidden`` (what the master does not
-    know, by kind and name) are for others to read only. ``changes`` grows with each registration
-    that comes or goes, ``lease_changes`` with whatever is to be remembered of leases.
+    ``by_port``, ``by_slave``, ``by_caller`` and ``services`` are for others to read only.
+    ``changes`` grows with each registration that comes or goes, ``lease_changes`` with whatever is
+    to be remembered of leases.
     """
 
     def __init__(self, ports: PortRange) -> None:
@@ -46,7 +49,8 @@ class Registry:
         self.by_slave: dict[HostPort, Endpoint] = {}
         self.by_caller: dict[str, Endpoint] = {}
         self.services: dict[str, tuple[Endpoint, Registration]] = {}
-        self.hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
+        self._hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
+        """The endpoints of hidden registrations, by kind and name, then by caller."""
         self.changes = self.lease_changes = 0
         self._by_node: dict[HostPort, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[HostPort, str], Endpoint] = {}
@@ -254,9 +258,32 @@ class Registry:
             uri = service_uri(HostPort(endpoint.node.host, port))
             self.register(endpoint, replace(provider[1], service_api=uri))
 
-    def registrations(self) -> Iterable[tuple[Endpoint, Registration]]:
+    def registrations(self) -> list[EndpointRegistration]:
         """Everything that is registered, with its endpoint."""
         return [(e, r) for e in self for r in e.registrations.values()]
+
+    def subscriptions(self, topic: str) -> list[EndpointRegistration]:
+        """The subscriptions of all nodes inside to a topic."""
+        return [
+            (e, r) for e, r in self.registrations() if r.kind is Kind.SUBSCRIBER and r.name == topic
+        ]
+
+    @property
+    def hides(self) -> bool:
+        """Whether there is a hidden registration, of which the master knows nothing."""
+        return bool(self._hidden)
+
+    def hidden_holders(self, kind: Kind, name: str) -> Mapping[str, Endpoint]:
+        """The endpoints of the hidden registrations of a kind and name, by caller."""
+        return self._hidden.get((kind, name), _NO_HOLDERS)
+
+    def hidden_registrations(self) -> list[EndpointRegistration]:
+        """All hidden registrations, with their endpoints."""
+        return [
+            (endpoint, endpoint.registrations[kind, name, caller_id])
+            for (kind, name), holders in self._hidden.items()
+            for caller_id, endpoint in holders.items()
+        ]
 
     def _movable(self, locations: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
         """Those whose new addresses are free, or will be; of two for the same one the first."""
@@ -323,13 +350,13 @@ class Registry:
 
     def _index_hidden(self, endpoint: Endpoint, registration: Registration) -> None:
         """Note by kind and name that a registration is hidden, or no longer."""
-        endpoints = self.hidden.setdefault((registration.kind, registration.name), {})
+        endpoints = self._hidden.setdefault((registration.kind, registration.name), {})
         if registration.hidden:
             endpoints[registration.caller_id] = endpoint
         elif endpoints.get(registration.caller_id) is endpoint:
             del endpoints[registration.caller_id]
         if not endpoints:
-            del self.hidden[registration.kind, registration.name]
+            del self._hidden[registration.kind, registration.name]
 
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
         registration = endpoint.registrations.pop(key, None)

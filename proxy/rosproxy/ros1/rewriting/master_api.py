@@ -7,33 +7,33 @@ each call), `master_calls.read_reply`, which tells what the registry has to lear
 ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import Kind, Reply, method_spec
+from rosproxy.ros1.protocol.master_methods import Reply, method_spec
 from rosproxy.ros1.protocol.uris import parse_service_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.multicall import insert_items
 from rosproxy.ros1.protocol.xmlrpc.values import Edit, Value
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.rewriting import hidden_graph
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
-    NO_REPLY_CHANGES,
     CallOutcome,
     CallResult,
     ExportedRequest,
-    LocalReply,
+    LocalAnswer,
     MasterReply,
-    ReplyChanges,
     Request,
     caller_id_of,
     read_reply,
     second_parameter_name,
 )
 from rosproxy.ros1.rewriting.slave_api import replace_value
+
+ResultFilter = Callable[[CallResult, Caller], list[Edit]]
+"""The edits of a result in which a caller may not read all, or is to read more; else none."""
 
 
 def export_request(
@@ -45,29 +45,27 @@ def export_request(
     """
     edits: list[Edit] = []
     for call, outcome in zip(request.calls, outcomes, strict=True):
-        if call and not isinstance(outcome, LocalReply):
+        if call and not isinstance(outcome, LocalAnswer):
             edits += _export_call(call, outcome, request.caller, addressing)
-    local = [isinstance(outcome, LocalReply) for outcome in outcomes]
+    local = [isinstance(outcome, LocalAnswer) for outcome in outcomes]
     if local and all(local):
         return ExportedRequest(request, tuple(outcomes), None)
     edits += [item.removed() for item, out in zip(request.items, local, strict=False) if out]
     return ExportedRequest(request, tuple(outcomes), xmlrpc.apply(request.body, edits))
 
 
-def import_reply(
-    reply: MasterReply, addressing: Addressing, changes: ReplyChanges = NO_REPLY_CHANGES
-) -> bytes:
-    """The reply for the inside node: URIs imported, the proxy's own replies put in."""
+def import_reply(reply: MasterReply, addressing: Addressing, filter_result: ResultFilter) -> bytes:
+    """The reply for the inside node: filtered, URIs imported, the proxy's own replies put in."""
     edits: list[Edit] = []
     request = reply.exported.request
     for result in reply.results:
         caller = request.caller
         if result.endpoint:
             caller = replace(caller, endpoint=result.endpoint)
-        edits += _import_result(result, caller, addressing, changes)
+        edits += filter_result(result, caller) or _import_result(result, caller, addressing)
     if request.multicall and reply.value and reply.value.items:
         outcomes = enumerate(reply.exported.outcomes)
-        local = [(i, o.triple()) for i, o in outcomes if isinstance(o, LocalReply)]
+        local = [(i, o.triple()) for i, o in outcomes if isinstance(o, LocalAnswer)]
         results = [(i, xmlrpc.dump_value([triple])) for i, triple in local]
         edits += insert_items(reply.value, results)
     return xmlrpc.apply(reply.body, edits)
@@ -125,21 +123,16 @@ def _export_call(
         yield service_api.with_text(text)
 
 
-def _import_result(
-    result: CallResult, caller: Caller, addressing: Addressing, changes: ReplyChanges
-) -> list[Edit]:
+def _import_result(result: CallResult, caller: Caller, addressing: Addressing) -> list[Edit]:
     triple = result.triple
     if triple is None or not result.accepted:
         return []
-    value = triple.items[2]
     if method_spec(result.call.method).reply is Reply.SLAVE_URIS:
-        return _import_uris(result.call, value, caller, addressing, changes)
-    if result.call.method == "getParamNames":
-        return [item.removed() for item in value.items if item.text in changes.params]
-    if changes.graph and result.call.method in hidden_graph.METHODS:
-        listing = xmlrpc.python_value(value)
-        completed = hidden_graph.with_hidden(result.call, listing, addressing.registry)
-        return [value.replaced_by(xmlrpc.dump_value(completed))]
+        return [
+            item.with_text(addressing.import_slave(item.text, caller))
+            for item in triple.items[2].items
+            if item.kind == "string"
+        ]
     return _import_uri(result.call, triple, caller, addressing)
 
 
@@ -154,21 +147,3 @@ def _import_uri(call: Call, triple: Value, caller: Caller, addressing: Addressin
     if text and kind is Reply.MASTER_URI and caller.master:
         return replace_value(triple, f"http://{caller.master}/")
     return []
-
-
-def _import_uris(
-    call: Call, array: Value, caller: Caller, addressing: Addressing, changes: ReplyChanges
-) -> list[Edit]:
-    """The publishers that a subscriber is told of, or the subscribers that a publisher is."""
-    extra: Sequence[str] = ()
-    if method_spec(call.method).registers is Kind.SUBSCRIBER:
-        extra = changes.publishers.get(second_parameter_name(call), ())
-    if extra:
-        uris = [*(item.text for item in array.items), *extra]
-        imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
-        return [array.replaced_by(xmlrpc.dump_value([*imported]))]
-    return [
-        item.with_text(addressing.import_slave(item.text, caller))
-        for item in array.items
-        if item.kind == "string"
-    ]

@@ -5,12 +5,18 @@ A request is one call or a ``system.multicall`` of several; each follows its own
 the registry has to learn of both is told here; `rosproxy.ros1.rewriting.master_api` rewrites them.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import NO_SPEC, Reply, method_spec, resolve_name
+from rosproxy.ros1.protocol.master_methods import (
+    GRAPH_METHODS,
+    NO_SPEC,
+    Reply,
+    method_spec,
+    resolve_name,
+)
 from rosproxy.ros1.protocol.uris import with_caller_address
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
@@ -18,55 +24,33 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls, inner_items
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.rewriting import hidden_graph
 from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.slave_api import ros_triple
 
 
-class Refusal(msgspec.Struct, frozen=True):
-    """A call that the proxy answers itself: with ROS status -1 and a reason."""
-
-    reason: str
-
-    def triple(self) -> list[object]:
-        """The ROS status triple (http://wiki.ros.org/ROS/Master_Slave_APIs)."""
-        return [-1, self.reason, 0]
-
-
 class LocalAnswer(msgspec.Struct, frozen=True):
-    """A call that the proxy answers itself, in the master's place; ``change`` follows from it.
+    """The answer to a call that the master does not get; ``change`` follows from the call.
 
     ``value`` is the third element of the triple, whose status is ``code``.
     """
 
     code: int
     text: str
-    value: object
+    value: object = 0
     change: "RegistryChange | None" = None
 
     def triple(self) -> list[object]:
-        """The ROS status triple."""
+        """The ROS status triple (http://wiki.ros.org/ROS/Master_Slave_APIs)."""
         return [self.code, self.text, self.value]
 
 
-class ReplyChanges(msgspec.Struct, frozen=True):
-    """What has to be changed in the master's reply to a request.
-
-    ``publishers`` are those by topic that the master does not know of, as it would have them;
-    ``params`` the names that getParamNames leaves out; ``graph`` says whether replies that tell
-    the graph are completed.
-    """
-
-    publishers: Mapping[str, Sequence[str]] = {}
-    params: Collection[str] = ()
-    graph: bool = False
+def refusal(reason: str) -> LocalAnswer:
+    """The answer to a call that fails: ROS status -1, and the reason."""
+    return LocalAnswer(-1, reason)
 
 
-NO_REPLY_CHANGES = ReplyChanges()
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
-LocalReply = Refusal | LocalAnswer
-"""The reply to a call that the master does not get."""
-CallOutcome = Endpoint | LocalReply | None
+CallOutcome = Endpoint | LocalAnswer | None
 """What becomes of a call: the endpoint that it registers or unregisters, or the proxy's reply."""
 
 
@@ -93,7 +77,7 @@ class Request(msgspec.Struct, frozen=True):
     @property
     def tells_graph(self) -> bool:
         """Whether the reply tells of the graph of all nodes."""
-        return any(call and call.method in hidden_graph.METHODS for call in self.calls)
+        return any(call and call.method in GRAPH_METHODS for call in self.calls)
 
     @property
     def reply_limits(self) -> Limits:
@@ -127,7 +111,7 @@ class ExportedRequest(msgspec.Struct, frozen=True):
 
     def local_reply(self) -> bytes:
         """The whole reply to a request of which the master gets nothing."""
-        triples = [o.triple() for o in self.outcomes if isinstance(o, LocalReply)]
+        triples = [o.triple() for o in self.outcomes if isinstance(o, LocalAnswer)]
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
     def registry_changes(self) -> "list[RegistryChange]":
@@ -179,12 +163,6 @@ class MasterReply(msgspec.Struct, frozen=True):
     value: Value | None
     results: tuple[CallResult, ...]
 
-    def param_names(self) -> Iterator[str]:
-        """The names of parameters that it lists."""
-        for result in self.results:
-            if result.call.method == "getParamNames" and result.value:
-                yield from (item.text for item in result.value.items)
-
     def registry_changes(self, now: float) -> list[RegistryChange]:
         """What the registry has to learn from the calls that the master accepted.
 
@@ -227,7 +205,7 @@ def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
     if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
         call = exported.request.calls[0]
         endpoint = exported.outcomes[0]
-        if call and not isinstance(endpoint, LocalReply):
+        if call and not isinstance(endpoint, LocalAnswer):
             return MasterReply(exported, reply, None, (CallResult(call, status, None, endpoint),))
     value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
@@ -272,7 +250,7 @@ def _results(exported: ExportedRequest, value: Value) -> Iterator[CallResult]:
     if exported.request.multicall:
         triples = [item.items[0] if item.items else None for item in value.items]
     pairs = zip(exported.request.calls, exported.outcomes, strict=True)
-    sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalReply)]
+    sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalAnswer)]
     # A reply may hold fewer results than there were calls; what has none is passed on as it is.
     for (call, endpoint), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):

@@ -34,7 +34,12 @@ from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.registry.registry import RangeExhausted
 from rosproxy.ros1.rewriting.addressing import Caller
-from rosproxy.ros1.rewriting.master_calls import CallOutcome, Refusal, registering_uri
+from rosproxy.ros1.rewriting.master_calls import (
+    CallOutcome,
+    LocalAnswer,
+    refusal,
+    registering_uri,
+)
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +92,7 @@ class NodeAdmission:
         if uri is None:
             return None
         if self._context.retired:
-            return Refusal(RETIRED)
+            return refusal(RETIRED)
         uri = with_caller_address(uri, caller.address)
         node = parse_slave_uri(uri)
         endpoint = self._context.registry.admitted(node, caller.address)
@@ -95,7 +100,7 @@ class NodeAdmission:
         if endpoint is not None and not endpoint.never_found:
             return await self._admit_again(endpoint, uri, call, caller)
         if node is None:
-            return Refusal(
+            return refusal(
                 f"rosproxy: caller_api {uri[:200]!r} is not of the form http://host:port/"
             )
         if self._context.addressing.is_own_uri(uri, caller):
@@ -104,7 +109,7 @@ class NodeAdmission:
 
     async def _admit_again(
         self, endpoint: Endpoint, uri: str, call: Call, caller: Caller
-    ) -> Endpoint | Refusal:
+    ) -> Endpoint | LocalAnswer:
         """The endpoint that a URI has meant before, for a node that is there.
 
         Somebody else at a source that hides several has to bear out its name as well.
@@ -114,7 +119,7 @@ class NodeAdmission:
         if location.address != caller.address and caller_id not in endpoint.caller_ids:
             name = await self._context.nodes.name(endpoint.slave, _service(call, caller))
             if name != caller_id:
-                return Refusal(
+                return refusal(
                     f"rosproxy: {endpoint.uri[:200]} is not the address of {caller_id[:200]}: the "
                     f"node at this address has the name {(name or 'none')[:200]}. Set ROS_IP where "
                     f"{caller_id[:200]} runs"
@@ -143,7 +148,7 @@ class NodeAdmission:
         location: NodeLocation,
         caller: Caller,
         answers: bool = False,
-    ) -> Endpoint | Refusal:
+    ) -> Endpoint | LocalAnswer:
         """The endpoint of a node found at a place, its port open; a refusal if none is left.
 
         Ports that turn out to be taken are passed over. ``answers``: the node has just done so.
@@ -255,11 +260,11 @@ class NodeAdmission:
     async def _answers(self, slave: HostPort) -> bool:
         return (await self._context.nodes.probe(slave)).probe is ProbeResult.ANSWERED
 
-    def _refuse(self, uri: str, caller: Caller, text: str) -> Refusal:
+    def _refuse(self, uri: str, caller: Caller, text: str) -> LocalAnswer:
         self._context.metrics.exhausted.inc()
         self._context.problems.add(caller.caller_id, text)
         log.error("%s: %s (%s) gets no port: %s", caller.address, caller.caller_id, uri, text)
-        return Refusal(text)
+        return refusal(text)
 
     def _welcome_back(self, endpoint: Endpoint, caller: Caller) -> None:
         """A node that registers is alive, whatever was believed of it."""

@@ -21,12 +21,12 @@ from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.policy.denial import Denial
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.name_lengths import too_long_to_connect
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import ROSOUT
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)
@@ -52,8 +52,8 @@ class TcprosTarget(Protocol):
     def port(self) -> int:
         """The proxy's port."""
 
-    def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
-        """Why somebody may not have a topic or service; None if he may."""
+    def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
+        """Check whether a client may have a topic or service."""
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node's TCPROS server; None if there is none. Raises NotOffered."""
@@ -107,9 +107,9 @@ class TcprosServer:
         except HeaderError as error:
             await self._refuse(conn, str(error), "bad header")
             return
-        version = self._context.policy.version
-        if denial := target.denial_reason(kind, name, peer, caller_id):
-            await self._refuse(conn, denial, "denied")
+        version = self._context.policy.rules.version
+        if denial := target.check(kind, name, peer, caller_id):
+            await self._refuse(conn, denial.reason, "denied")
             return
         node = await self._connect(target, kind, name, conn)
         if node is None:
@@ -119,8 +119,8 @@ class TcprosServer:
             return
         # While the node was asked and connected to, the policy may have changed. After a reset the
         # client comes again, and is then told why it is refused.
-        changed = self._context.policy.version != version
-        if changed and target.denial_reason(kind, name, peer, caller_id):
+        changed = self._context.policy.rules.version != version
+        if changed and target.check(kind, name, peer, caller_id):
             node.close()
             self._fail(target, conn, name)
             return
@@ -188,14 +188,13 @@ class InsideNodes:
     host in a reply or registration is never used, so none can lead to another inside host.
     """
 
-    def __init__(self, context: Context, access: AccessChecks) -> None:
+    def __init__(self, context: Context) -> None:
         self._context = context
-        self._access = access
         self._port_tasks: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
 
     def target(self, endpoint: Endpoint) -> "InsideNode":
         """What connections to an endpoint's ports lead to."""
-        return InsideNode(self._context, self._access, endpoint, self._learn_port)
+        return InsideNode(self._context, endpoint, self._learn_port)
 
     async def _learn_port(self, endpoint: Endpoint, kind: str, name: str) -> int | None:
         """The TCPROS port of a topic or service now; the node is asked once for all who wait."""
@@ -245,7 +244,6 @@ class InsideNode:
     """A node inside as a target, for those who connect from outside."""
 
     _context: Context
-    _access: AccessChecks
     _endpoint: Endpoint
     _learn_port: Callable[[Endpoint, str, str], Awaitable[int | None]]
     inside: bool = True
@@ -255,12 +253,12 @@ class InsideNode:
         """The lease."""
         return self._endpoint.port
 
-    def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
-        """Why somebody outside may not have a topic or service; None if he may."""
+    def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
+        """Check whether outside may have a topic or service."""
         rule_kind = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
         # Without the caller_id: publishers take the topic of a header as it stands (rospy's
         # tcpros_pubsub.py, topic_connection_handler; roscpp's transport_subscriber_link.cpp).
-        return self._access.outside_may_not(rule_kind, name, self._endpoint, peer)
+        return self._context.policy.check_outside(rule_kind, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; a port that is not known or refuses is asked for.

@@ -17,10 +17,10 @@ from rosproxy.net.interfaces import is_own
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.policy.denial import Denial
 from rosproxy.ros1.protocol.uris import parse_service_uri, path_of
 from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.registry.stand_ins import StandIn
-from rosproxy.ros1.servers.access_checks import AccessChecks
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +129,6 @@ class OutsideNode:
 
     _outside: Outside
     _context: Context
-    _access: AccessChecks
     _stand_in: StandIn
     inside: bool = False
 
@@ -138,10 +137,10 @@ class OutsideNode:
         """The port that stands in for it."""
         return self._stand_in.local.port
 
-    def denial_reason(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
-        """Why a node inside may not have a topic or service; None if it may."""
+    def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
+        """Check whether a node inside may have a topic or service."""
         rule_kind = RuleKind.CALL if kind == "service" else RuleKind.SUBSCRIBE
-        return self._access.inside_may_not(rule_kind, name, peer, caller_id)
+        return self._context.policy.check_inside(rule_kind, name, peer, caller_id)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node, which is asked for its port again if the known one refuses."""

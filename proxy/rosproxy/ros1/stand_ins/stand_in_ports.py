@@ -37,7 +37,6 @@ from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.addressing import Caller
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, count_reply
@@ -65,14 +64,12 @@ class StandInPorts:
         context: Context,
         callers: Callers,
         tcpros: TcprosServer,
-        access: AccessChecks,
         plane: KernelPlane,
     ) -> None:
         self._context = context
         self._callers = callers
         self._stand_ins = context.stand_ins
         self._tcpros = tcpros
-        self._access = access
         self._plane = plane
         self._acceptors: dict[HostPort, Acceptor] = {}
         self._refused: dict[str, None] = {}
@@ -81,7 +78,7 @@ class StandInPorts:
         greeting = "rosproxy: a ROS node outside\n"
         self.server = XmlRpcServer(context, self._forward, greeting, context.master_call)
         self._outside = Outside(context, self._note_refused)
-        self.udpros = UdprosRelays(context, access, self._outside)
+        self.udpros = UdprosRelays(context, self._outside)
         self._closed = False
         self._query_lock = asyncio.Lock()
         self._pending_topics: set[str] = set()
@@ -289,7 +286,7 @@ class StandInPorts:
         candidate = self._stand_ins.choose_fast_candidate(stand_in) if usable else None
         if candidate is None:
             return
-        if not self._access.inside_may_bypass() or stand_ins.obstacle(
+        if not self._context.policy.inside_may_bypass() or stand_ins.obstacle(
             candidate.port, self._context.settings
         ):
             return
@@ -365,7 +362,7 @@ class StandInPorts:
             conn.close()
             return
         self._stand_ins.note_used(stand_in)
-        target = OutsideNode(self._outside, self._context, self._access, stand_in)
+        target = OutsideNode(self._outside, self._context, stand_in)
         await self.server.dispatch(conn, peer, partial(self._tcpros.serve, target, peer))
 
     async def _forward(self, call: IncomingCall) -> bytes:
@@ -380,9 +377,9 @@ class StandInPorts:
         return await count_reply(self._context.metrics, "stand_in", parsed.method, answer)
 
     async def _answer(self, stand_in: StandIn, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
-        denied = self._access.inside_may_not_ask(parsed, call.source)
-        if denied is not None:
-            return xmlrpc.dump_reply(denied)
+        denial = self._context.policy.check_inside_request(parsed, call.source)
+        if denial is not None:
+            return xmlrpc.dump_reply(denial.answer.triple())
         caller = Caller(call.source, call.local.host)
         master = slave_uri(HostPort(caller.proxy, self._context.settings.master_port))
         view = slave_api.from_inside(caller, master, self._context.addressing)

@@ -40,7 +40,6 @@ from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
 from rosproxy.ros1.rewriting.udpros_offers import read_offers, redirect_offer
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.stand_ins.outside_nodes import Outside
 
 log = logging.getLogger(__name__)
@@ -83,9 +82,9 @@ class _RelayCondition:
 class UdprosRelays:
     """Opens relays for the offers that pass, and ends them."""
 
-    def __init__(self, context: Context, access: AccessChecks, outside: Outside) -> None:
+    def __init__(self, context: Context, outside: Outside) -> None:
         self._context = context
-        self._access = access
+        self._policy = context.policy
         self._outside = outside
         self._open: dict[UdprosSubscription, tuple[DatagramRelay, _RelayCondition]] = {}
 
@@ -115,7 +114,7 @@ class UdprosRelays:
 
         def is_allowed() -> bool:
             kind = RuleKind.PUBLISH
-            return not self._access.outside_may_not(kind, topic, endpoint, source, caller_id)
+            return not self._policy.check_outside(kind, topic, endpoint, source, caller_id)
 
         condition = _RelayCondition(is_registered, is_allowed)
 
@@ -147,7 +146,7 @@ class UdprosRelays:
             return (Kind.SUBSCRIBER, topic, caller_id) in endpoint.registrations
 
         def is_allowed() -> bool:
-            return not self._access.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
+            return not self._policy.check_inside(RuleKind.SUBSCRIBE, topic, source, caller_id)
 
         condition = _RelayCondition(is_registered, is_allowed)
 

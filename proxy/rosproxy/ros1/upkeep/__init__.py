@@ -16,7 +16,7 @@ port opens or refuses. Nothing below knows who asked for it.
                                                                                   leases end
     RESUBSCRIBE_TICK,       resubscriber       the graph, nodes'  resubscription  they are told
     until nobody is missed                     connections                        es
-    ENFORCE_TICK, once the  policy_enforcer    the registry,      AccessChecks    hidden, shown,
+    ENFORCE_TICK, once the  policy_enforcer    the registry,      Ros1Policy      hidden, shown,
     policy has changed                         connections                        cut
     TIDY_INTERVAL           stand_in_ports     problems with                      those of ended
                                                nodes outside                      nodes go
@@ -30,7 +30,4 @@ port opens or refuses. Nothing below knows who asked for it.
     did around the proxy                       master                             anew
     what is hidden changes  publisher_updates  the registry                       they are told
                                                                                   again
-    a hidden service is     service_finder     the nodes inside                   the registry
-    looked up after a                                                             learns it
-    start
 """

@@ -19,7 +19,6 @@ from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.tcpros_server import UNREGISTERED, TcprosServer
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -41,19 +40,14 @@ class PolicyEnforcer:
     _recovery: Recovery
     _tcpros: TcprosServer
     _plane: KernelPlane
-    _access: AccessChecks
     _stand_ins: StandInPorts
     _enforced_version: int = -1
-    _must_enforce: bool = False
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-
-    def look_again(self) -> None:
-        """Note that something may have been done by a policy that is no longer in force."""
-        self._must_enforce = True
 
     async def look(self) -> None:
         """Enforce the policy if that has not been done since it changed."""
-        if self._must_enforce or self._enforced_version != self._context.policy.version:
+        policy = self._context.policy
+        if policy.must_enforce or self._enforced_version != policy.rules.version:
             try:
                 await self.enforce()
             except (Unreachable, MasterError) as error:
@@ -63,14 +57,15 @@ class PolicyEnforcer:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._lock:
             # Before anything is awaited: what changes meanwhile is left for the next look.
-            version = self._context.policy.version
-            self._must_enforce = False
+            policy = self._context.policy
+            version = policy.rules.version
+            policy.must_enforce = False
             cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
             try:
                 await self._recovery.ensure()
                 hidden, shown = await self._registrar.apply_policy()
             except (Unreachable, MasterError):
-                self._must_enforce = True
+                policy.must_enforce = True
                 raise
             self._enforced_version = version
         enforced = EnforcementCounts(hidden, shown, cut)
@@ -84,29 +79,32 @@ class PolicyEnforcer:
 
         The name of what is not registered is not known: a connection to it may be denied as well.
         """
+        policy = self._context.policy
         count = 0
         for relay in self._tcpros.relays:
             endpoint = self._context.registry.by_port.get(relay.port)
             denied = endpoint is not None and self._is_denied(relay, endpoint)
-            if denied or (relay.inside_asks and self._access.inside_may_not_keep(relay)):
+            if denied or (relay.inside_asks and not policy.inside_may_keep(relay)):
                 relay.end()
                 count += 1
         return count
 
     def _is_denied(self, relay: Relay, endpoint: Endpoint) -> bool:
         if relay.name == UNREGISTERED:
-            return not self._access.may_bypass(endpoint)
+            return not self._context.policy.may_bypass(endpoint)
         kind = RuleKind.SERVE if relay.kind == "service" else RuleKind.PUBLISH
-        return bool(self._access.outside_may_not(kind, relay.name, endpoint, relay.peer))
+        denial = self._context.policy.check_outside(kind, relay.name, endpoint, relay.peer)
+        return denial is not None
 
     def _take_fast_ports(self) -> int:
         """Take fast ports from nodes of which something may be denied; how many connections."""
-        count = 0 if self._access.inside_may_bypass() else self._stand_ins.close_fast_ports()
+        policy = self._context.policy
+        count = 0 if policy.inside_may_bypass() else self._stand_ins.close_fast_ports()
         # These are connections of nodes inside, who may have to be told of their publishers again.
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:
-            if endpoint.fast_port is not None and not self._access.may_bypass(endpoint):
+            if endpoint.fast_port is not None and not policy.may_bypass(endpoint):
                 count += endpoint.fast_connections
                 self._plane.cut(endpoint)
                 self._leases.withdraw_fast_port(endpoint)

@@ -1,7 +1,7 @@
 """The master's part for what it does not know: which publishers subscribers inside hear of.
 
 A list of publishers for a node inside is what the master says, and the hidden publishers besides
-(`rosproxy.ros1.registry.hidden_registrations`). When those change, the subscribers inside are told.
+(`rosproxy.ros1.policy`). When those change, the subscribers inside are told.
 The ones that the master knows need the master's list for that: registering them again yields it,
 and tells nobody anything.
 
@@ -18,9 +18,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry import hidden_registrations
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
-from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
 from rosproxy.ros1.upkeep.decisions import registration as decisions
 
@@ -59,7 +57,7 @@ class PublisherUpdates:
         caller = self._context.caller_at(endpoint)
         addressing = self._context.addressing
         await self._stand_ins.listen_for(publishers, caller)
-        uris = policing.publishers_for(endpoint, topic, publishers, addressing)
+        uris = self._context.policy.publishers_for(endpoint, topic, publishers)
         imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
         return await self._update(endpoint.slave, topic, [*imported])
 
@@ -74,7 +72,7 @@ class PublisherUpdates:
         Not ``everybody``: only the hidden subscribers, since the master tells the others.
         """
         for topic in topics:
-            if everybody or (Kind.SUBSCRIBER, topic) in self._context.registry.hidden:
+            if everybody or self._context.policy.hides_subscribers(topic):
                 self._changed_topics[topic] = everybody or self._changed_topics.get(topic, False)
                 if topic not in self._topics_underway:
                     self._topics_underway.add(topic)
@@ -85,7 +83,7 @@ class PublisherUpdates:
         try:
             while topic in self._changed_topics:
                 everybody = self._changed_topics.pop(topic)
-                inside = hidden_registrations.subscribers_inside(self._context.registry, topic)
+                inside = self._context.registry.subscriptions(topic)
                 inside = [(e, r) for e, r in inside if e.answers and (everybody or r.hidden)]
                 try:
                     await self._hand_out(inside)

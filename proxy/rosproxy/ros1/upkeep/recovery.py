@@ -35,7 +35,6 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.node_health import ProbeResult
-from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.upkeep.decisions import recovery_claims
 from rosproxy.ros1.upkeep.decisions.recovery_claims import Claim
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
@@ -68,7 +67,6 @@ class Recovery:
         registrar: Registrar,
         resubscriber: Resubscriber,
         plane: KernelPlane,
-        access: AccessChecks,
         memory: LeaseMemory,
     ) -> None:
         self._context = context
@@ -76,7 +74,6 @@ class Recovery:
         self._plane = plane
         self._verifier = Verifier(context.nodes)
         self._memory = memory
-        self._access = access
         self._registrar = registrar
         self._resubscriber = resubscriber
         self.verifying: set[Endpoint] = set()
@@ -103,7 +100,9 @@ class Recovery:
             if self._failures != failures_before:
                 raise Unreachable("the proxy could not read the master's state")
             try:
-                await self._context.policy.wait_for_operator(self._context.settings.await_policy)
+                await self._context.policy.rules.wait_for_operator(
+                    self._context.settings.await_policy
+                )
                 await self._recover()
             except (Unreachable, MasterError) as error:
                 self._failures += 1
@@ -159,7 +158,7 @@ class Recovery:
         served_ids = {id(claim) for claim, endpoint in restored if endpoint is not None}
         unserved = [claim for claim in claims if id(claim) not in served_ids]
         # Before calls that register go on: their nodes could get these fast ports as leases.
-        self._plane.recovered([e for e in endpoints if self._access.may_bypass(e)])
+        self._plane.recovered([e for e in endpoints if self._context.policy.may_bypass(e)])
         if (unserved or forgotten) and self._context.settings.cleanup_after:
             sweep = self._sweep(unserved, forgotten)
             self._context.tasks.spawn(sweep, "taking back registrations of former proxies")

@@ -13,14 +13,12 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from rosproxy.access.layers import Verdict
 from rosproxy.ros1.clients.master_client import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.master_methods import Kind, prefix
+from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.upkeep.decisions import registration as decisions
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
@@ -224,7 +222,7 @@ class Registrar:
         to_hide = list[EndpointRegistration]()
         to_show = list[EndpointRegistration]()
         for count, (endpoint, registration) in enumerate(self._context.registry.registrations(), 1):
-            if self._verdict(endpoint, registration).allowed == registration.hidden:
+            if self._context.policy.verdict(endpoint, registration).allowed == registration.hidden:
                 (to_show if registration.hidden else to_hide).append((endpoint, registration))
             if not count % JUDGED_AT_ONCE:
                 await asyncio.sleep(0)
@@ -232,17 +230,6 @@ class Registrar:
         alive = [(e, r) for e, r in to_show if e.answers and not e.health.cleaned]
         await self.register(alive)
         return len(to_hide), len(alive)
-
-    def _verdict(self, endpoint: Endpoint, registration: Registration) -> Verdict:
-        policy = self._context.policy
-        kind = KINDS[registration.kind]
-        address = endpoint.address
-        verdict = policy.judge(kind, registration.name, [registration.caller_id], address)
-        if registration.kind is Kind.PARAM and verdict.allowed:
-            return policy.judge_below(
-                kind, prefix(registration.name), registration.caller_id, address
-            )
-        return verdict
 
     async def _conceal(self, registrations: Sequence[EndpointRegistration]) -> None:
         """Hide registrations, and take back what the master has of them. Raises Unreachable.
@@ -270,7 +257,7 @@ class Registrar:
             registry.unregister(registration.kind, registration.name, registration.caller_id)
         subscribers = [(e, r) for e, r in registrations if r.kind is Kind.SUBSCRIBER]
         update = self._publisher_updates.update_inside
-        # To the empty list the publishers inside are added (`policing.publishers_for`).
+        # To the empty list the publishers inside are added (`Ros1Policy.publishers_for`).
         await asyncio.gather(*(update(e, r.name, []) for e, r in subscribers))
         self._publisher_updates.update_subscribers(
             {r.name for _, r in registrations if r.kind is Kind.PUBLISHER}
@@ -295,7 +282,7 @@ class Registrar:
             return
         addressing = self._context.addressing
         current = decisions.to_register(registrations)
-        allowed = {(e, r): self._verdict(e, r).allowed for e, r in current}
+        allowed = {(e, r): self._context.policy.verdict(e, r).allowed for e, r in current}
         await self._conceal([pair for pair, is_allowed in allowed.items() if not is_allowed])
         permitted = [pair for pair, is_allowed in allowed.items() if is_allowed]
         calls = [

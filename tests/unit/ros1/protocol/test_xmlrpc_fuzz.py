@@ -24,6 +24,7 @@ from tests.unit.builders import (
     py_reply,
     python_values,
     raw_call,
+    unfiltered,
 )
 
 TEXT = st.text(
@@ -121,7 +122,7 @@ def test_a_reply_without_addresses_comes_out_byte_for_byte(
     request = master_calls.read_request(py_call(method, "/node"), CALLER)
     for reply in (py_reply(value), py_reply([status, "said", value])):
         answer = master_calls.read_reply(exported(request), reply)
-        assert master_api.import_reply(answer, WORLD) == reply
+        assert master_api.import_reply(answer, WORLD, unfiltered) == reply
 
 
 @given(
@@ -160,7 +161,7 @@ def everything_in_reply(reply: bytes) -> None:
     slave_api.topic_port(call, reply)
     slave_api.rewrite_reply(call, reply, REACHED, VIEW)
     request = master_calls.read_request(py_call("system.multicall", []), CALLER)
-    master_api.import_reply(master_calls.read_reply(exported(request), reply), WORLD)
+    master_api.import_reply(master_calls.read_reply(exported(request), reply), WORLD, unfiltered)
     multicall.results_reply([multicall.result_value(reply)])
 
 

@@ -1,4 +1,4 @@
-"""What of a call the policy is asked about, and what is answered in the master's place."""
+"""What the policy checks in a call, and what the proxy answers in the master's place."""
 
 from dataclasses import replace
 
@@ -9,15 +9,16 @@ from hypothesis import strategies as st
 from rosproxy.access.rules import RuleKind
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.policy.checks import topic_names
+from rosproxy.ros1.policy.denial import no_provider
+from rosproxy.ros1.policy.hidden import HiddenRegistrations
+from rosproxy.ros1.policy.parameters import ParamUse, param_use
 from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
-from rosproxy.ros1.protocol.xmlrpc.document import Call
-from rosproxy.ros1.registry import hidden_registrations
-from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
+from rosproxy.ros1.protocol.xmlrpc.document import Call, parse_call
+from rosproxy.ros1.registry.endpoint import NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
-from rosproxy.ros1.rewriting import policing
-from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.rewriting.hidden_graph import with_hidden
-from tests.unit.builders import make_stand_ins
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from tests.unit.builders import make_stand_ins, py_call
 
 PORTS = PortRange(11000, 11009)
 OUTSIDE = "http://robot:40001/"
@@ -36,8 +37,12 @@ def make(*registrations: tuple[str, Kind, str, bool]) -> Addressing:
     return Addressing(registry, "host", ports, make_stand_ins(ports))
 
 
-def nodes(endpoints: list[Endpoint]) -> list[str]:
-    return [name for endpoint in endpoints for name in endpoint.caller_ids]
+def hidden_in(addressing: Addressing) -> HiddenRegistrations:
+    return HiddenRegistrations(addressing.registry, addressing)
+
+
+def look_up_node(name: str) -> Call:
+    return parse_call(py_call("lookupNode", "/me", name))
 
 
 @pytest.mark.parametrize(
@@ -57,16 +62,16 @@ def nodes(endpoints: list[Endpoint]) -> list[str]:
 def test_what_a_call_does_with_parameters(
     method: str, name: str | None, use: tuple[RuleKind, tuple[str, ...], bool]
 ) -> None:
-    assert policing.param_use(method, "/ns/node", name) == policing.ParamUse(*use)
+    assert param_use(method, "/ns/node", name) == ParamUse(*use)
 
 
 def test_other_calls_do_nothing_with_parameters() -> None:
-    assert policing.param_use("registerPublisher", "/a", "/b") is None
+    assert param_use("registerPublisher", "/a", "/b") is None
 
 
 @given(st.text("/ab~", max_size=8))
 def test_a_topic_is_asked_about_in_every_form_that_a_node_may_take_it_for(topic: str) -> None:
-    assert {topic, resolve_name(topic, "/ns/x")} <= {*policing.topic_names(topic, "/ns/x")}
+    assert {topic, resolve_name(topic, "/ns/x")} <= {*topic_names(topic, "/ns/x")}
 
 
 def test_a_subscriber_hears_of_hidden_publishers_besides_the_masters() -> None:
@@ -79,9 +84,8 @@ def test_a_subscriber_hears_of_hidden_publishers_besides_the_masters() -> None:
     registry = addressing.registry
     shown, concealed, _, listener = registry
     at_master = [OUTSIDE, addressing.advertised_uri(shown)]
-    uris = policing.publishers_for(listener, "/t", at_master, addressing)
+    uris = hidden_in(addressing).publishers_for(listener, "/t", at_master)
     assert uris == [*at_master, addressing.advertised_uri(concealed)]
-    assert policing.publishers_for(None, "/t", at_master, addressing) == at_master
 
 
 def test_a_hidden_subscriber_hears_of_those_inside_alone() -> None:
@@ -92,7 +96,7 @@ def test_a_hidden_subscriber_hears_of_those_inside_alone() -> None:
     )
     shown, concealed, listener = addressing.registry
     inside = [addressing.advertised_uri(shown), addressing.advertised_uri(concealed)]
-    assert policing.publishers_for(listener, "/t", [OUTSIDE], addressing) == inside
+    assert hidden_in(addressing).publishers_for(listener, "/t", [OUTSIDE]) == inside
 
 
 def test_what_is_hidden_is_known_by_kind_and_name() -> None:
@@ -103,16 +107,18 @@ def test_what_is_hidden_is_known_by_kind_and_name() -> None:
     )
     registry = addressing.registry
     a, b, c = registry
-    assert nodes(hidden_registrations.publishers(registry, "/t")) == ["/a"]
-    assert hidden_registrations.service(registry, "/s") is b
-    assert hidden_registrations.service(registry, "/shown") is None
-    assert hidden_registrations.node(registry, "/a") is a
-    assert hidden_registrations.node(registry, "/c") is None
+    hidden = hidden_in(addressing)
+    caller = Caller("10.0.0.9", "10.0.0.100")
+    assert dict(registry.hidden_holders(Kind.PUBLISHER, "/t")) == {"/a": a}
+    assert [(e, r.name) for e, r in registry.hidden_registrations()] == [(a, "/t"), (b, "/s")]
+    assert hidden.find_node(look_up_node("/a"), caller)
+    assert hidden.find_node(look_up_node("/c"), caller) is None
     a.health.note_cleaned(1.0)
-    assert hidden_registrations.publishers(registry, "/t") == []
+    assert hidden.find_node(look_up_node("/a"), caller) is None
+    assert hidden.publishers_for(c, "/t", []) == []
     registry.register(b, replace(b.registrations[Kind.SERVICE, "/s", "/b"], hidden=False))
     registry.remove(a)
-    assert registry.hidden == {}
+    assert not registry.hides
     assert c.names_at_master(Kind.SERVICE) == ["/shown"]
 
 
@@ -133,12 +139,9 @@ def test_the_index_of_hidden_names_is_that_of_the_registrations(
         registration = Registration(Kind.PUBLISHER, topic, caller, hidden=is_hidden)
         registry.register(endpoint, registration)
     wanted = {
-        (registration.kind, registration.name, registration.caller_id)
-        for _, registration in registry.registrations()
-        if registration.hidden
+        registration.key for _, registration in registry.registrations() if registration.hidden
     }
-    indexed = {(*key, caller) for key, holders in registry.hidden.items() for caller in holders}
-    assert indexed == wanted
+    assert {registration.key for _, registration in registry.hidden_registrations()} == wanted
 
 
 def test_the_graph_is_completed_once() -> None:
@@ -147,31 +150,32 @@ def test_the_graph_is_completed_once() -> None:
         ("/b", Kind.SUBSCRIBER, "/only/heard", True),
         ("/c", Kind.SERVICE, "/s", True),
     )
-    registry = addressing.registry
+    hidden = hidden_in(addressing)
     state = [[["/t", ["/far"]]], [], []]
-    assert with_hidden(Call("getSystemState", []), state, registry) == [
+    assert hidden.complete_graph(Call("getSystemState", []), state) == [
         [["/t", ["/far", "/a"]]],
         [["/only/heard", ["/b"]]],
         [["/s", ["/c"]]],
     ]
     types = [["/t", "X"]]
-    assert with_hidden(Call("getTopicTypes", []), types, registry) == [
+    assert hidden.complete_graph(Call("getTopicTypes", []), types) == [
         ["/t", "X"],
         ["/only/heard", "T"],
     ]
-    assert with_hidden(Call("getPublishedTopics", []), [], registry) == [["/t", "T"]]
+    assert hidden.complete_graph(Call("getPublishedTopics", []), []) == [["/t", "T"]]
 
 
 @given(st.recursive(st.text() | st.integers(), st.lists))
 def test_a_malformed_graph_is_left_as_it_is_or_completed(said: object) -> None:
-    registry = make(("/a", Kind.PUBLISHER, "/t", True)).registry
+    hidden = hidden_in(make(("/a", Kind.PUBLISHER, "/t", True)))
     for method in ("getSystemState", "getTopicTypes", "getPublishedTopics"):
-        with_hidden(Call(method, []), said, registry)
+        hidden.complete_graph(Call(method, []), said)
 
 
 def test_what_a_policy_denies_has_a_fix() -> None:
     reason = "policy of --policy: deny call /add"
-    answer = policing.no_provider(reason)
-    assert answer.triple()[1] == (
+    denial = no_provider(reason)
+    assert denial.reason == reason
+    assert denial.answer.triple()[1] == (
         f"no provider (rosproxy: {reason}. Change that rule if the node may have this)"
     )

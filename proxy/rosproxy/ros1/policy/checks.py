@@ -1,0 +1,416 @@
+"""The checks of the policy: before the master or a node is called, and of what comes back.
+
+Each ``check_…`` returns a `Denial`, or None for what is allowed, and reports what a rule denies. A
+source that is the address of a node inside is not outside: nodes in several inside networks reach
+each other through the proxy's ports.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rosproxy.access.access_policy import OUTWARDS, PARAMETERS, AccessPolicy
+from rosproxy.access.layers import Verdict, strictest
+from rosproxy.access.rules import RuleKind
+from rosproxy.forwarding.relay import Relay
+from rosproxy.ros1.clients.master_client import MasterClient, MasterError, Unreachable
+from rosproxy.ros1.policy.denial import Denial, denied, no_provider, no_publisher, with_fix
+from rosproxy.ros1.policy.hidden import HiddenRegistrations
+from rosproxy.ros1.policy.parameters import ParamUse, param_use, param_use_of, sets_namespace
+from rosproxy.ros1.policy.service_finder import ServiceFinder
+from rosproxy.ros1.protocol.master_methods import (
+    GRAPH_METHODS,
+    Kind,
+    method_spec,
+    prefix,
+    resolve_name,
+)
+from rosproxy.ros1.protocol.uris import parse_service_uri
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import passing
+from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
+from rosproxy.ros1.protocol.xmlrpc.values import Edit
+from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
+from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.ros1.rewriting.master_calls import (
+    CallOutcome,
+    CallResult,
+    LocalAnswer,
+    Request,
+    registration_of,
+    second_parameter_name,
+)
+from rosproxy.ros1.rewriting.slave_api import MASTER_ONLY
+
+MASTER = "/master"
+"""The caller_id of the master's calls to nodes (rosmaster/registrations.py)."""
+RULE_KINDS = {
+    Kind.PUBLISHER: RuleKind.PUBLISH,
+    Kind.SUBSCRIBER: RuleKind.SUBSCRIBE,
+    Kind.SERVICE: RuleKind.SERVE,
+    Kind.PARAM: RuleKind.GET_PARAM,
+}
+"""The rules for a registration, by its kind."""
+
+
+class Ros1Policy:
+    """The policy in force, ``rules``, as it applies to calls, connections and registrations.
+
+    ``must_enforce``: something happened by a policy that is no longer in force, so the policy has
+    to be enforced again (`PolicyEnforcer`).
+    """
+
+    def __init__(
+        self,
+        rules: AccessPolicy,
+        registry: Registry,
+        addressing: Addressing,
+        upstream: MasterClient,
+        services: ServiceFinder,
+    ) -> None:
+        self.rules = rules
+        self.must_enforce = False
+        self._registry = registry
+        self._addressing = addressing
+        self._upstream = upstream
+        self._services = services
+        self._hidden = HiddenRegistrations(registry, addressing)
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to check: no rule, and nothing that a former rule has hidden."""
+        return self.rules.empty and not self._registry.hides
+
+    # Calls at the master port
+
+    def reads_parameters(self, source: str | None) -> bool:
+        """Whether calls for parameters from an address have to be read; None: from any."""
+        return self.rules.may_deny(PARAMETERS, (), source)
+
+    def reads_reply(self, request: Request) -> bool:
+        """Whether the reply to a request may have to say otherwise than the master does."""
+        if request.tells_graph and self._registry.hides:
+            return True
+        lists_params = any(call and call.method == "getParamNames" for call in request.calls)
+        return lists_params and self._filters_params(request.caller)
+
+    async def check_request(self, request: Request) -> Sequence[LocalAnswer | None]:
+        """The answers to the calls of a request that the master does not get; None: it gets it.
+
+        A registration is checked once the node has an endpoint (`check_registration`). Raises
+        Unreachable.
+        """
+        answers: list[LocalAnswer | None] = [None] * len(request.calls)
+        if self.idle:
+            return answers
+        params = _ParamNames(self._upstream)
+        for index, call in enumerate(request.calls):
+            if call:
+                answers[index] = await self._answer(call, request.caller, params)
+            await asyncio.sleep(0)  # with many rules one call may take milliseconds
+        return answers
+
+    def check_unread(self, method: str, head: bytes, source: str) -> Denial | None:
+        """Check a long call, of which only the head was read."""
+        caller_id, name = passing.first_strings(head, 2)
+        use = param_use(method, caller_id or "", name)
+        if use is None:
+            return None
+        verdict = self._judge_use(use, caller_id or "", source)
+        return self._denial(verdict, use.kind, f"of {caller_id}", source)
+
+    def check_registration(
+        self, call: Call, admission: CallOutcome, caller: Caller, now: float
+    ) -> Denial | None:
+        """Check a call that registers, once its node is admitted; what is denied is hidden."""
+        affected = None if self.idle else registration_of(call, now, caller.address)
+        if affected is None or affected.kind is Kind.PARAM:  # parameters were checked before
+            return None
+        endpoint = admission if isinstance(admission, Endpoint) else None
+        address = endpoint.address if endpoint else caller.address
+        kind = RULE_KINDS[affected.kind]
+        verdict = self.rules.ask(kind, affected.name, [affected.caller_id], address)
+        if verdict.allowed:
+            return None
+        if endpoint is None:  # the URI is that of another node, which the proxy can't hide
+            return denied(verdict.reason)
+        hidden = replace(affected, hidden=True)
+        answer = self._hidden.answer_registration(hidden, endpoint, caller)
+        return Denial(verdict.reason, answer)
+
+    def answer_unregistration(
+        self, call: Call, endpoint: Endpoint, caller: Caller
+    ) -> LocalAnswer | None:
+        """The answer to a call that ends a hidden registration; None for any other call."""
+        ended = None if self.idle else registration_of(call, 0.0, caller.address)
+        current = endpoint.registrations.get(ended.key) if ended else None
+        return self._hidden.answer_unregistration(current) if current and current.hidden else None
+
+    def settle(self, endpoint: Endpoint, registration: Registration) -> Registration:
+        """The registration as the registry has to have it.
+
+        A registration that the master has stays shown until the enforcer takes it back: the policy
+        has just changed. The enforcer also takes the fast port of a node that hides anything.
+        """
+        if not registration.hidden:
+            return registration
+        previous = endpoint.registrations.get(registration.key)
+        is_shown = previous is not None and not previous.hidden
+        if is_shown or endpoint.fast_port is not None:
+            self.must_enforce = True
+        return replace(registration, hidden=not is_shown)
+
+    def filter_result(self, result: CallResult, caller: Caller) -> list[Edit]:
+        """The edits by which a result leaves out what is denied and has what is hidden; or none."""
+        value = result.value
+        if self.idle or value is None or not result.accepted:
+            return []
+        call = result.call
+        if call.method == "getParamNames":
+            return self._without_denied_params(value, caller)
+        if call.method in GRAPH_METHODS and self._registry.hides:
+            graph = self._hidden.complete_graph(call, xmlrpc.python_value(value))
+            return [value.replaced_by(xmlrpc.dump_value(graph))]
+        if method_spec(call.method).registers is Kind.SUBSCRIBER and result.endpoint:
+            extra = self.publishers_for(result.endpoint, second_parameter_name(call), [])
+            uris = [*(item.text for item in value.items), *extra]
+            imported = dict.fromkeys(self._addressing.import_slave(uri, caller) for uri in uris)
+            return [value.replaced_by(xmlrpc.dump_value([*imported]))] if extra else []
+        return []
+
+    def publishers_for(self, endpoint: Endpoint, topic: str, at_master: Sequence[str]) -> list[str]:
+        """The publishers of a topic for a node inside, by the URIs that the master has.
+
+        ``at_master`` are the publishers that the master tells this node.
+        """
+        if not self._registry.hides:
+            return [*dict.fromkeys(at_master)]
+        return self._hidden.publishers_for(endpoint, topic, at_master)
+
+    # What is registered
+
+    def verdict(self, endpoint: Endpoint, registration: Registration) -> Verdict:
+        """Whether the master may have a registration; nothing is reported."""
+        kind = RULE_KINDS[registration.kind]
+        name = registration.name
+        verdict = self.rules.judge(kind, name, [registration.caller_id], endpoint.address)
+        if registration.kind is Kind.PARAM and verdict.allowed:
+            caller_id = registration.caller_id
+            return self.rules.judge_below(kind, prefix(name), caller_id, endpoint.address)
+        return verdict
+
+    def hidden_registrations(self) -> list[EndpointRegistration]:
+        """All hidden registrations with their endpoints."""
+        return self._registry.hidden_registrations()
+
+    def hides_subscribers(self, topic: str) -> bool:
+        """Whether a topic has a hidden subscriber."""
+        return bool(self._registry.hidden_holders(Kind.SUBSCRIBER, topic))
+
+    # What outside asks of a node inside
+
+    def check_outside(
+        self, kind: RuleKind, name: str, endpoint: Endpoint, source: str, caller_id: str = ""
+    ) -> Denial | None:
+        """Check whether outside may have a topic or service of a node."""
+        if self.rules.empty:
+            return None
+        wanted_kind = Kind.SERVICE if kind is RuleKind.SERVE else Kind.PUBLISHER
+        callers = endpoint.callers_of(wanted_kind, name)
+        for resolved in topic_names(name, caller_id):
+            verdict = self.rules.judge(kind, resolved, callers, endpoint.address)
+            if verdict.rule is not None and not self._is_inside(source):
+                subject = f"{resolved} of {endpoint.label}"
+                if denial := self._denial(verdict, kind, subject, source):
+                    return denial
+        return None
+
+    def check_outside_request(self, call: Call, endpoint: Endpoint, source: str) -> Denial | None:
+        """Check a requestTopic from outside.
+
+        An offer of UDPROS holds a header of its own, whose topic roscpp serves (topic_manager.cpp,
+        requestTopic): the offer is denied if a rule may deny anything of the node.
+        """
+        topic = call.string(1) or ""
+        caller_id = call.string(0) or ""
+        denial = self.check_outside(RuleKind.PUBLISH, topic, endpoint, source, caller_id)
+        if denial:
+            return no_publisher(topic, with_fix(denial.reason))
+        if _offers_tcpros_alone(call) or self.may_bypass(endpoint) or self._is_inside(source):
+            return None
+        text = "a policy may deny topics of this node, so only TCPROS passes. Offer TCPROS"
+        return no_publisher(topic, text)
+
+    async def check_slave_call(
+        self, method: str, endpoint: Endpoint, source: str, caller_id: str
+    ) -> Denial | None:
+        """Check a call from outside at a node.
+
+        What only the master calls, in its name and from its address, is allowed.
+        """
+        kind = RuleKind.SLAVE
+        verdict = self.rules.judge(kind, method, [caller_id], endpoint.address)
+        if verdict.rule is None or self._is_inside(source):
+            return None
+        is_from_master = method in MASTER_ONLY and caller_id == MASTER
+        if is_from_master and source in await self._upstream.master_addresses():
+            return None
+        return self._denial(verdict, kind, f"{method} at {endpoint.label}", source)
+
+    def may_bypass(self, endpoint: Endpoint) -> bool:
+        """Whether a node's topics may go where no header is read: forwarded by the kernel."""
+        return not self.rules.may_deny(OUTWARDS, endpoint.caller_ids, endpoint.address)
+
+    # What a node inside asks of outside
+
+    def check_inside(self, kind: RuleKind, name: str, source: str, caller_id: str) -> Denial | None:
+        """Check whether a node inside may have a topic or service of outside.
+
+        A client gives any name. Unless a node of that name is known at the address of the client,
+        what one of the nodes there may not have is denied.
+        """
+        if self.rules.empty:
+            return None
+        names_at_source = [n for e in self._registry if e.address == source for n in e.caller_ids]
+        callers = [caller_id] if caller_id in names_at_source else [caller_id, *names_at_source]
+        for resolved in topic_names(name, caller_id):
+            verdict = self.rules.ask(kind, resolved, callers, source)
+            if not verdict.allowed:
+                return denied(verdict.reason)
+        return None
+
+    def check_inside_request(self, call: Call, source: str) -> Denial | None:
+        """Check a call of a node inside at a node outside, if it is a requestTopic."""
+        if call.method != "requestTopic":
+            return None
+        topic = call.string(1) or ""
+        denial = self.check_inside(RuleKind.SUBSCRIBE, topic, source, call.string(0) or "")
+        return no_publisher(topic, with_fix(denial.reason)) if denial else None
+
+    def inside_may_bypass(self) -> bool:
+        """Whether nodes inside may have topics of outside where no header is read."""
+        return not self.rules.may_deny((RuleKind.SUBSCRIBE,), (), None)
+
+    def inside_may_keep(self, relay: Relay) -> bool:
+        """Whether a node inside may still have what a relay brings it from outside.
+
+        Of a service's connection only the address is known: it may be denied as well.
+        """
+        if parse_service_uri(relay.name):
+            return not self.rules.may_deny({RuleKind.CALL}, [relay.caller_id], relay.peer)
+        kind = RuleKind.SUBSCRIBE
+        return self.check_inside(kind, relay.name, relay.peer, relay.caller_id) is None
+
+    async def _answer(
+        self, call: Call, caller: Caller, params: "_ParamNames"
+    ) -> LocalAnswer | None:
+        if call.method == "lookupNode":
+            return self._hidden.find_node(call, caller)
+        if call.method == "lookupService":
+            return await self._answer_lookup(call, caller)
+        denial = await self._check_parameters(call, caller, params)
+        return denial.answer if denial else None
+
+    async def _answer_lookup(self, call: Call, caller: Caller) -> LocalAnswer | None:
+        name = second_parameter_name(call)
+        await self._services.find(name)
+        provider = self._registry.services.get(name)
+        # Rules for `call` are about services of outside (docs/reference/policy.md). Once a node's
+        # registrations are taken back, the master may have the service of another.
+        if provider and not provider[0].health.cleaned:
+            is_hidden = provider[1].hidden
+            return self._hidden.find_service(name, provider[0], caller) if is_hidden else None
+        callers = [call.string(0) or ""]
+        verdict = self.rules.ask(RuleKind.CALL, name, callers, caller.address)
+        return None if verdict.allowed else no_provider(verdict.reason).answer
+
+    async def _check_parameters(
+        self, call: Call, caller: Caller, params: "_ParamNames"
+    ) -> Denial | None:
+        """Check what a call does with parameters. Raises Unreachable."""
+        use = param_use_of(call)
+        if use is None:
+            return None
+        caller_id = call.string(0) or ""
+        verdict = self._judge_use(use, caller_id, caller.address)
+        # A subscriber of a namespace is also sent what is set below it later (rosmaster's
+        # paramserver.py, compute_param_updates), so the names that exist now don't settle it. Nor
+        # do they for a call that sets a whole namespace.
+        may_settle = use.below and call.method != "subscribeParam" and not sets_namespace(call)
+        exact = self._judge_names(use.kind, use.names, caller_id, caller.address)
+        if may_settle and exact.allowed and not verdict.allowed:
+            starts = tuple(map(prefix, use.names))
+            below = [name for name in await params.read() if name.startswith(starts)]
+            names = (*use.names, *below)
+            verdict = self._judge_names(use.kind, names, caller_id, caller.address)
+        return self._denial(verdict, use.kind, f"{use.names[0]} of {caller_id}", caller.address)
+
+    def _judge_use(self, use: ParamUse, caller_id: str, source: str) -> Verdict:
+        """The strictest verdict on all names that a call may mean, and on names below them."""
+        verdict = self._judge_names(use.kind, use.names, caller_id, source)
+        if not use.below:
+            return verdict
+        judge = self.rules.judge_below
+        below = [judge(use.kind, prefix(name), caller_id, source) for name in use.names]
+        return strictest([verdict, *below])
+
+    def _judge_names(
+        self, kind: RuleKind, names: Sequence[str], caller_id: str, source: str
+    ) -> Verdict:
+        judge = self.rules.judge
+        return strictest([judge(kind, name, [caller_id], source) for name in names])
+
+    def _filters_params(self, caller: Caller) -> bool:
+        """Whether there may be parameters that a caller may not read."""
+        return self.rules.may_deny({RuleKind.GET_PARAM}, [caller.caller_id], caller.address)
+
+    def _without_denied_params(self, names: Value, caller: Caller) -> list[Edit]:
+        """The edits by which a list of parameters leaves out those that a caller may not read."""
+        if not self._filters_params(caller):
+            return []
+        kind = RuleKind.GET_PARAM
+        return [
+            item.removed()
+            for item in names.items
+            if not self._judge_names(kind, [item.text], caller.caller_id, caller.address).allowed
+        ]
+
+    def _denial(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Denial | None:
+        """Report a verdict; the denial if it is one."""
+        is_allowed = self.rules.report(verdict, kind, subject, source).allowed
+        return None if is_allowed else denied(verdict.reason)
+
+    def _is_inside(self, source: str) -> bool:
+        """Whether a node that has answered lives at an address."""
+        return any(e.address == source and e.trusted for e in self._registry)
+
+
+class _ParamNames:
+    """The names of all parameters, for one request: the master is asked once if at all."""
+
+    def __init__(self, upstream: MasterClient) -> None:
+        self._upstream = upstream
+        self._names: list[str] | None = None
+
+    async def read(self) -> list[str]:
+        """Return the names. Raises Unreachable."""
+        if self._names is None:
+            try:
+                listing = await self._upstream.call_master("getParamNames")
+            except MasterError as error:
+                raise Unreachable(str(error)) from None
+            names = listing if isinstance(listing, list) else []
+            self._names = [name for name in names if isinstance(name, str)]
+        return self._names
+
+
+def topic_names(topic: str, caller_id: str) -> tuple[str, ...]:
+    """The names to which a node may resolve a topic as a client has written it."""
+    return tuple(dict.fromkeys((topic, resolve_name(topic, ""), resolve_name(topic, caller_id))))
+
+
+def _offers_tcpros_alone(call: Call) -> bool:
+    """Whether a requestTopic offers no other protocol than TCPROS."""
+    offers = call.params[2].items if len(call.params) > 2 else []
+    return all(offer.items and offer.items[0].string() == "TCPROS" for offer in offers)

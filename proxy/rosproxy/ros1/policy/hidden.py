@@ -1,0 +1,155 @@
+"""Hidden registrations: how nodes inside find each other where the master is told nothing.
+
+For nodes inside the proxy answers in the master's place:
+
+- A subscriber hears of hidden publishers besides the publishers that the master names.
+- A hidden subscriber hears of all publishers inside, and of none outside.
+- lookupService finds a hidden service, lookupNode a node of which the master knows nothing.
+- The graph has the hidden names, too.
+
+`Registry` has the table of hidden registrations. Texts and values of the answers:
+ros_comm/tools/rosmaster/src/rosmaster/master_api.py and registrations.py.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from msgspec.structs import replace
+
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.graph import read_types
+from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.ros1.rewriting.master_calls import LocalAnswer, RegistryChange, second_parameter_name
+
+_TABLES = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
+"""The tables of getSystemState, in order."""
+
+
+@dataclass(slots=True, eq=False)
+class HiddenRegistrations:
+    """Answers for what is hidden, as the master would answer if it knew."""
+
+    _registry: Registry
+    _addressing: Addressing
+
+    def answer_registration(
+        self, registration: Registration, endpoint: Endpoint, caller: Caller
+    ) -> LocalAnswer:
+        """The answer to a registration that is hidden from now on."""
+        name = registration.name
+        change = RegistryChange(registration, endpoint)
+        if registration.kind is Kind.SERVICE:
+            text = f"Registered [{registration.caller_id}] as provider of [{name}]"
+            return LocalAnswer(1, text, 1, change)
+        if registration.kind is Kind.PUBLISHER:
+            neighbours = [e for e, _ in self._registry.subscriptions(name)]
+            text = f"Registered [{registration.caller_id}] as publisher of [{name}]"
+        else:
+            neighbours = self._publishers_inside(name)
+            text = f"Subscribed to [{name}]"
+        caller = replace(caller, endpoint=endpoint)
+        uris = map(self._addressing.advertised_uri, dict.fromkeys(neighbours))
+        imported = [self._addressing.import_slave(uri, caller) for uri in uris]
+        return LocalAnswer(1, text, imported, change)
+
+    def answer_unregistration(self, registration: Registration) -> LocalAnswer:
+        """The answer to a call that ends a hidden registration."""
+        # rosmaster says "provider" of topics as well (registrations.py, unregister).
+        text = f"Unregistered [{registration.caller_id}] as provider of [{registration.name}]"
+        return LocalAnswer(1, text, 1, RegistryChange(registration, None))
+
+    def find_service(self, name: str, endpoint: Endpoint, caller: Caller) -> LocalAnswer:
+        """The answer to lookupService for a hidden service of an endpoint."""
+        uri = self._addressing.advertised_service(endpoint)
+        imported = self._addressing.import_service(uri, name, caller)
+        return LocalAnswer(1, f"rosrpc URI: [{imported}]", imported)
+
+    def find_node(self, call: Call, caller: Caller) -> LocalAnswer | None:
+        """The answer to lookupNode; None for a node of which the master may know."""
+        caller_id = second_parameter_name(call)
+        endpoint = self._registry.by_caller.get(caller_id)
+        if endpoint is None or endpoint.health.cleaned:
+            return None
+        if not all(r.hidden for r in endpoint.registrations.values() if r.caller_id == caller_id):
+            return None
+        uri = self._addressing.import_slave(self._addressing.advertised_uri(endpoint), caller)
+        return LocalAnswer(1, "node api", uri)
+
+    def publishers_for(self, endpoint: Endpoint, topic: str, at_master: Sequence[str]) -> list[str]:
+        """The publishers of a topic for the node of an endpoint, by the URIs that the master has.
+
+        ``at_master`` are the publishers that the master tells this node.
+        """
+        if endpoint in self._registry.hidden_holders(Kind.SUBSCRIBER, topic).values():
+            at_master = []
+            extra = self._publishers_inside(topic)
+        else:
+            extra = _living(self._registry.hidden_holders(Kind.PUBLISHER, topic).values())
+        return [*dict.fromkeys([*at_master, *map(self._addressing.advertised_uri, extra)])]
+
+    def complete_graph(self, call: Call, listing: Any) -> Any:
+        """The graph that the master tells, with the hidden names; unchanged if it is malformed.
+
+        Shapes, all lists of strings: master_api.py, getPublishedTopics, getTopicTypes and
+        getSystemState.
+        """
+        if not isinstance(listing, list):
+            return listing
+        if call.method == "getSystemState":
+            if len(listing) != len(_TABLES):
+                return listing
+            pairs = zip(_TABLES, listing, strict=True)
+            return [self._with_nodes(table, kind) for kind, table in pairs]
+        kinds = [Kind.PUBLISHER, Kind.SUBSCRIBER]
+        prefix = ""
+        if call.method == "getPublishedTopics":  # of a namespace, if the call names one
+            kinds = kinds[:1]
+            namespace = call.string(1) or ""
+            prefix = f"{namespace.rstrip('/')}/" if namespace else ""
+        listed = read_types(listing)
+        return listing + [
+            [topic, type_]
+            for topic, type_ in sorted(self._types(kinds).items())
+            if topic not in listed and topic.startswith(prefix)
+        ]
+
+    def _with_nodes(self, table: Any, kind: Kind) -> Any:
+        """A table of names with their nodes, and the hidden ones among them."""
+        if not isinstance(table, list):
+            return table
+        rows = {row[0]: [*row[1]] for row in table if _is_row(row)}
+        for _, registration in self._registry.hidden_registrations():
+            if registration.kind is kind:
+                nodes = rows.setdefault(registration.name, [])
+                if registration.caller_id not in nodes:
+                    nodes.append(registration.caller_id)
+        return [[name, nodes] for name, nodes in rows.items()]
+
+    def _types(self, kinds: Sequence[Kind]) -> dict[str, str]:
+        """The types of hidden topics, as far as a node has given one."""
+        types: dict[str, str] = {}
+        for _, registration in self._registry.hidden_registrations():
+            if registration.kind in kinds and types.get(registration.name, "*") == "*":
+                types[registration.name] = registration.type
+        return types
+
+    def _publishers_inside(self, topic: str) -> list[Endpoint]:
+        """All nodes inside that publish a topic."""
+        return _living(endpoint for endpoint in self._registry if endpoint.publishes(topic))
+
+
+def _living(endpoints: Iterable[Endpoint]) -> list[Endpoint]:
+    """The endpoints whose registrations stand, each once, in the order of their ports."""
+    by_id = {id(endpoint): endpoint for endpoint in endpoints if not endpoint.health.cleaned}
+    return sorted(by_id.values(), key=lambda endpoint: endpoint.port)
+
+
+def _is_row(row: Any) -> bool:
+    match row:
+        case [str(_), [*_]]:
+            return True
+    return False

@@ -1,0 +1,53 @@
+"""Parameters: what a call does with them, and so which rules and names the policy looks at."""
+
+import msgspec
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.ros1.protocol.master_methods import resolve_name
+from rosproxy.ros1.protocol.xmlrpc.document import Call
+
+_EVERYTHING = "/"
+_READS = {"getParam": 1, "hasParam": 1, "searchParam": 1, "subscribeParam": 2}
+_WRITES = {"setParam": 1, "deleteParam": 1}
+_WHOLE = frozenset({"getParam", "subscribeParam", "setParam", "deleteParam"})
+"""The methods that are about a whole namespace, if the name is one."""
+
+
+class ParamUse(msgspec.Struct, frozen=True):
+    """What a call does with parameters: the names that it may mean, and whether all below them."""
+
+    kind: RuleKind
+    names: tuple[str, ...]
+    below: bool
+
+
+def param_use(method: str, caller_id: str, name: str | None) -> ParamUse | None:
+    """What a call does with parameters; None if nothing. No ``name``: the name is not known."""
+    if method not in _READS and method not in _WRITES:
+        return None
+    kind = RuleKind.SET_PARAM if method in _WRITES else RuleKind.GET_PARAM
+    if name is None:
+        return ParamUse(kind, (_EVERYTHING,), True)
+    if method == "searchParam":
+        return ParamUse(kind, _searched_names(caller_id, name), False)
+    return ParamUse(kind, (resolve_name(name, caller_id),), method in _WHOLE)
+
+
+def param_use_of(call: Call) -> ParamUse | None:
+    """What a call that was read does with parameters; None if nothing."""
+    place = _READS.get(call.method) or _WRITES.get(call.method)
+    return param_use(call.method, call.string(0) or "", call.string(place)) if place else None
+
+
+def sets_namespace(call: Call) -> bool:
+    """Whether a call sets a whole namespace, or may do so."""
+    return call.method == "setParam" and (len(call.params) < 3 or call.params[2].kind == "struct")
+
+
+def _searched_names(caller_id: str, name: str) -> tuple[str, ...]:
+    """The names that searchParam looks at: in all namespaces of the caller, from its own up."""
+    if name.startswith(("/", "~")):
+        return (resolve_name(name, caller_id),)
+    segments = [segment for segment in caller_id.split("/") if segment]
+    namespaces = ("/".join(["", *segments[:count]]) for count in range(len(segments), -1, -1))
+    return tuple(resolve_name(f"{namespace}/{name}", "") for namespace in namespaces)
