@@ -19,7 +19,13 @@ from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
-from rosproxy.ros1.rewriting.master_calls import CallOutcome, CallResult, RegistryChange, refusal
+from rosproxy.ros1.rewriting.master_calls import (
+    CallOutcome,
+    CallResult,
+    Passing,
+    RegistryChange,
+    refusal,
+)
 from rosproxy.settings import Settings
 
 HOST = "robot-host"
@@ -221,7 +227,7 @@ def _outcome(
 def _admit(addressing: Addressing, uri: str | None, caller: Caller, refuse: Refuse) -> CallOutcome:
     node = parse_slave_uri(uri) if uri else None
     if uri is None or node is None:
-        return None
+        return Passing.NO_REGISTRATION
     if refuse(uri):
         return refusal("rosproxy: no port is left")
     named = node.host.startswith("10.")

@@ -55,7 +55,9 @@ def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = F
     method, params = calls[0]
     text = py_call("system.multicall", body) if multicall else py_call(method, *params)
     request = master_calls.read_request(text, make_caller("10.0.0.5"))
-    exported = master_api.export_request(request, [None] * len(request.calls), make_addressing())
+    exported = master_api.export_request(
+        request, [master_calls.Passing.NO_REGISTRATION] * len(request.calls), make_addressing()
+    )
     return list(master_calls.read_reply(exported, reply).uris())
 
 

@@ -37,6 +37,7 @@ from rosproxy.ros1.rewriting.master_calls import (
     ExportedRequest,
     LocalAnswer,
     MasterReply,
+    Passing,
     RegistryChange,
     Request,
     caller_id_of,
@@ -163,7 +164,7 @@ class MasterApi:
             for call, answer in zip(request.calls, answers, strict=True):
                 if incoming.gone:
                     raise Unreachable("the caller has closed the connection")
-                outcome: CallOutcome = answer
+                outcome: CallOutcome = answer or Passing.NO_REGISTRATION
                 if call and answer is None:
                     outcome = await self._outcome(call, request, pending)
                 outcomes.append(outcome)
@@ -178,12 +179,10 @@ class MasterApi:
         caller = request.caller
         policy = self._context.policy
         if method_spec(call.method).unregisters:
-            endpoint = master_api.unregistering_endpoint(call, caller, self._context.addressing)
-            if endpoint is None:
-                return None
-            return policy.answer_unregistration(call, endpoint, caller) or endpoint
+            ended = master_api.unregistering_endpoint(call, caller, self._context.addressing)
+            return policy.answer_unregistration(call, ended, caller) or ended
         admission = await self._admit(call, request)
-        if isinstance(admission, LocalAnswer):
+        if isinstance(admission, LocalAnswer) or admission is Passing.NO_REGISTRATION:
             return admission
         if isinstance(admission, Endpoint):
             # Held before anything is awaited: nothing else keeps the lease from ending meanwhile.

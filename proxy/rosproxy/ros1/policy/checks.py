@@ -34,9 +34,9 @@ from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Regi
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
-    CallOutcome,
     CallResult,
     LocalAnswer,
+    Passing,
     Request,
     registration_of,
     second_parameter_name,
@@ -121,7 +121,7 @@ class Ros1Policy:
         return self._denial(verdict, use.kind, f"of {caller_id}", source)
 
     def check_registration(
-        self, call: Call, admission: CallOutcome, caller: Caller, now: float
+        self, call: Call, admission: Endpoint | Passing, caller: Caller, now: float
     ) -> Denial | None:
         """Check a call that registers, once its node is admitted; what is denied is hidden."""
         affected = None if self.idle else registration_of(call, now, caller.address)
@@ -140,11 +140,13 @@ class Ros1Policy:
         return Denial(verdict.reason, answer)
 
     def answer_unregistration(
-        self, call: Call, endpoint: Endpoint, caller: Caller
+        self, call: Call, ended_at: Endpoint | Passing, caller: Caller
     ) -> LocalAnswer | None:
         """The answer to a call that ends a hidden registration; None for any other call."""
-        ended = None if self.idle else registration_of(call, 0.0, caller.address)
-        current = endpoint.registrations.get(ended.key) if ended else None
+        if self.idle or not isinstance(ended_at, Endpoint):
+            return None
+        ended = registration_of(call, 0.0, caller.address)
+        current = ended_at.registrations.get(ended.key) if ended else None
         return self._hidden.answer_unregistration(current) if current and current.hidden else None
 
     def settle(self, endpoint: Endpoint, registration: Registration) -> Registration:

@@ -25,6 +25,7 @@ from rosproxy.ros1.rewriting.master_calls import (
     ExportedRequest,
     LocalAnswer,
     MasterReply,
+    Passing,
     Request,
     caller_id_of,
     read_reply,
@@ -80,7 +81,7 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
         return reply
     edits: list[Edit] = []
     for result in read_reply(
-        ExportedRequest(request, (None,) * len(request.calls), None), reply
+        ExportedRequest(request, (Passing.NO_REGISTRATION,) * len(request.calls), None), reply
     ).results:
         if not (result.triple and result.value):
             continue
@@ -90,31 +91,34 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
     return xmlrpc.apply(reply, edits)
 
 
-def unregistering_endpoint(call: Call, caller: Caller, addressing: Addressing) -> Endpoint | None:
+def unregistering_endpoint(
+    call: Call, caller: Caller, addressing: Addressing
+) -> Endpoint | Passing:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
     spec = method_spec(call.method)
     endpoint = addressing.registry.by_caller.get(caller_id_of(call))
     if endpoint is None:
-        return None
+        return Passing.FOREIGN_URI
     if spec.caller_api is None:
         uri = addressing.export_service(
             call.string(spec.service_api) or "", second_parameter_name(call), caller
         )
-        return endpoint if uri == addressing.advertised_service(endpoint) else None
+        is_own = uri == addressing.advertised_service(endpoint)
+        return endpoint if is_own else Passing.FOREIGN_URI
     uri = addressing.export_slave(call.string(spec.caller_api) or "", caller)
-    return endpoint if uri == addressing.advertised_uri(endpoint) else None
+    return endpoint if uri == addressing.advertised_uri(endpoint) else Passing.FOREIGN_URI
 
 
 def _export_call(
-    call: Call, admission: CallOutcome, caller: Caller, addressing: Addressing
+    call: Call, outcome: CallOutcome, caller: Caller, addressing: Addressing
 ) -> Iterator[Edit]:
     caller_api = call.string_value(method_spec(call.method).caller_api)
     service_api = call.string_value(method_spec(call.method).service_api)
-    if isinstance(admission, Endpoint):
+    if isinstance(outcome, Endpoint):
         if caller_api:
-            yield caller_api.with_text(addressing.advertised_uri(admission))
+            yield caller_api.with_text(addressing.advertised_uri(outcome))
         if service_api and parse_service_uri(with_caller_address(service_api.text, caller.address)):
-            yield service_api.with_text(addressing.advertised_service(admission))
+            yield service_api.with_text(addressing.advertised_service(outcome))
         return
     if caller_api:
         yield caller_api.with_text(addressing.export_slave(caller_api.text, caller))

@@ -6,6 +6,7 @@ the registry has to learn of both is told here; `rosproxy.ros1.rewriting.master_
 """
 
 from collections.abc import Iterator, Sequence
+from enum import Enum
 
 import msgspec
 from msgspec.structs import replace
@@ -44,14 +45,22 @@ class LocalAnswer(msgspec.Struct, frozen=True):
         return [self.code, self.text, self.value]
 
 
+class Passing(Enum):
+    """Why a call goes to the master without an endpoint; its URIs are exported all the same."""
+
+    NO_REGISTRATION = "the call neither registers nor unregisters"
+    FOREIGN_URI = "the URI is not that of the caller's own endpoint: a node outside, or another"
+
+
 def refusal(reason: str) -> LocalAnswer:
     """The answer to a call that fails: ROS status -1, and the reason."""
     return LocalAnswer(-1, reason)
 
 
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
-CallOutcome = Endpoint | LocalAnswer | None
-"""What becomes of a call: the endpoint that it registers or unregisters, or the proxy's reply."""
+CallOutcome = Endpoint | LocalAnswer | Passing
+"""What becomes of a call: the endpoint that it registers or unregisters, the proxy's own answer, or
+the reason why the call passes to the master without either."""
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -101,8 +110,6 @@ class ExportedRequest(msgspec.Struct, frozen=True):
     """A request made ready for the master, and what became of each of its calls.
 
     ``body`` is what the master gets; None if it gets nothing, since the proxy answers all calls.
-    An ``outcome`` is the endpoint whose registration the call makes or ends, None for another
-    call, or the proxy's own reply.
     """
 
     request: Request
@@ -204,9 +211,10 @@ def read_reply(exported: ExportedRequest, reply: bytes) -> MasterReply:
     """
     if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
         call = exported.request.calls[0]
-        endpoint = exported.outcomes[0]
-        if call and not isinstance(endpoint, LocalAnswer):
-            return MasterReply(exported, reply, None, (CallResult(call, status, None, endpoint),))
+        outcome = exported.outcomes[0]
+        if call and not isinstance(outcome, LocalAnswer):
+            result = CallResult(call, status, None, _endpoint_of(outcome))
+            return MasterReply(exported, reply, None, (result,))
     value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
@@ -252,6 +260,10 @@ def _results(exported: ExportedRequest, value: Value) -> Iterator[CallResult]:
     pairs = zip(exported.request.calls, exported.outcomes, strict=True)
     sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalAnswer)]
     # A reply may hold fewer results than there were calls; what has none is passed on as it is.
-    for (call, endpoint), triple in zip(sent, triples, strict=False):
+    for (call, outcome), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):
-            yield CallResult(call, triple.items[0].integer(), triple, endpoint)
+            yield CallResult(call, triple.items[0].integer(), triple, _endpoint_of(outcome))
+
+
+def _endpoint_of(outcome: CallOutcome) -> Endpoint | None:
+    return outcome if isinstance(outcome, Endpoint) else None

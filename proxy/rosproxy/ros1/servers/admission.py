@@ -37,6 +37,7 @@ from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.master_calls import (
     CallOutcome,
     LocalAnswer,
+    Passing,
     refusal,
     registering_uri,
 )
@@ -83,14 +84,13 @@ class NodeAdmission:
         self._making_room = asyncio.Lock()
 
     async def admit(self, call: Call, caller: Caller) -> CallOutcome:
-        """The endpoint of a call that registers, or why there is none; None for other calls.
+        """The endpoint of a call that registers, or why there is none.
 
-        None, too, for a node that is found to be outside: its URI passes as it is. Raises
-        Unreachable if the master is needed and away.
+        Raises Unreachable if the master is needed and away.
         """
         uri = registering_uri(call)
         if uri is None:
-            return None
+            return Passing.NO_REGISTRATION
         if self._context.retired:
             return refusal(RETIRED)
         uri = with_caller_address(uri, caller.address)
@@ -104,7 +104,7 @@ class NodeAdmission:
                 f"rosproxy: caller_api {uri[:200]!r} is not of the form http://host:port/"
             )
         if self._context.addressing.is_own_uri(uri, caller):
-            return None
+            return Passing.FOREIGN_URI
         return await self._admit_new(uri, node, call, caller)
 
     async def _admit_again(
@@ -133,7 +133,7 @@ class NodeAdmission:
         """The endpoint of a node that has not registered from there before; see `admit`."""
         location = await self._locate(node, call, caller)
         if location is None:
-            return None
+            return Passing.FOREIGN_URI
         admitted = await self.take_in(uri, node, location, caller)
         if isinstance(admitted, Endpoint):
             await self._leases.cleared(admitted)

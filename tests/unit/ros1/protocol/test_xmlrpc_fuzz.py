@@ -105,7 +105,9 @@ def swapped_booleans(value: Any) -> Any:
 
 def exported(request: master_calls.Request) -> master_calls.ExportedRequest:
     """The request for the master, of a node that is not admitted."""
-    return master_api.export_request(request, [None] * len(request.calls), WORLD)
+    return master_api.export_request(
+        request, [master_calls.Passing.NO_REGISTRATION] * len(request.calls), WORLD
+    )
 
 
 @given(st.sampled_from(METHODS), st.lists(VALUES, max_size=4))

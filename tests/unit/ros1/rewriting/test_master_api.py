@@ -326,7 +326,7 @@ def test_a_registration_with_a_uri_that_the_proxy_handed_out_ends_none() -> None
     request = master_calls.read_request(
         py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_RELAYED), NODE
     )
-    exported = master_api.export_request(request, [None], addressing)
+    exported = master_api.export_request(request, [master_calls.Passing.FOREIGN_URI], addressing)
     assert exported.body == py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_OUT)
     assert master_calls.read_reply(exported, py_reply([1, "", []])).registry_changes(7.0) == []
 
