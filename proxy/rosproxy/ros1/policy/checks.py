@@ -15,7 +15,7 @@ from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master_client import MasterClient, MasterError, Unreachable
 from rosproxy.ros1.policy.denial import Denial, denied, no_provider, no_publisher, with_fix
-from rosproxy.ros1.policy.hidden import HiddenRegistrations
+from rosproxy.ros1.policy.hidden import HiddenAnswers
 from rosproxy.ros1.policy.parameters import ParamUse, param_use, param_use_of, sets_namespace
 from rosproxy.ros1.policy.service_finder import ServiceFinder
 from rosproxy.ros1.protocol.master_methods import (
@@ -52,6 +52,10 @@ RULE_KINDS = {
     Kind.PARAM: RuleKind.GET_PARAM,
 }
 """The rules for a registration, by its kind."""
+_OFFERED = {"topic": Kind.PUBLISHER, "service": Kind.SERVICE}
+"""What a node inside has registered if outside asks for a topic or service of the node."""
+_USED = {"topic": RuleKind.SUBSCRIBE, "service": RuleKind.CALL}
+"""The rules for a topic or service of outside."""
 
 
 class Ros1Policy:
@@ -75,7 +79,7 @@ class Ros1Policy:
         self._addressing = addressing
         self._upstream = upstream
         self._services = services
-        self._hidden = HiddenRegistrations(registry, addressing)
+        self._hidden = HiddenAnswers(registry, addressing)
 
     @property
     def idle(self) -> bool:
@@ -213,18 +217,18 @@ class Ros1Policy:
     # What outside asks of a node inside
 
     def check_outside(
-        self, kind: RuleKind, name: str, endpoint: Endpoint, source: str, caller_id: str = ""
+        self, kind: str, name: str, endpoint: Endpoint, source: str, caller_id: str = ""
     ) -> Denial | None:
-        """Check whether outside may have a topic or service of a node."""
+        """Check whether outside may have something of a node: a "topic" or a "service"."""
         if self.rules.empty:
             return None
-        wanted_kind = Kind.SERVICE if kind is RuleKind.SERVE else Kind.PUBLISHER
-        callers = endpoint.callers_of(wanted_kind, name)
+        callers = endpoint.callers_of(_OFFERED[kind], name)
+        rule_kind = RULE_KINDS[_OFFERED[kind]]
         for resolved in topic_names(name, caller_id):
-            verdict = self.rules.judge(kind, resolved, callers, endpoint.address)
+            verdict = self.rules.judge(rule_kind, resolved, callers, endpoint.address)
             if verdict.rule is not None and not self._is_inside(source):
                 subject = f"{resolved} of {endpoint.label}"
-                if denial := self._denial(verdict, kind, subject, source):
+                if denial := self._denial(verdict, rule_kind, subject, source):
                     return denial
         return None
 
@@ -236,7 +240,7 @@ class Ros1Policy:
         """
         topic = call.string(1) or ""
         caller_id = call.string(0) or ""
-        denial = self.check_outside(RuleKind.PUBLISH, topic, endpoint, source, caller_id)
+        denial = self.check_outside("topic", topic, endpoint, source, caller_id)
         if denial:
             return no_publisher(topic, with_fix(denial.reason))
         if _offers_tcpros_alone(call) or self.may_bypass(endpoint) or self._is_inside(source):
@@ -266,8 +270,8 @@ class Ros1Policy:
 
     # What a node inside asks of outside
 
-    def check_inside(self, kind: RuleKind, name: str, source: str, caller_id: str) -> Denial | None:
-        """Check whether a node inside may have a topic or service of outside.
+    def check_inside(self, kind: str, name: str, source: str, caller_id: str) -> Denial | None:
+        """Check whether a node inside may have a "topic" or "service" of outside.
 
         A client gives any name. Unless a node of that name is known at the address of the client,
         what one of the nodes there may not have is denied.
@@ -277,7 +281,7 @@ class Ros1Policy:
         names_at_source = [n for e in self._registry if e.address == source for n in e.caller_ids]
         callers = [caller_id] if caller_id in names_at_source else [caller_id, *names_at_source]
         for resolved in topic_names(name, caller_id):
-            verdict = self.rules.ask(kind, resolved, callers, source)
+            verdict = self.rules.ask(_USED[kind], resolved, callers, source)
             if not verdict.allowed:
                 return denied(verdict.reason)
         return None
@@ -287,7 +291,7 @@ class Ros1Policy:
         if call.method != "requestTopic":
             return None
         topic = call.string(1) or ""
-        denial = self.check_inside(RuleKind.SUBSCRIBE, topic, source, call.string(0) or "")
+        denial = self.check_inside("topic", topic, source, call.string(0) or "")
         return no_publisher(topic, with_fix(denial.reason)) if denial else None
 
     def inside_may_bypass(self) -> bool:
@@ -301,8 +305,7 @@ class Ros1Policy:
         """
         if parse_service_uri(relay.name):
             return not self.rules.may_deny({RuleKind.CALL}, [relay.caller_id], relay.peer)
-        kind = RuleKind.SUBSCRIBE
-        return self.check_inside(kind, relay.name, relay.peer, relay.caller_id) is None
+        return self.check_inside("topic", relay.name, relay.peer, relay.caller_id) is None
 
     async def _answer(
         self, call: Call, caller: Caller, params: "_ParamNames"

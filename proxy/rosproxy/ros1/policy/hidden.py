@@ -30,8 +30,8 @@ _TABLES = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
 @dataclass(slots=True, eq=False)
-class HiddenRegistrations:
-    """Answers for what is hidden, as the master would answer if it knew."""
+class HiddenAnswers:
+    """Answers nodes inside as the master would, if it knew of the hidden registrations."""
 
     _registry: Registry
     _addressing: Addressing

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
@@ -255,10 +254,9 @@ class InsideNode:
 
     def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
         """Check whether outside may have a topic or service."""
-        rule_kind = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
         # Without the caller_id: publishers take the topic of a header as it stands (rospy's
         # tcpros_pubsub.py, topic_connection_handler; roscpp's transport_subscriber_link.cpp).
-        return self._context.policy.check_outside(rule_kind, name, self._endpoint, peer)
+        return self._context.policy.check_outside(kind, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; a port that is not known or refuses is asked for.

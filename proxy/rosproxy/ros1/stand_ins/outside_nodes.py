@@ -10,7 +10,6 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback
 from rosproxy.net.interfaces import is_own
@@ -139,8 +138,7 @@ class OutsideNode:
 
     def check(self, kind: str, name: str, peer: str, caller_id: str) -> Denial | None:
         """Check whether a node inside may have a topic or service."""
-        rule_kind = RuleKind.CALL if kind == "service" else RuleKind.SUBSCRIBE
-        return self._context.policy.check_inside(rule_kind, name, peer, caller_id)
+        return self._context.policy.check_inside(kind, name, peer, caller_id)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node, which is asked for its port again if the known one refuses."""

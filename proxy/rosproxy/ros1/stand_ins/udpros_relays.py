@@ -27,7 +27,6 @@ from hashlib import blake2b
 
 import msgspec
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.datagrams import DatagramRelay, bind
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import NODES, resolve
@@ -113,8 +112,7 @@ class UdprosRelays:
             return is_current and topic in endpoint.names(Kind.PUBLISHER)
 
         def is_allowed() -> bool:
-            kind = RuleKind.PUBLISH
-            return not self._policy.check_outside(kind, topic, endpoint, source, caller_id)
+            return not self._policy.check_outside("topic", topic, endpoint, source, caller_id)
 
         condition = _RelayCondition(is_registered, is_allowed)
 
@@ -146,7 +144,7 @@ class UdprosRelays:
             return (Kind.SUBSCRIBER, topic, caller_id) in endpoint.registrations
 
         def is_allowed() -> bool:
-            return not self._policy.check_inside(RuleKind.SUBSCRIBE, topic, source, caller_id)
+            return not self._policy.check_inside("topic", topic, source, caller_id)
 
         condition = _RelayCondition(is_registered, is_allowed)
 

@@ -11,7 +11,6 @@ import asyncio
 import logging
 from dataclasses import dataclass, field
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.admin.requests import EnforcementCounts
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
@@ -92,9 +91,8 @@ class PolicyEnforcer:
     def _is_denied(self, relay: Relay, endpoint: Endpoint) -> bool:
         if relay.name == UNREGISTERED:
             return not self._context.policy.may_bypass(endpoint)
-        kind = RuleKind.SERVE if relay.kind == "service" else RuleKind.PUBLISH
-        denial = self._context.policy.check_outside(kind, relay.name, endpoint, relay.peer)
-        return denial is not None
+        policy = self._context.policy
+        return policy.check_outside(relay.kind, relay.name, endpoint, relay.peer) is not None
 
     def _take_fast_ports(self) -> int:
         """Take fast ports from nodes of which something may be denied; how many connections."""

@@ -11,7 +11,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.policy.checks import topic_names
 from rosproxy.ros1.policy.denial import no_provider
-from rosproxy.ros1.policy.hidden import HiddenRegistrations
+from rosproxy.ros1.policy.hidden import HiddenAnswers
 from rosproxy.ros1.policy.parameters import ParamUse, param_use
 from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call, parse_call
@@ -37,8 +37,8 @@ def make(*registrations: tuple[str, Kind, str, bool]) -> Addressing:
     return Addressing(registry, "host", ports, make_stand_ins(ports))
 
 
-def hidden_in(addressing: Addressing) -> HiddenRegistrations:
-    return HiddenRegistrations(addressing.registry, addressing)
+def hidden_in(addressing: Addressing) -> HiddenAnswers:
+    return HiddenAnswers(addressing.registry, addressing)
 
 
 def look_up_node(name: str) -> Call:
