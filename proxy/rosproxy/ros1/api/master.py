@@ -172,7 +172,7 @@ class MasterApi:
             yield outcomes
         finally:
             for endpoint in pending:
-                endpoint.release()
+                endpoint.pending -= 1
 
     async def _outcome(self, call: Call, request: Request, pending: list[Endpoint]) -> CallOutcome:
         """What becomes of a call; the endpoint that it registers is pending from now on."""
@@ -186,7 +186,7 @@ class MasterApi:
             return admission
         if isinstance(admission, Endpoint):
             # Held before anything is awaited: nothing else keeps the lease from ending meanwhile.
-            admission.hold()
+            admission.pending += 1
             pending.append(admission)
             await self._adopter.take_over(admission, caller_id_of(call))
         denial = policy.check_registration(call, admission, caller, self._context.now())

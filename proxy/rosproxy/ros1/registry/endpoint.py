@@ -79,8 +79,7 @@ class Endpoint:
 
     ``callers`` are the nodes' names with the number of their registrations, and ``characters`` is
     how long these are together; `Registry` keeps both.
-    It is plain state: whoever learns something of the node calls a method (``note_…``), and
-    `Registry` keeps the indexes by which it is found.
+    It is plain state, and `Registry` keeps the indexes by which it is found.
 
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
     listens on. ``topic_ports`` are the TCPROS ports that the node itself named, by topic: one for
@@ -111,8 +110,11 @@ class Endpoint:
     former_callers: dict[str, None] = field(default_factory=dict)
     """Names that were registered here and are no longer, oldest first; `Registry` keeps them."""
     connections: int = 0
+    """Open connections from outside that the proxy relays."""
     pending: int = 0
+    """Calls on their way that register something here: the lease does not end meanwhile."""
     idle_since: float | None = None
+    """When the lease was last found unused; None if it is in use, as far as is known."""
     trusted: bool = True
     source: str = ""
     health: Health = field(default_factory=Health)
@@ -135,18 +137,6 @@ class Endpoint:
         self.health.pid = pid
         self.health.cleaned = False
 
-    def hold(self) -> None:
-        """Keep the lease while a call is on its way; see `release`."""
-        self.pending += 1
-
-    def release(self) -> None:
-        """Note that a call has ended for which the lease was held."""
-        self.pending -= 1
-
-    def note_used(self) -> None:
-        """Note that somebody needs the lease."""
-        self.idle_since = None
-
     def note_unused(self, now: float) -> float:
         """Note that nobody needs the lease now; for how many seconds that has been so."""
         if self.idle_since is None:
@@ -161,18 +151,6 @@ class Endpoint:
         if self.health.pid is None:
             self.health.pid = pid
 
-    def note_named(self, named: bool) -> None:
-        """Note whether the host that the node gives leads to it."""
-        self.location = replace(self.location, named=named)
-
-    def note_uri(self, uri: str) -> None:
-        """Note how the node writes its own URI, of which a recovery knows the host and port."""
-        self.uri = uri
-
-    def note_former_uri(self, uri: str) -> None:
-        """Note a URI by which the master may have known the node."""
-        self.former_uris.add(uri)
-
     def note_former_caller(self, caller_id: str) -> None:
         """Note that a name is no longer registered here."""
         self.former_callers.pop(caller_id, None)
@@ -185,14 +163,6 @@ class Endpoint:
         self.former_uris.add(former_uri)
         self.former_uris.discard(uri)
         self.unsettled = True
-
-    def note_settled(self) -> None:
-        """Note that everything is registered by the URI that is advertised now."""
-        self.unsettled = False
-
-    def expect_updates(self, until: float) -> None:
-        """Take lists of publishers without this one for outdated, until a time."""
-        self.settles_at = until
 
     def confirm(self) -> None:
         """Note that the node registered from its own address: what it says is believed."""
@@ -218,19 +188,6 @@ class Endpoint:
         while len(self.service_ports) > MOST_SERVICE_PORTS:
             del self.service_ports[next(iter(self.service_ports))]
         return True
-
-    def replace_topic_ports(self, ports: Mapping[str, int]) -> None:
-        """Note the TCPROS ports that another process names, in place of all before."""
-        self.topic_ports = dict(ports)
-
-    def note_connection(self) -> None:
-        """Note that somebody outside has connected through the proxy."""
-        self.connections += 1
-        self.note_used()
-
-    def note_disconnection(self) -> None:
-        """Note that such a connection has ended."""
-        self.connections -= 1
 
     @property
     def address(self) -> str:

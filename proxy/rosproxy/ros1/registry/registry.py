@@ -221,7 +221,7 @@ class Registry:
         endpoint.registrations[registration.key] = registration
         self._index_hidden(endpoint, registration)
         self.by_caller[registration.caller_id] = endpoint
-        endpoint.note_used()
+        endpoint.idle_since = None
 
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
         """Note that a registration has ended, whoever ended it."""

@@ -125,7 +125,7 @@ class NodeAdmission:
                     f"{caller_id[:200]} runs"
                 )
         if location.address == caller.address:
-            endpoint.note_uri(uri)
+            endpoint.uri = uri  # a recovery knows no more of it than the host and port
         self._welcome_back(endpoint, caller)
         return endpoint
 

@@ -285,11 +285,12 @@ class InsideNode:
 
     def note_connection(self) -> None:
         """Note that a connection is relayed."""
-        self._endpoint.note_connection()
+        self._endpoint.connections += 1
+        self._endpoint.idle_since = None
 
     def note_disconnection(self) -> None:
         """Note that one is relayed no more."""
-        self._endpoint.note_disconnection()
+        self._endpoint.connections -= 1
 
     def note_failure(self, name: str) -> None:
         """Tell of a node that is registered, and whose TCPROS server can't be reached."""

@@ -166,7 +166,7 @@ class Adopter:
                 await self._registrar.register_missing(endpoint, info)
         finally:
             for endpoint in endpoints:
-                endpoint.release()
+                endpoint.pending -= 1
         adopted = {name: e for name, (e, _) in former.items() if name in e.caller_ids}
         for name, endpoint in adopted.items():
             uri = self._context.addressing.advertised_uri(endpoint)
@@ -189,7 +189,7 @@ class Adopter:
         endpoint = await self._admission.take_in(uri, own_slave, location, caller, answers=True)
         if not isinstance(endpoint, Endpoint):
             return None
-        endpoint.hold()
+        endpoint.pending += 1
         await self._leases.cleared(endpoint)
         now = self._context.now()
         known_pid = endpoint.health.pid
@@ -199,7 +199,7 @@ class Adopter:
             endpoint.health.suspect()
         self._leases.open(endpoint)
         for node in nodes:
-            endpoint.note_former_uri(node.uri)
+            endpoint.former_uris.add(node.uri)
             for registration in node.registrations:
                 type_ = info.by_kind.get(registration.kind, {}).get(
                     registration.name, registration.type

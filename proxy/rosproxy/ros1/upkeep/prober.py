@@ -153,7 +153,7 @@ class Prober:
         """End the lease of an endpoint that nobody has needed for long enough."""
         now = self._context.now()
         if not endpoint.unused:
-            endpoint.note_used()
+            endpoint.idle_since = None
             return
         lease_time = liveness.lease_lasts(endpoint, self._context.settings.linger)
         if endpoint.note_unused(now) >= lease_time:

@@ -25,6 +25,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
@@ -202,7 +203,7 @@ class Recovery:
         for port in claim.service_ports:
             endpoint.note_service_port(port)
         if claim.advertised != self._context.addressing.advertised_uri(endpoint):
-            endpoint.note_former_uri(claim.advertised)  # the URI of a former version
+            endpoint.former_uris.add(claim.advertised)  # the URI of a former version
         return endpoint
 
     async def _resume(self, endpoints: Sequence[Endpoint]) -> None:
@@ -282,7 +283,7 @@ class Recovery:
         addresses = await resolve(host, address)
         # Neighbours can use the host's name if it leads here.
         if endpoint.location.address == address:
-            endpoint.note_named(address in addresses)
+            endpoint.location = replace(endpoint.location, named=address in addresses)
         refuted = await self._verifier.refuted(endpoint.slave, registrations, info, ports)
         await self._registrar.disown(endpoint, refuted)
         # The master has it by a former version's URI: it is registered by that of this one.

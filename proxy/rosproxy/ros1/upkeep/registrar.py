@@ -89,7 +89,7 @@ class Registrar:
         await asyncio.gather(*(update(e, topic, []) for e, topic in topics))
         await self.register([(e, r) for e in endpoints for r in e.registrations.values()])
         for endpoint in endpoints:
-            endpoint.note_settled()
+            endpoint.unsettled = False
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
         """Register what a node has and the master does not know of. Raises Unreachable."""
@@ -200,7 +200,7 @@ class Registrar:
         started = self._context.now()
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
-            endpoint.replace_topic_ports(info.topic_ports)
+            endpoint.topic_ports = dict(info.topic_ports)
             await self._forget(endpoint, decisions.left_over_registrations(endpoint, info, started))
 
     async def reconcile(self, endpoint: Endpoint) -> None:
@@ -331,10 +331,10 @@ class Registrar:
         calls: list[decisions.MethodCall] = []
         direct: dict[str, tuple[Endpoint, str]] = {}
         for name, (endpoint, uri) in former.items():
-            endpoint.note_former_uri(uri)
+            endpoint.former_uris.add(uri)
             if addressing.lease_of(uri) is None:
                 direct[name] = endpoint, uri
-                endpoint.expect_updates(self._context.now() + SETTLE_TIME)
+                endpoint.settles_at = self._context.now() + SETTLE_TIME
             else:
                 service = addressing.advertised_service(endpoint)
                 shown = [r for r in _registrations_of(endpoint, name) if not r.hidden]

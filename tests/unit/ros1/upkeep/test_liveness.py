@@ -123,7 +123,7 @@ def test_nobody_who_is_due_or_unused_is_passed_over(
     if registered:
         add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter")
     if direct:
-        endpoint.note_former_uri(endpoint.uri)
+        endpoint.former_uris.add(endpoint.uri)
     endpoint.health = health
     endpoint.connections = connections
     endpoint.idle_since = idle_since
@@ -182,5 +182,5 @@ def test_what_is_due_first_once_a_node_has_answered(
     endpoint.health.cleaned = cleaned
     endpoint.health.pid = known_pid
     if direct:
-        endpoint.note_former_uri(endpoint.uri)
+        endpoint.former_uris.add(endpoint.uri)
     assert liveness.after_answer(endpoint, 7) is due
