@@ -5,13 +5,16 @@ import errno
 import logging
 from collections.abc import Collection, Iterator, Sequence
 
-from rosproxy.leases.leases import PORTS, RANGE_OPTION
 from rosproxy.net import proxy_signs
 from rosproxy.setting_kinds import SettingError
 from rosproxy.settings import Settings
 from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
+
+RANGE_OPTION = "--port-range"
+PORTS = "ports"
+"""The subject of problems with the range."""
 
 
 @contextlib.contextmanager

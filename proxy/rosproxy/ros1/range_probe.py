@@ -15,14 +15,13 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from rosproxy.admin.requests import PortProbe
-from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry.endpoint import Endpoint
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +64,7 @@ class _PortTrial:
 
 
 async def probe_range(
-    context: Context, leases: Leases[Endpoint], or_fast: bool = True
+    context: Context, leases: Leases, or_fast: bool = True
 ) -> tuple[PortProbe, ...]:
     """Try the lowest and the highest free port of the range; where none is free, one fast port.
 

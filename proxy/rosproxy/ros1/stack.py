@@ -21,22 +21,21 @@ from rosproxy.admin.requests import (
     read_body,
 )
 from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.binding import report_taken_ports, setting_error_if_taken
+from rosproxy.binding import RANGE_OPTION, report_taken_ports, setting_error_if_taken
 from rosproxy.forwarding.kernel.connection_table import ConnectionTable
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.kernel.table import TrackedTable
 from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases.fast_ports import BothSides
-from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.ros1.range_probe import probe_range
-from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros_server import RATE_INTERVAL, TcprosServer
@@ -88,7 +87,7 @@ class Ros1:
         self._resubscriber = Resubscriber(
             context, registrar, publisher_updates, self.tcpros, plane, self.stand_ins
         )
-        self.leases = leases = self._make_leases()
+        self.leases = leases = Leases(context, plane.syncer, self._resubscriber.watch)
         self._recovery = Recovery(
             context, leases, registrar, self._resubscriber, plane, self._memory
         )
@@ -109,18 +108,6 @@ class Ros1:
         self._servers = [slave.server, self.stand_ins.server]
         self._acceptors: list[Acceptor] = []
         self._containers = self._make_containers()
-
-    def _make_leases(self) -> Leases[Endpoint]:
-        context = self.context
-        return Leases(
-            context.registry,
-            self.settings.bind,
-            self.plane.syncer,
-            self._resubscriber.watch,
-            context.tasks,
-            context.problems,
-            context.gate,
-        )
 
     def _make_containers(self) -> ContainerEvents:
         return ContainerEvents(

@@ -8,8 +8,8 @@ import pytest
 
 from examples.demo.fake_http import End, free_ports, ok, value
 from examples.demo.fake_node import FakeNode
-from rosproxy.leases import leases
 from rosproxy.net import sockets
+from rosproxy.ros1 import leases
 from rosproxy.ros1.clients.master_client import CALLER_ID
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import (

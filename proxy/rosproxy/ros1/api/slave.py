@@ -12,11 +12,11 @@ from collections.abc import Awaitable
 from functools import partial
 from typing import TypeVar
 
-from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.clients.master_client import Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.protocol.name_lengths import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
@@ -45,7 +45,7 @@ class SlaveApi:
     def __init__(
         self,
         context: Context,
-        leases: Leases[Endpoint],
+        leases: Leases,
         stand_ins: StandInPorts,
         adopter: Adopter,
         tcpros: TcprosServer,

@@ -22,10 +22,11 @@ import errno
 import logging
 from typing import Protocol
 
-from rosproxy.leases.leases import PORTS, Leases
+from rosproxy.binding import PORTS
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.protocol.master_methods import method_spec
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, with_caller_address
 from rosproxy.ros1.protocol.xmlrpc.document import Call
@@ -73,7 +74,7 @@ class NodeAdmission:
     def __init__(
         self,
         context: Context,
-        leases: Leases[Endpoint],
+        leases: Leases,
         cleanup: Cleanup,
         verification: Verification,
     ) -> None:

@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from rosproxy.fixes import how_to_in_a_sentence
-from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.graph import NodeInfo
@@ -40,7 +40,7 @@ class Adopter:
     """Finds nodes that registered around the proxy, and makes the master know them through it."""
 
     _context: Context
-    _leases: Leases[Endpoint]
+    _leases: Leases
     _admission: NodeAdmission
     _registrar: Registrar
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)

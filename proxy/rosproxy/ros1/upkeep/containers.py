@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.registry.node_health import ProbeResult
@@ -46,7 +46,7 @@ class ContainerEvents:
     """Acts on what an operator knows of containers before any time-out can tell."""
 
     context: Context
-    leases: Leases[Endpoint]
+    leases: Leases
     registrar: Registrar
     adopter: Adopter
     recovery: Recovery

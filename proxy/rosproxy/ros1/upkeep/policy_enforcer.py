@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from rosproxy.admin.requests import EnforcementCounts
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
-from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.tcpros_server import UNREGISTERED, TcprosServer
 from rosproxy.ros1.stand_ins.stand_in_ports import StandInPorts
@@ -34,7 +34,7 @@ class PolicyEnforcer:
     """Makes registrations and connections fit the policy."""
 
     _context: Context
-    _leases: Leases[Endpoint]
+    _leases: Leases
     _registrar: Registrar
     _recovery: Recovery
     _tcpros: TcprosServer

@@ -15,11 +15,11 @@ import asyncio
 import logging
 from dataclasses import dataclass, field
 
-from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.kept_connections import KeptConnections
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.clients.node_client import ProbeAnswer
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.node_health import ProbeResult
 from rosproxy.ros1.upkeep.decisions import liveness
@@ -43,7 +43,7 @@ class Prober:
     """Looks after all endpoints."""
 
     _context: Context
-    _leases: Leases[Endpoint]
+    _leases: Leases
     _registrar: Registrar
     _resubscriber: Resubscriber
     _recovery: Recovery

@@ -28,11 +28,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master_client import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.leases import Leases
 from rosproxy.ros1.registry.client_kinds import ClientKind
 from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.node_health import ProbeResult
@@ -64,7 +64,7 @@ class Recovery:
     def __init__(
         self,
         context: Context,
-        leases: Leases[Endpoint],
+        leases: Leases,
         registrar: Registrar,
         resubscriber: Resubscriber,
         plane: KernelPlane,
