@@ -121,7 +121,7 @@ class Ros1Policy:
         use = param_use(method, caller_id or "", name)
         if use is None:
             return None
-        verdict = self._judge_use(use, caller_id or "", source)
+        verdict = self._verdict_on_use(use, caller_id or "", source)
         return self._denial(verdict, use.kind, f"of {caller_id}", source)
 
     def check_registration(
@@ -167,11 +167,11 @@ class Ros1Policy:
             self.must_enforce = True
         return replace(registration, hidden=not is_shown)
 
-    def filter_result(self, result: CallResult, caller: Caller) -> list[Edit]:
+    def filter_result(self, result: CallResult, caller: Caller) -> Sequence[Edit]:
         """The edits by which a result leaves out what is denied and has what is hidden; or none."""
         value = result.value
         if self.idle or value is None or not result.accepted:
-            return []
+            return ()
         call = result.call
         if call.method == "getParamNames":
             return self._without_denied_params(value, caller)
@@ -182,8 +182,8 @@ class Ros1Policy:
             extra = self.publishers_for(result.endpoint, second_parameter_name(call), [])
             uris = [*(item.text for item in value.items), *extra]
             imported = dict.fromkeys(self._addressing.import_slave(uri, caller) for uri in uris)
-            return [value.replaced_by(xmlrpc.dump_value([*imported]))] if extra else []
-        return []
+            return [value.replaced_by(xmlrpc.dump_value([*imported]))] if extra else ()
+        return ()
 
     def publishers_for(self, endpoint: Endpoint, topic: str, at_master: Sequence[str]) -> list[str]:
         """The publishers of a topic for a node inside, by the URIs that the master has.
@@ -338,29 +338,29 @@ class Ros1Policy:
         if use is None:
             return None
         caller_id = call.string(0) or ""
-        verdict = self._judge_use(use, caller_id, caller.address)
+        verdict = self._verdict_on_use(use, caller_id, caller.address)
         # A subscriber of a namespace is also sent what is set below it later (rosmaster's
         # paramserver.py, compute_param_updates), so the names that exist now don't settle it. Nor
         # do they for a call that sets a whole namespace.
         may_settle = use.below and call.method != "subscribeParam" and not sets_namespace(call)
-        exact = self._judge_names(use.kind, use.names, caller_id, caller.address)
+        exact = self._verdict_on_names(use.kind, use.names, caller_id, caller.address)
         if may_settle and exact.allowed and not verdict.allowed:
             starts = tuple(map(prefix, use.names))
             below = [name for name in await params.read() if name.startswith(starts)]
             names = (*use.names, *below)
-            verdict = self._judge_names(use.kind, names, caller_id, caller.address)
+            verdict = self._verdict_on_names(use.kind, names, caller_id, caller.address)
         return self._denial(verdict, use.kind, f"{use.names[0]} of {caller_id}", caller.address)
 
-    def _judge_use(self, use: ParamUse, caller_id: str, source: str) -> Verdict:
+    def _verdict_on_use(self, use: ParamUse, caller_id: str, source: str) -> Verdict:
         """The strictest verdict on all names that a call may mean, and on names below them."""
-        verdict = self._judge_names(use.kind, use.names, caller_id, source)
+        verdict = self._verdict_on_names(use.kind, use.names, caller_id, source)
         if not use.below:
             return verdict
         judge = self.rules.judge_below
         below = [judge(use.kind, prefix(name), caller_id, source) for name in use.names]
         return strictest([verdict, *below])
 
-    def _judge_names(
+    def _verdict_on_names(
         self, kind: RuleKind, names: Sequence[str], caller_id: str, source: str
     ) -> Verdict:
         judge = self.rules.judge
@@ -378,7 +378,9 @@ class Ros1Policy:
         return [
             item.removed()
             for item in names.items
-            if not self._judge_names(kind, [item.text], caller.caller_id, caller.address).allowed
+            if not self._verdict_on_names(
+                kind, [item.text], caller.caller_id, caller.address
+            ).allowed
         ]
 
     def _denial(self, verdict: Verdict, kind: RuleKind, subject: str, source: str) -> Denial | None:

@@ -33,7 +33,7 @@ from rosproxy.ros1.rewriting.master_calls import (
 )
 from rosproxy.ros1.rewriting.slave_api import replace_value
 
-ResultFilter = Callable[[CallResult, Caller], list[Edit]]
+ResultFilter = Callable[[CallResult, Caller], Sequence[Edit]]
 """The edits of a result in which a caller may not read all, or is to read more; else none."""
 
 

@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 
 FormerUris = Mapping[str, tuple[Endpoint, str]]
 """Names with their endpoints, and the former URIs by which the master has them."""
-JUDGED_AT_ONCE = 100
-"""Registrations that the policy judges before other tasks have their turn: rules may be many."""
+CHECKED_AT_ONCE = 100
+"""Registrations that the proxy checks before other tasks have their turn: rules may be many."""
 SETTLE_TIME = 2.0
 """Seconds in which the master's updates about a publisher that is registered anew come in."""
 
@@ -224,7 +224,7 @@ class Registrar:
         for count, (endpoint, registration) in enumerate(self._context.registry.registrations(), 1):
             if self._context.policy.verdict(endpoint, registration).allowed == registration.hidden:
                 (to_show if registration.hidden else to_hide).append((endpoint, registration))
-            if not count % JUDGED_AT_ONCE:
+            if not count % CHECKED_AT_ONCE:
                 await asyncio.sleep(0)
         await self._conceal(to_hide)
         alive = [(e, r) for e, r in to_show if e.answers and not e.health.cleaned]
