@@ -359,6 +359,7 @@ async def test_a_change_hides_cuts_and_shows(make_proxy, master, make_node):
         await read_header(kept)
         before = len(listener.updates())
         assert await told(proxy, "deny publish /chatter") == (1, 0, 1)
+        assert await denied(proxy, "publish") == 2  # the registration and the connection
         assert await wire.outcome() in ("closed", "reset")
         assert master.holds("publishers", "/chatter") == []
         assert master.holds("publishers", "/odom") == [proxy.uri(talker)]
@@ -552,6 +553,15 @@ async def test_audit_only_tells(make_proxy, master, make_node, caplog):
     assert await denied(proxy, "get-param", "audit") == 1
     assert await denied(proxy, "publish") == 0
     assert "publish /chatter of /talker would be denied by policy of --policy: deny" in caplog.text
+
+
+async def test_an_audit_rule_tells_of_what_was_registered_before(make_proxy, make_node):
+    proxy = await make_proxy()
+    talker = await make_node("/talker")
+    await talker.publish(proxy.master)
+    assert await told(proxy, "deny publish *", mode="audit") == (0, 0, 0)
+    assert await denied(proxy, "publish", "audit") == 1
+    assert await denied(proxy, "publish") == 0
 
 
 async def test_the_status_tells_layers_and_hidden_names(make_proxy, make_node):

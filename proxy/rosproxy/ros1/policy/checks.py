@@ -206,6 +206,12 @@ class Ros1Policy:
             return self.rules.judge_below(kind, prefix(name), caller_id, endpoint.address)
         return verdict
 
+    def report_registration(self, endpoint: Endpoint, registration: Registration) -> Verdict:
+        """The same, and a denial is reported."""
+        verdict = self.verdict(endpoint, registration)
+        subject = f"{registration.name} of {registration.caller_id}"
+        return self.rules.report(verdict, RULE_KINDS[registration.kind], subject, endpoint.address)
+
     def hidden_registrations(self) -> list[EndpointRegistration]:
         """All hidden registrations with their endpoints."""
         return self._registry.hidden_registrations()

@@ -62,7 +62,8 @@ class PolicyEnforcer:
             cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
             try:
                 await self._recovery.ensure()
-                hidden, shown = await self._registrar.apply_policy()
+                has_changed = version != self._enforced_version
+                hidden, shown = await self._registrar.apply_policy(has_changed)
             except (Unreachable, MasterError):
                 policy.must_enforce = True
                 raise

@@ -214,16 +214,21 @@ class Registrar:
             await self._forget(endpoint, decisions.vanished_topics(endpoint, info, started))
             await self.register_missing(endpoint, info)
 
-    async def apply_policy(self) -> tuple[int, int]:
+    async def apply_policy(self, has_changed: bool = False) -> tuple[int, int]:
         """Hide what is denied now, show what no longer is; returns how many registrations of each.
 
-        Raises Unreachable, MasterError.
+        After a change of the policy, also report what would be denied (audit). Raises Unreachable,
+        MasterError.
         """
+        policy = self._context.policy
         to_hide = list[EndpointRegistration]()
         to_show = list[EndpointRegistration]()
         for count, (endpoint, registration) in enumerate(self._context.registry.registrations(), 1):
-            if self._context.policy.verdict(endpoint, registration).allowed == registration.hidden:
+            verdict = policy.verdict(endpoint, registration)
+            if verdict.allowed == registration.hidden:
                 (to_show if registration.hidden else to_hide).append((endpoint, registration))
+            elif verdict.allowed and has_changed:
+                policy.report_registration(endpoint, registration)
             if not count % CHECKED_AT_ONCE:
                 await asyncio.sleep(0)
         await self._conceal(to_hide)
@@ -253,6 +258,8 @@ class Registrar:
                 if endpoint.registrations.get(registration.key) is registration:
                     registry.register(endpoint, replace(registration, hidden=False))
             raise
+        for endpoint, registration in [*shown, *params]:
+            self._context.policy.report_registration(endpoint, registration)
         for _, registration in params:
             registry.unregister(registration.kind, registration.name, registration.caller_id)
         subscribers = [(e, r) for e, r in registrations if r.kind is Kind.SUBSCRIBER]
