@@ -37,6 +37,8 @@ FEEDBACK_PAUSE = 0.2
 # A server drops a response whose client's reader it does not know after a tenth of a second
 # (rmw_fastrtps, `check_for_subscription`), though the client knows the server already. So on a busy
 # machine a first goal's result may be lost without a proxy as well; clients ask again.
+ORDER = 8
+"""Of the action's goals: the sequence has one number more, and feedback begins with three."""
 GOAL_PATIENCE = 15.0
 
 
@@ -151,17 +153,27 @@ def act(node: Node, options: argparse.Namespace) -> None:
 
 
 def pursue(node: Node, options: argparse.Namespace) -> None:
+    """Pursue goals until all feedback of one has come.
+
+    The server does not wait for the client's reader of feedback, which it may meet after the first
+    goal (rcl_action, rcl_action_server_is_available).
+    """
     client = node.kept = ActionClient(node, Fibonacci, options.topic)
     asked = -GOAL_PATIENCE
+    lengths = set[int]()
 
     def feedback(message: object) -> None:
+        lengths.add(len(message.feedback.sequence))
         say("feedback", len(message.feedback.sequence))
 
     def accepted(future: object) -> None:
         future.result().get_result_async().add_done_callback(done)
 
     def done(future: object) -> None:
-        timer.cancel()
+        nonlocal asked
+        asked = -GOAL_PATIENCE
+        if lengths.issuperset(range(3, ORDER + 2)):
+            timer.cancel()
         say("result", *future.result().result.sequence)
 
     def ask() -> None:
@@ -169,7 +181,8 @@ def pursue(node: Node, options: argparse.Namespace) -> None:
         now = time.monotonic()
         if client.server_is_ready() and now - asked >= GOAL_PATIENCE:
             asked = now
-            goal = Fibonacci.Goal(order=8)
+            lengths.clear()
+            goal = Fibonacci.Goal(order=ORDER)
             client.send_goal_async(goal, feedback_callback=feedback).add_done_callback(accepted)
 
     timer = node.create_timer(options.period, ask)
