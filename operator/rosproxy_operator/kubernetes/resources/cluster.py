@@ -14,6 +14,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     Name,
     Pod,
+    ProxyPlace,
     RosProxy,
 )
 
@@ -35,7 +36,8 @@ class ProxyPod(msgspec.Struct, frozen=True):
     (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
     say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
     condition Ready. ``restarts`` counts those of its container. ``token`` is that of its admin
-    endpoint where it stands in the pod, as former operators wrote it.
+    endpoint where it stands in the pod, as former operators wrote it. ``runs``: its container was
+    started, and was not seen to end.
     """
 
     pod: Pod
@@ -50,6 +52,7 @@ class ProxyPod(msgspec.Struct, frozen=True):
     stuck: PodFailure | None = None
     message: str = ""
     restarts: int = 0
+    runs: bool = False
 
 
 class HelperPod(msgspec.Struct, frozen=True):
@@ -195,8 +198,9 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     tokens are made. ``unusable`` are the RosProxies that can't be read at all: what they have is
     left as it is. ``reports`` are what the proxies say of themselves, by the uid of the pod;
     ``failures`` are, by RosProxy and object, what the API server said of the actions that failed at
-    the last try; ``webhook`` is that of this operator: none of these is listed, the operator puts
-    them here.
+    the last try; ``vanished`` are the places whose proxy's pod is gone though its container was not
+    seen to end, and when, by the operator's monotonic clock; ``webhook`` is that of this operator:
+    the reports, the failures and the webhook are not listed, the operator puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -214,6 +218,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     misspelt_services: Mapping[Name, tuple[str, ...]] = {}
     policies: Mapping[Name, ProxyPolicy] = {}
     policies_error: str = ""
+    vanished: Mapping[ProxyPlace, float] = {}
     key: bytes = b""
     reports: Mapping[str, ProxyReport] = {}
     unusable: Mapping[Name, InvalidRosProxy] = {}

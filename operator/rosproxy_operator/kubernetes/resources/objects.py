@@ -142,6 +142,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
         stuck=reason,
         message=message,
         restarts=sum(int_at(c, "restartCount") for c in submaps(status, "containerStatuses")),
+        runs=any(submap(c, "state").get("running") for c in submaps(status, "containerStatuses")),
     )
 
 

@@ -40,6 +40,8 @@ Record = (
     | MasterService
     | ProxyPolicy
 )
+Change = tuple[str, Record | None]
+"""An object's key and what it is now; None: gone."""
 POLICIES = "networkpolicies"
 
 

@@ -15,7 +15,7 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from rosproxy_operator.kubernetes.api.api_client import (
@@ -29,7 +29,7 @@ from rosproxy_operator.kubernetes.api.api_client import (
 )
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at
 from rosproxy_operator.kubernetes.resources.model import Json
-from rosproxy_operator.kubernetes.resources.records import READERS, Record, key_of
+from rosproxy_operator.kubernetes.resources.records import READERS, Change, Record, key_of
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +50,8 @@ STOPPING = 3.0
 class Listener(Protocol):
     """Gets lists and changes, in the event loop. ``place`` is a namespace, empty for all."""
 
-    def changed(self, kind: str, place: str, changes: Mapping[str, Record | None]) -> None:
-        """These objects have changed, by their keys; None: gone."""
+    def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
+        """These objects have changed, in this order; None: gone."""
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
         """These are all objects of the kind."""
@@ -164,7 +164,7 @@ class Reflector:
         began = time.monotonic()
         heard = False
         self._watch = watch = self._api.watch(self._kind, self._place, self._version)
-        self._tell(self._listener.changed, {})  # it works again, if it did not
+        self._tell(self._listener.changed, ())  # it works again, if it did not
         if self._ending.is_set():
             watch.stop()  # `stop` may have come before there was a watch to end
         for events in watch:
@@ -177,16 +177,18 @@ class Reflector:
         if not heard and time.monotonic() - began < SHORT:
             raise ApiLost("the watch ended at once")
 
-    def _changes(self, events: Iterable[Event]) -> dict[str, Record | None]:
+    def _changes(self, events: Iterable[Event]) -> list[Change]:
         """The objects that have changed, by their keys. Raises ApiError for an ERROR event."""
-        changes: dict[str, Record | None] = {}
+        changes = list[Change]()
         for event in events:
             if event.type == "ERROR":
                 raise _error(event.object)
             if event.type == "BOOKMARK":
                 continue
-            gone = event.type == "DELETED"
-            changes[key_of(event.object)] = None if gone else self._read(event.object)
+            key = key_of(event.object)
+            changes.append((key, self._read(event.object)))
+            if event.type == "DELETED":  # the object is as it was at its end
+                changes.append((key, None))
         return changes
 
     def _read(self, obj: Json) -> Record | None:

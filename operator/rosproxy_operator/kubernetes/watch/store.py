@@ -7,8 +7,9 @@ something: a later look corrects the consequences, and nothing is deleted by it 
 
 import asyncio
 import logging
+import time
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -36,16 +37,19 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     Name,
     Pod,
+    ProxyPlace,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, LAN_RELAY, PLURAL
-from rosproxy_operator.kubernetes.resources.records import POLICIES, Record
+from rosproxy_operator.kubernetes.resources.records import POLICIES, Change, Record
 
 log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Record)
 Collection = tuple[str, str]
 """A kind, and a namespace, empty for all."""
+MOST_VANISHED = 4096
+"""Proxies whose pods have vanished that are remembered; of more, the first goes."""
 
 
 @dataclass(slots=True)
@@ -69,10 +73,12 @@ class ClusterStore:
         wake: Callable[[], None],
         back: Callable[[], None],
         corrected: Callable[[int], None] = lambda _: None,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._wake = wake
         self._back = back
         self._corrected = corrected
+        self._now = now
         self._places = places
         self._tables: dict[Collection, dict[str, Record]] = {collection: {} for collection in kinds}
         self._errors: dict[Collection, ApiError] = {}
@@ -86,17 +92,18 @@ class ClusterStore:
         self._misspelt: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._rosproxies: dict[str, dict[str, RosProxy]] = defaultdict(dict)
+        self._vanished: dict[ProxyPlace, float] = {}
         self._touched = StoreChanges()
 
     # what reflectors call
 
-    def changed(self, kind: str, place: str, changes: Mapping[str, Record | None]) -> None:
-        """Some objects have changed, by their keys; None: gone. And the watch works."""
+    def changed(self, kind: str, place: str, changes: Sequence[Change]) -> None:
+        """Some objects have changed, in this order; None: gone. And the watch works."""
         collection = kind, place
         self._note_heard(collection)
         if self._errors.pop(collection, None):
             self._back()
-        for key, record in changes.items():
+        for key, record in changes:
             self._put(collection, key, record)
 
     def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
@@ -165,6 +172,7 @@ class ClusterStore:
             misspelt_services={id: s.misspelt for id, (s, _) in masters.items() if s},
             policies={policy.id: policy for policy in self._records_of(POLICIES, ProxyPolicy)},
             policies_error=next((str(error) for error in self._errors_of(POLICIES)), ""),
+            vanished=dict(self._vanished),
             key=key,
         )
         return self._with_pods(snapshot)
@@ -260,10 +268,20 @@ class ClusterStore:
             _set(self._rosproxies, record.id.namespace, key, record if add else None)
         elif isinstance(record, ProxyPod):
             _set(self._proxies, record.of.namespace, key, record if add else None)
+            self._note_place(record, add)
         elif isinstance(record, HelperPod):
             _set(self._helpers, record.of.namespace, key, record if add else None)
         elif isinstance(record, Pod):
             self._index_pod(record, key, record if add else None)
+
+    def _note_place(self, proxy: ProxyPod, is_there: bool) -> None:
+        """Note when a proxy's pod is gone whose container was not seen to end."""
+        place = ProxyPlace(proxy.of, proxy.node)
+        self._vanished.pop(place, None)
+        if not is_there and proxy.runs:
+            self._vanished[place] = self._now()
+            if len(self._vanished) > MOST_VANISHED:
+                del self._vanished[next(iter(self._vanished))]
 
     def _index_pod(self, pod: Pod, key: str, kept: Pod | None) -> None:
         _set(self._pods, pod.id.namespace, key, kept)

@@ -145,10 +145,10 @@ def test_without_a_rosproxy_it_is_told_once_on_the_pod() -> None:
 
 def test_a_misspelt_label_wakes_the_operator_without_a_rosproxy() -> None:
     store = ClusterStore([("pods", "")], ("",), lambda: None, lambda: None)
-    store.changed("pods", "", {"uid": objects.pod(pod_obj("a", {"rosproxy.io/injekt": "true"}))})
+    store.changed("pods", "", [("uid", objects.pod(pod_obj("a", {"rosproxy.io/injekt": "true"})))])
     assert store.take_changes().namespaces == {NAMESPACE}
     assert len(store.snapshot().misspelt_pods) == 1
-    store.changed("pods", "", {"uid": None})
+    store.changed("pods", "", [("uid", None)])
     assert store.snapshot().misspelt_pods == ()
 
 

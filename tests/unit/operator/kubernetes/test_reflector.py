@@ -147,6 +147,31 @@ async def test_what_happens_is_seen(server: ApiServer, seen: Seen) -> None:
     await until(lambda: "talker" not in seen.pods())
 
 
+async def test_a_proxy_that_vanishes_while_it_runs_is_noted(server: ApiServer, seen: Seen) -> None:
+    """Deleted by force: its kubelet ends it, and frees its hostPorts, some seconds later."""
+    running = {"containerStatuses": [{"name": "proxy", "state": {"running": {"startedAt": "1"}}}]}
+    ended = {"containerStatuses": [{"name": "proxy", "state": {"terminated": {"exitCode": 0}}}]}
+    put_all(server)
+    await begun(server, seen)
+
+    async def vanished(*places: str) -> None:
+        await until(lambda: [p.node for p in seen.store.snapshot().vanished] == [*places])
+
+    proxy = changed(proxy_obj(node="node2"), **running)
+    server.put("pods", proxy, NAMESPACE)
+    await until(lambda: all(p.runs for p in seen.store.snapshot().proxies))
+    server.drop("pods", proxy["metadata"]["name"], NAMESPACE)
+    await vanished("node2")
+
+    server.put("pods", proxy, NAMESPACE)
+    await vanished()
+
+    server.put("pods", changed(proxy, **ended), NAMESPACE)
+    server.drop("pods", proxy["metadata"]["name"], NAMESPACE)
+    await until(lambda: not seen.store.snapshot().proxies)
+    await vanished()
+
+
 async def test_a_watch_that_is_too_old_begins_anew(server: ApiServer, seen: Seen) -> None:
     put_all(server)
     await begun(server, seen)

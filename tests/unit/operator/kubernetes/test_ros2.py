@@ -17,6 +17,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
+from rosproxy_operator.kubernetes.planner.steps.context import TORN_DOWN_WITHIN_S
 from rosproxy_operator.kubernetes.planner.steps.lan_relay import lan_relay_pod
 from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
@@ -27,6 +28,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     MasterSpec,
     Pod,
     PodContainer,
+    ProxyPlace,
     Ros2Spec,
     RosProxy,
 )
@@ -64,6 +66,19 @@ def of2(ros2: Ros2Spec | None = None, **changes: Any) -> RosProxy:
     """One for ROS 2 alone."""
     spec: dict[str, Any] = {"ros1": False, "ros2": ros2 or Ros2Spec(), "master": MasterSpec()}
     return some.rosproxy(**spec | changes)
+
+
+@pytest.mark.parametrize(("of", "waits"), [(of2(), True), (some.rosproxy(), False)])
+def test_a_proxy_waits_for_the_udp_ports_of_one_that_vanished(of: RosProxy, waits: bool) -> None:
+    """Else the node's conntrack leads datagrams to the former pod's address for good."""
+    vanished = {ProxyPlace(of.id, some.node().name): 100.0}
+    seen = observed(of, service(of), pod(), vanished=vanished)
+    early = look(seen, now=100.5)
+    late = look(seen, now=100.0 + TORN_DOWN_WITHIN_S)
+    assert any(isinstance(action, CreateProxy) for action in early.actions) is not waits
+    assert any(isinstance(action, CreateProxy) for action in late.actions)
+    assert early.next_look_in is not None
+    assert early.next_look_in <= TORN_DOWN_WITHIN_S - 0.5
 
 
 def pod(*containers: PodContainer, **changes: Any) -> Pod:

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from rosproxy.setting_kinds import hash_token
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.cluster_view import View
-from rosproxy_operator.kubernetes.planner.manifests import ProxySite
+from rosproxy_operator.kubernetes.planner.manifests import STOPS_WITHIN, ProxySite
 from rosproxy_operator.kubernetes.planner.retries import Retries
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources.checks import host_problem
@@ -30,6 +30,13 @@ from rosproxy_operator.kubernetes.status.refusal_fixes import OF_ANOTHER
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""
+TORN_DOWN_WITHIN_S = STOPS_WITHIN + 3.0
+"""Seconds in which a kubelet ends a pod that was deleted by force, and takes its hostPorts back.
+
+If a new pod gets the same ports earlier, the former one's rules still come first. Datagrams that
+go on coming to a port are then led to the former pod's address for good: the CNI plug-in portmap
+deletes conntrack entries when a pod comes, and not when it goes (containernetworking/plugins 1277).
+"""
 
 
 class ClusterContext(msgspec.Struct, frozen=True):
@@ -60,6 +67,12 @@ class ClusterContext(msgspec.Struct, frozen=True):
         """The seconds until the grace of a proxy ends that no pod wants any more."""
         grace = self.view.rosproxies[place.of].spec.grace
         return grace - (self.now - self.state.absent.get(place, self.now))
+
+    def seconds_until_torn_down(self, place: ProxyPlace) -> float:
+        """The seconds until a proxy's former pod holds no UDP ports any more for certain."""
+        since = self.observed.vanished.get(place)
+        takes_udp = self.view.rosproxies[place.of].spec.takes_udp
+        return 0.0 if since is None or not takes_udp else TORN_DOWN_WITHIN_S - (self.now - since)
 
     def seconds_until_lost(self, node: str) -> float:
         """The seconds until a node that is missing counts as gone."""

@@ -173,6 +173,8 @@ def _ensure(
         _note_creation(context, place)
         if current is not None:  # else its pod is about to go
             yield from _update(context, current, site, may_stop)
+    elif (seconds := context.seconds_until_torn_down(place)) > 0:
+        context.retries.look_again_in(seconds)
     elif context.retries.is_due(_creation(place)):
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
