@@ -1,7 +1,13 @@
-"""Finding ports for a proxy, and when it leaves them: the same for every engine."""
+"""Which range of ports each proxy gets, and when it leaves the range: the same for every engine.
 
-from collections.abc import Collection, Iterable, Iterator
+A proxy's range is a promise: ROS nodes are registered at the master under its ports. So `keep`
+gives each proxy the range that it has or had, where that range is free. Then `fill` gives ranges to
+the other proxies, and more ports to proxies that have too few. What is free is data of the engine.
+"""
+
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from rosproxy.leases.ports import PortRange
 
@@ -12,6 +18,8 @@ TAKEN_FOR = 300.0
 """Seconds for which a port is avoided that the engine has refused."""
 MOVED_FOR = 600.0
 """Seconds for which it is reported that a proxy had to leave its range."""
+Proxy = TypeVar("Proxy", bound=Hashable)
+"""What tells the proxies of an engine apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,23 +30,48 @@ class Move:
     at: float
 
 
+@dataclass(frozen=True, slots=True)
+class FormerRange:
+    """A range that a proxy had. Others have the ports ``blocked`` and ``ranges``."""
+
+    ports: PortRange
+    blocked: Collection[int]
+    ranges: Collection[PortRange] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RangeWish:
+    """The ports that a proxy is to have on its host: ``count`` in a row, from ``window``.
+
+    ``held`` is the range that the proxy has now and keeps. Without one, the proxy keeps the first
+    range of ``former`` that is free. New ports are none of ``blocked``, none of ``ranges``, and
+    none of ``growing``, the ranges of other proxies. If possible, a new range has no port of
+    ``avoided``, and all ranges have ``room`` to grow to so many times their length.
+    """
+
+    count: int
+    window: PortRange
+    blocked: Collection[int]
+    ranges: Collection[PortRange] = ()
+    held: PortRange | None = None
+    former: tuple[FormerRange, ...] = ()
+    growing: Collection[PortRange] = ()
+    avoided: Collection[PortRange] = ()
+    room: int = 1
+
+
 def after_move(ros1: bool, ros2: bool) -> str:
     """What happens to nodes behind a proxy that had to leave its range, and what to do.
 
     ROS 1's nodes have to register anew. Participants of ROS 2 meet anew by themselves, if the
     operator has seen what ports they had.
     """
-    effects = []
-    if ros1:
-        text = "Restart the nodes that registered on the old ports: outside can't reach them"
-        effects.append(text)
-    if ros2:
-        text = (
-            "Outside discovers the ROS 2 participants again. Restart the participants that outside "
-            "has not discovered after a minute"
-        )
-        effects.append(text)
-    return ". ".join(effects)
+    texts = {
+        "Restart the nodes that registered on the old ports: outside can't reach them": ros1,
+        "Outside discovers the ROS 2 participants again. Restart the participants that outside has "
+        "not discovered after a minute": ros2,
+    }
+    return ". ".join(text for text, applies in texts.items() if applies)
 
 
 class PortsExhausted(Exception):
@@ -56,6 +89,78 @@ class PortsExhausted(Exception):
         self.window = window
 
 
+def keep(wishes: Mapping[Proxy, RangeWish]) -> dict[Proxy, PortRange]:
+    """Return the ranges that proxies of a host keep. The first wishes come first."""
+    given: dict[Proxy, PortRange] = {}
+    for proxy, wish in wishes.items():
+        possible = (
+            former.ports
+            for former in wish.former
+            if is_free(former.ports, former.blocked, [*former.ranges, *given.values()])
+        )
+        if ports := wish.held or next(possible, None):
+            given[proxy] = ports
+    return given
+
+
+def fill(
+    wishes: Mapping[Proxy, RangeWish], kept: Mapping[Proxy, PortRange]
+) -> tuple[dict[Proxy, PortRange], dict[Proxy, PortsExhausted]]:
+    """Return the ranges of the proxies of a host, and why some proxies have none.
+
+    ``kept`` are the ranges of `keep`. Ranges that are too short get more ports, if those are free.
+    """
+    given = dict(kept)
+    exhausted: dict[Proxy, PortsExhausted] = {}
+    for proxy, wish in wishes.items():
+        growing = [*wish.growing, *(ports for other, ports in given.items() if other != proxy)]
+        try:
+            if ports := given.get(proxy):
+                given[proxy] = _extended(ports, wish, growing)
+            else:
+                given[proxy] = _new_range(wish, growing)
+        except PortsExhausted as error:
+            exhausted[proxy] = error
+    return given, exhausted
+
+
+def _extended(ports: PortRange, wish: RangeWish, growing: Iterable[PortRange]) -> PortRange:
+    """Return the range with ports added at its end, if those are free; else the range itself."""
+    wanted = PortRange(ports.first, ports.first + wish.count - 1)
+    added = PortRange(ports.last + 1, wanted.last)
+    is_possible = ports.last < wanted.last <= wish.window.last
+    ranges = [*wish.ranges, *growing]
+    return wanted if is_possible and is_free(added, wish.blocked, ranges) else ports
+
+
+def _new_range(wish: RangeWish, growing: Collection[PortRange]) -> PortRange:
+    """The first range that is free, if possible with room for it and its neighbours to grow."""
+    more = wish.room - 1
+    widened = [PortRange(r.first, min(r.last + more * len(r), LAST_PORT)) for r in growing]
+    preferred = [*wish.ranges, *wish.avoided, *widened]
+    try:
+        roomy = negotiate(wish.room * wish.count, wish.window, wish.blocked, preferred)
+    except PortsExhausted:
+        return negotiate(wish.count, wish.window, wish.blocked, [*wish.ranges, *growing])
+    return PortRange(roomy.first, roomy.first + wish.count - 1)
+
+
+def new_moves(
+    former: Mapping[Proxy, PortRange], given: Mapping[Proxy, PortRange], now: float
+) -> dict[Proxy, Move]:
+    """Which proxies leave which ranges."""
+    return {
+        proxy: Move(ports, now)
+        for proxy, ports in former.items()
+        if proxy in given and is_moved(ports, given[proxy])
+    }
+
+
+def is_moved(former: PortRange, ports: PortRange) -> bool:
+    """Whether a range is another one, and has not only grown or shrunk at its end."""
+    return former.first != ports.first
+
+
 def negotiate(
     count: int, window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()
 ) -> PortRange:
@@ -68,45 +173,6 @@ def negotiate(
         if len(gap) >= count:
             return PortRange(gap.first, gap.first + count - 1)
     raise PortsExhausted(count, window, [len(gap) for gap in gaps])
-
-
-def negotiate_with_room(
-    count: int,
-    window: PortRange,
-    blocked: Collection[int],
-    growing: Iterable[PortRange],
-    fixed: Iterable[PortRange] = (),
-) -> PortRange:
-    """Ports as `negotiate`, where possible with room for the range and its neighbours to double.
-
-    ``growing`` are the ranges of other proxies, which may get longer, ``fixed`` other ranges.
-    """
-    growing = [*growing]
-    fixed = [*fixed]
-    doubled = [PortRange(ports.first, min(ports.last + len(ports), LAST_PORT)) for ports in growing]
-    try:
-        roomy = negotiate(2 * count, window, blocked, [*doubled, *fixed])
-    except PortsExhausted:
-        return negotiate(count, window, blocked, [*growing, *fixed])
-    return PortRange(roomy.first, roomy.first + count - 1)
-
-
-def extended(
-    ports: PortRange,
-    count: int,
-    window: PortRange,
-    blocked: Collection[int],
-    ranges: Iterable[PortRange] = (),
-) -> PortRange | None:
-    """The range with ports added at its end up to ``count``, if those are free and in the window.
-
-    The range itself is not checked, and never made shorter.
-    """
-    if len(ports) >= count:
-        return ports
-    wanted = PortRange(ports.first, ports.first + count - 1)
-    added = PortRange(ports.last + 1, wanted.last)
-    return wanted if wanted.last <= window.last and is_free(added, blocked, ranges) else None
 
 
 def is_free(ports: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()) -> bool:

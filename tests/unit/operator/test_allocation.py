@@ -1,17 +1,23 @@
 """Ports are found in a row, as early as can be, where they were if that can be."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.port_negotiation import (
+    FormerRange,
+    Move,
     PortsExhausted,
+    RangeWish,
     after_move,
-    extended,
+    fill,
     is_free,
+    keep,
     negotiate,
-    negotiate_with_room,
+    new_moves,
     overlap,
     within,
 )
@@ -60,14 +66,15 @@ def test_the_first_range_that_is_free(
 def test_a_range_is_never_made_shorter_and_its_own_ports_do_not_matter(
     count: int, blocked: frozenset[int], ranges: list[PortRange], ports: PortRange
 ) -> None:
-    more = extended(ports, count, WINDOW, blocked, ranges)
+    wish = RangeWish(count, WINDOW, blocked, ranges)
+    more = fill({"proxy": wish}, {"proxy": ports})[0]["proxy"]
     added = PortRange(ports.last + 1, ports.first + count - 1)
     if len(ports) >= count:
         assert more == ports
     elif free(added, blocked, ranges) and added.last <= WINDOW.last:
         assert more == PortRange(ports.first, added.last)
     else:
-        assert more is None
+        assert more == ports
 
 
 @given(BLOCKED, RANGES, RANGE)
@@ -87,16 +94,42 @@ def test_overlap(first: PortRange, second: PortRange) -> None:
 def test_room_is_left_where_there_is_some(
     count: int, blocked: frozenset[int], ranges: list[PortRange]
 ) -> None:
-    try:
-        given = negotiate_with_room(count, WINDOW, blocked, ranges)
-    except PortsExhausted:
+    wish = RangeWish(count, WINDOW, blocked, (), growing=ranges, room=2)
+    given_ranges, exhausted = fill({"proxy": wish}, {})
+    if exhausted:
         assert not any(free(ports, blocked, ranges) for ports in every(count))
         return
+    given = given_ranges["proxy"]
     assert free(given, blocked, ranges)
     assert len(given) == count
     doubled = [PortRange(r.first, r.last + len(r)) for r in ranges]
     roomy = [ports for ports in every(2 * count) if free(ports, blocked, doubled)]
     assert not roomy or given.first == roomy[0].first
+
+
+def test_a_range_that_two_proxies_had_is_for_the_first() -> None:
+    had = PortRange(100, 109)
+    wish = RangeWish(10, WINDOW, (), former=(FormerRange(had, ()),))
+    assert keep({"first": wish, "second": wish}) == {"first": had}
+    assert keep({"first": wish, "second": replace(wish, held=had)}) == {"first": had, "second": had}
+    taken = replace(wish, former=(FormerRange(had, {105}), FormerRange(had, (), [had])))
+    assert keep({"first": taken}) == {}
+
+
+def test_a_range_that_another_had_is_avoided_if_possible() -> None:
+    wish = RangeWish(10, WINDOW, (), avoided=[PortRange(100, 109)])
+    assert fill({"first": wish}, {}) == ({"first": PortRange(110, 119)}, {})
+    narrow = replace(wish, window=PortRange(100, 109))
+    assert fill({"first": narrow}, {}) == ({"first": PortRange(100, 109)}, {})
+
+
+def test_a_range_that_grows_or_shrinks_at_its_end_is_the_same() -> None:
+    former = {"grown": PortRange(100, 109), "shrunk": PortRange(110, 119), "gone": WINDOW}
+    given = {"grown": PortRange(100, 119), "shrunk": PortRange(110, 112)}
+    assert new_moves(former, given, 1.0) == {}
+    assert new_moves(former, {"grown": PortRange(101, 109)}, 1.0) == {
+        "grown": Move(PortRange(100, 109), 1.0)
+    }
 
 
 def test_the_error_says_how_many_there_are() -> None:

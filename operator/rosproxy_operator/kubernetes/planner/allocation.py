@@ -1,22 +1,24 @@
 """Which range of ports each proxy gets on its node.
 
-A proxy's range is a promise: ROS nodes have registered at the master under its ports, so a proxy
-keeps the range that it has, or had by the state or by its RosProxy's status, as long as that is
-allowed and available. On each node proxies that have ports come first, then those that had some,
-then those that want some; a hostPort is taken if any pod of the node has it, whoever owns the pod.
-`state` says which ports were refused recently, and which proxies had to leave theirs.
+A proxy keeps the range that it has, or had by the state or by its RosProxy's status, as long as the
+RosProxy allows the range and its ports are free. On each node proxies that have ports come first,
+then those that had some, then those that want some. A hostPort is taken if any pod of the node has
+it, whoever owns the pod. `state` says which ports were refused recently, and which proxies had to
+leave theirs.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.port_negotiation import (
+    FormerRange,
     PortsExhausted,
-    extended,
+    RangeWish,
+    fill,
     is_free,
-    negotiate,
+    keep,
     overlap,
     within,
 )
@@ -30,6 +32,7 @@ from rosproxy_operator.kubernetes.planner.cluster_view import (
     serves,
 )
 from rosproxy_operator.kubernetes.planner.state import ClusterState, host_ports_of
+from rosproxy_operator.kubernetes.resources.cluster import ProxyPod
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Pod,
@@ -44,12 +47,12 @@ from rosproxy_operator.kubernetes.status.findings import finding
 class ClusterRanges(msgspec.Struct, frozen=True):
     """The range of each wanted proxy that can have one.
 
-    ``published`` are the places whose port for the master in the cluster is free. ``exhausted``
-    says for each other place why it has no range, ``findings`` what could not be had as asked for.
+    ``published`` are the ports for a master in the cluster, where they are free. ``exhausted`` says
+    for each other place why it has no range, ``findings`` what could not be had as asked for.
     """
 
     given: dict[ProxyPlace, PortRange] = {}
-    published: set[ProxyPlace] = set()
+    published: dict[ProxyPlace, PortRange] = {}
     exhausted: dict[ProxyPlace, str] = {}
     findings: list[ClusterFinding] = []
 
@@ -60,91 +63,95 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
     A proxy that has its ports keeps them, unless its RosProxy or the settings now forbid them.
     """
     ranges = ClusterRanges()
+    kernel = {"NodePorts": settings.node_ports, "the nodes' ephemeral ports": settings.ephemeral}
     places = group_by_key((place.node, place) for place in view.wanted)
     refused = group_by_key(state.taken)
     for node, wanted in sorted(places.items()):
-        _Allocation(view, settings, state, wanted, {*refused.get(node, ())}, ranges).run()
+        _Node(view, state, kernel, node, {*refused.get(node, ())}, ranges).allocate(wanted)
     return ranges
 
 
-class _Allocation:
-    """The ranges of one node being given out, into ``ranges``."""
+class _Node(msgspec.Struct):
+    """A node whose ranges are given out, into ``ranges``."""
 
-    def __init__(
-        self,
-        view: View,
-        settings: ClusterSettings,
-        state: ClusterState,
-        wanted: tuple[ProxyPlace, ...],
-        refused: set[int],
-        ranges: ClusterRanges,
-    ) -> None:
-        self.view = view
-        self.state = state
-        self.ranges = ranges
-        self.node = node = wanted[0].node
-        self.rosproxies = {place: view.rosproxies[place.of] for place in wanted}
-        self.proxies = view.proxies_by_node.get(node, ())
-        self.strangers = view.other_pods_by_node.get(node, ())
-        self.refused = refused
-        self.kernel = {
-            "NodePorts": settings.node_ports,
-            "the nodes' ephemeral ports": settings.ephemeral,
-        }
+    view: View
+    state: ClusterState
+    kernel: Mapping[str, PortRange]
+    node: str
+    refused: set[int]
+    ranges: ClusterRanges
 
-    def run(self) -> None:
+    @property
+    def proxies(self) -> tuple[ProxyPod, ...]:
+        """All proxies that hold ports on the node."""
+        return self.view.proxies_by_node.get(self.node, ())
+
+    def allocate(self, places: Iterable[ProxyPlace]) -> None:
         """Proxies that have ports come before those that had some, and these before the rest."""
-        # In three rounds: nothing is given out anew before all is known that proxies keep.
-        order = sorted(self.rosproxies, key=self._rank)
-        for place in order:
-            self._keep(place)
-        for place in order:
-            self._publish(place)
-        for place in order:
-            self._fill(place)
+        wishes = {(place, False): self._wish(place) for place in sorted(places, key=self._rank)}
+        published = {
+            (place, True): self._master_wish(place)
+            for place, _ in wishes
+            if self.view.rosproxies[place.of].spec.master.publish
+        }
+        kept, unpublished = fill(published, keep(wishes) | keep(published))
+        given, exhausted = fill(wishes, kept)
+        self.ranges.findings.extend(self._unpublished(place) for place, _ in unpublished)
+        for (place, is_master), ports in given.items():
+            (self.ranges.published if is_master else self.ranges.given)[place] = ports
+            if not is_master and len(ports) < wishes[place, False].count:
+                self.ranges.findings.append(self._too_short(place, ports))
+        for (place, _), error in exhausted.items():
+            self.ranges.exhausted[place] = self._exhaustion(place, error)
 
     def _rank(self, place: ProxyPlace) -> tuple[int, ProxyPlace]:
         proxy = self.view.current.get(place)
-        ranks = (
-            proxy is not None and serves(proxy),
-            proxy is not None and has_ports(proxy),
-            place in self.state.served,
-            proxy is not None,
-            self.rosproxies[place].former_ranges.get(self.node) is not None,
-        )
-        return ranks.index(True) if True in ranks else len(ranks), place
+        has_had_ports = self.node in self.view.rosproxies[place.of].former_ranges
+        present = (serves(proxy), has_ports(proxy)) if proxy else (False, False)
+        ranks = (*present, place in self.state.served, proxy is not None, has_had_ports, True)
+        return ranks.index(True), place
 
-    def _keep(self, place: ProxyPlace) -> None:
-        """Give a proxy the range that it has or had, if it can have it."""
-        proxy = self.view.current.get(place)
-        spec = self.rosproxies[place].spec
-        reserved = self._reserved(place)
+    def _wish(self, place: ProxyPlace) -> RangeWish:
+        """What a proxy wants, and what it can't have."""
+        spec = self.view.rosproxies[place.of].spec
+        reserved = self._reserved(spec)
         kernel = [*self.kernel.values()]
-        for ports in self._candidates(place):
-            trimmed = PortRange(ports.first, min(ports.last, ports.first + spec.ports - 1))
-            is_allowed = within(trimmed, spec.window) and is_free(trimmed, reserved, kernel)
-            is_current = proxy is not None and has_ports(proxy) and proxy.range == ports
-            if is_allowed and (is_current or self._is_available(place, trimmed)):
-                self.ranges.given[place] = trimmed
-                return
+        most = spec.ports - 1
+        ranges = [PortRange(r.first, min(r.last, r.first + most)) for r in self._past(place)]
+        allowed = [r for r in ranges if within(r, spec.window) and is_free(r, reserved, kernel)]
+        current = self.view.current.get(place)
+        is_held = current is not None and has_ports(current) and allowed[:1] == ranges[:1]
+        taken = set[int]() if is_held else self._taken(place)
+        # If possible, a new range is none that another RosProxy has had on this node.
+        others = (r.former_ranges.get(self.node) for r in self.view.rosproxies.values())
+        return RangeWish(
+            spec.ports,
+            spec.window,
+            host_ports_of(self._other_pods(place), spec) | self.refused | reserved,
+            kernel,
+            held=allowed[0] if is_held else None,
+            former=tuple(FormerRange(r, taken) for r in allowed),
+            avoided=[*filter(None, others)],
+        )
 
-    def _candidates(self, place: ProxyPlace) -> Iterator[PortRange]:
+    def _past(self, place: ProxyPlace) -> Iterator[PortRange]:
+        """The ranges that a proxy has or had, that of its present pod first."""
         current = self.view.current.get(place)
         proxies = [p for p in self.proxies if place_of(p) == place]
         yield from (p.range for p in sorted(proxies, key=lambda p: p is not current))
         remembered = (
             self.state.given.get(place),
             self.state.served.get(place),
-            self.rosproxies[place].former_ranges.get(self.node),
+            self.view.rosproxies[place.of].former_ranges.get(self.node),
         )
         yield from filter(None, remembered)
 
-    def _is_available(self, place: ProxyPlace, ports: PortRange) -> bool:
-        """Whether a range that the proxy does not hold now is available.
+    def _taken(self, place: ProxyPlace) -> set[int]:
+        """The ports that a proxy can't get back.
 
         Pods that are about to end free their ports in time for a proxy that has served; other
-        proxies' pods also for one that waits for its ports already. The ports of another proxy
-        count if it has got them, or if its place is not given another range.
+        proxies' pods also for a proxy that waits for its ports already. The ports of another proxy
+        count if that proxy has got them, or if its place is not given another range.
         """
         served = place in self.state.served
         is_waiting = served or self.view.current.get(place) is not None
@@ -153,79 +160,54 @@ class _Allocation:
             counts = has_ports(proxy) or place_of(proxy) not in self.view.wanted
             if counts and place_of(proxy) != place and not (is_waiting and proxy.pod.deleting):
                 pods.append(proxy.pod)
-        pod_ports = host_ports_of(pods, self.rosproxies[place].spec)
-        return is_free(ports, pod_ports | self.refused, self._promised_to_others(place))
+        return host_ports_of(pods, self.view.rosproxies[place.of].spec) | self.refused
 
-    def _publish(self, place: ProxyPlace) -> None:
-        """Give a proxy its port for a master in the cluster, if it is to have one and can."""
+    def _master_wish(self, place: ProxyPlace) -> RangeWish:
+        """The port for a master in the cluster."""
         proxy = self.view.current.get(place)
-        port = self.rosproxies[place].spec.master.publish
-        if not port:
-            return
-        if proxy is None or not has_ports(proxy) or port not in proxy.pod.host_ports:
-            holders = [str(p.id) for p in self._other_pods(place) if port in p.host_ports]
-            promised = any(port in ports for ports in self._promised_to_others(place))
-            if holders or promised or port in self.refused:
-                holder = "another RosProxy, or a pod or program that ends soon, has"
-                if holders:
-                    holder = f"pod {abbreviated(holders)} has"
-                text = (
-                    f"the master is not published on port {port} of node {self.node}, since "
-                    f"{holder} this port. Choose another spec.master.publish, or free the port"
-                )
-                self.ranges.findings.append(finding(self.rosproxies[place], "PortConflict", text))
-                return
-        self.ranges.published.add(place)
+        port = self.view.rosproxies[place.of].spec.master.publish
+        ports = PortRange(port, port)
+        is_held = proxy is not None and has_ports(proxy) and port in proxy.pod.host_ports
+        blocked = {port for pod in self._other_pods(place) for port in pod.host_ports}
+        return RangeWish(1, ports, blocked | self.refused, held=ports if is_held else None)
 
-    def _fill(self, place: ProxyPlace) -> None:
-        """Give a proxy more ports if it has too few, or a range if it has none."""
-        spec = self.rosproxies[place].spec
-        ranges = self.ranges.given
-        pod_ports = host_ports_of(self._other_pods(place), spec)
-        blocked = pod_ports | self.refused | self._reserved(place)
-        excluded = [*self.kernel.values(), *self._promised_to_others(place)]
-        if kept := ranges.get(place):
-            ranges[place] = extended(kept, spec.ports, spec.window, blocked, excluded) or kept
-            if len(ranges[place]) < spec.ports:
-                missing = PortRange(kept.last + 1, kept.first + spec.ports - 1)
-                text = (
-                    f"the proxy on node {self.node} has only the {len(kept)} ports {kept}, "
-                    f"although spec.ports is {spec.ports}: ports {missing} are not all free, or "
-                    "not in spec.portWindow. Delete the pods that hold these ports, or move "
-                    "spec.portWindow elsewhere, so that the proxy gets another range"
-                )
-                self.ranges.findings.append(finding(self.rosproxies[place], "PortsExhausted", text))
-            return
-        try:
-            ranges[place] = self._new_range(spec, blocked, excluded)
-        except PortsExhausted as error:
-            self.ranges.exhausted[place] = self._exhaustion(place, error)
-
-    def _new_range(
-        self, spec: RosProxySpec, blocked: Collection[int], excluded: list[PortRange]
-    ) -> PortRange:
-        """A new range, if possible none that another RosProxy has had on this node."""
-        former = filter(
-            None, (r.former_ranges.get(self.node) for r in self.view.rosproxies.values())
+    def _unpublished(self, place: ProxyPlace) -> ClusterFinding:
+        """Why outside does not find a master in the cluster."""
+        rosproxy = self.view.rosproxies[place.of]
+        port = rosproxy.spec.master.publish
+        pods = [str(pod.id) for pod in self._other_pods(place) if port in pod.host_ports]
+        holder = "another RosProxy, or a pod or program that ends soon, has"
+        if pods:
+            holder = f"pod {abbreviated(pods)} has"
+        text = (
+            f"the master is not published on port {port} of node {self.node}, since {holder} this "
+            "port. Choose another spec.master.publish, or free the port"
         )
-        try:
-            return negotiate(spec.ports, spec.window, blocked, [*excluded, *former])
-        except PortsExhausted:
-            return negotiate(spec.ports, spec.window, blocked, excluded)
+        return finding(rosproxy, "PortConflict", text)
+
+    def _too_short(self, place: ProxyPlace, ports: PortRange) -> ClusterFinding:
+        """Why a range has not as many ports as it is to have."""
+        rosproxy = self.view.rosproxies[place.of]
+        count = rosproxy.spec.ports
+        missing = PortRange(ports.last + 1, ports.first + count - 1)
+        text = (
+            f"the proxy on node {self.node} has only the {len(ports)} ports {ports}, although "
+            f"spec.ports is {count}: ports {missing} are not all free, or not in spec.portWindow. "
+            "Delete the pods that hold these ports, or move spec.portWindow elsewhere, so that the "
+            "proxy gets another range"
+        )
+        return finding(rosproxy, "PortsExhausted", text)
 
     def _exhaustion(self, place: ProxyPlace, error: PortsExhausted) -> str:
         """Why there are no ports, and what to do."""
-        reasons = [
-            f"{subject} {r}" for subject, r in self.kernel.items() if overlap(r, error.window)
-        ]
+        window = error.window
+        reasons = [f"{subject} {r}" for subject, r in self.kernel.items() if overlap(r, window)]
         pods = self._other_pods(place)
-        spec = self.rosproxies[place].spec
-        holders = [
-            str(pod.id) for pod in pods if any(p in error.window for p in pod.ports_of(spec))
-        ]
+        spec = self.view.rosproxies[place.of].spec
+        holders = [str(pod.id) for pod in pods if any(p in window for p in pod.ports_of(spec))]
         reasons += [f"ports of pods {abbreviated(holders)}"] if holders else []
         reason = ", ".join(reasons) or "ports that the node refused a short time ago"
-        fix = f"Widen spec.portWindow ({error.window}), or lower spec.ports ({error.count})"
+        fix = f"Widen spec.portWindow ({window}), or lower spec.ports ({error.count})"
         fix += ", or delete one of these pods" if holders else ""
         return f"{error}. Not available: {reason}. {fix}"
 
@@ -236,26 +218,12 @@ class _Allocation:
 
     def _strangers(self, place: ProxyPlace) -> list[Pod]:
         """Pods that are no proxies, among them the LAN relays of other RosProxies."""
+        lan_relays = (r for r in self.view.observed.lan_relays if r.node == self.node)
         # That of the same RosProxy holds the last port of the range: see `ProxySite.own_ports`.
-        lan_relays = (
-            lan_relay for lan_relay in self.view.observed.lan_relays if lan_relay.node == self.node
-        )
-        return [
-            *self.strangers,
-            *(lan_relay.pod for lan_relay in lan_relays if lan_relay.of != place.of),
-        ]
+        others = (lan_relay.pod for lan_relay in lan_relays if lan_relay.of != place.of)
+        return [*self.view.other_pods_by_node.get(self.node, ()), *others]
 
-    def _promised_to_others(self, place: ProxyPlace) -> Iterator[PortRange]:
-        """The ports that other proxies on the node have been given so far."""
-        for other_place in self.rosproxies.keys() - {place}:
-            if other_place in self.ranges.given:
-                yield self.ranges.given[other_place]
-            if other_place in self.ranges.published:
-                port = self.rosproxies[other_place].spec.master.publish
-                yield PortRange(port, port)
-
-    def _reserved(self, place: ProxyPlace) -> set[int]:
+    def _reserved(self, spec: RosProxySpec) -> set[int]:
         # The proxy listens on these itself, and a hostPort is the container's port of that number.
-        spec = self.rosproxies[place].spec
         ros2_ports = well_known_ports(spec.ros2.number) if spec.ros2 else frozenset[int]()
         return {MASTER_PORT, ADMIN_PORT, spec.master.publish, *ros2_ports}

@@ -18,8 +18,9 @@ from rosproxy_operator.common.port_negotiation import (
     TAKEN_FOR,
     Move,
     after_move,
+    is_moved,
+    new_moves,
     overlap,
-    within,
 )
 from rosproxy_operator.kubernetes.planner.cluster_view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
@@ -99,14 +100,14 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
 
 def decide(state: ClusterState, ranges: Mapping[ProxyPlace, PortRange], now: float) -> ClusterState:
     """The state with the ranges that are given, and with the proxies that had to leave theirs."""
-    moved = _new_moves(state.served, ranges, now)
+    moved = new_moves(state.served, ranges, now)
     tried = {place: ports for place, ports in state.given.items() if place not in state.served}
     return replace(
         state,
         given={**state.given, **ranges},
         served={place: ports for place, ports in state.served.items() if place not in moved},
         moved={**state.moved, **moved},
-        tried={**state.tried, **_new_moves(tried, ranges, now)},
+        tried={**state.tried, **new_moves(tried, ranges, now)},
     )
 
 
@@ -116,7 +117,7 @@ def moves(
     """Which proxies have had to leave which ports."""
     for moved, has_served in ((state.moved, True), (state.tried, False)):
         for place, move in sorted(moved.items()):
-            if place in ranges and not _is_kept(move.ports, ranges[place]):
+            if place in ranges and is_moved(move.ports, ranges[place]):
                 rosproxy = view.rosproxies[place.of]
                 why = "the old ports are not free. Nothing needs to be done"
                 if has_served:
@@ -193,18 +194,3 @@ def _is_waiting(view: View, place: ProxyPlace) -> bool:
 def host_ports_of(pods: Iterable[Pod], spec: RosProxySpec) -> set[int]:
     """The hostPorts of pods that a RosProxy can't have."""
     return {port for pod in pods for port in pod.ports_of(spec)}
-
-
-def _new_moves(
-    former: Mapping[ProxyPlace, PortRange], ranges: Mapping[ProxyPlace, PortRange], now: float
-) -> dict[ProxyPlace, Move]:
-    return {
-        place: Move(ports, now)
-        for place, ports in former.items()
-        if place in ranges and not _is_kept(ports, ranges[place])
-    }
-
-
-def _is_kept(former: PortRange, ports: PortRange) -> bool:
-    """Whether a range has at most been enlarged or reduced."""
-    return within(former, ports) or within(ports, former)
