@@ -23,17 +23,13 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiNotFound,
     NotLeading,
 )
-from rosproxy_operator.kubernetes.confirm_deletion import Deletion, StateChanged, confirm
+from rosproxy_operator.kubernetes.confirm_deletion import StateChanged, confirm
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
-    CreateHelper,
-    CreatePolicy,
     CreateProxy,
-    CreateService,
-    DeleteHelper,
-    DeletePolicy,
+    Creation,
     DeleteProxy,
-    DeleteService,
+    Deletion,
     Emit,
     EvictPod,
     ObjectAction,
@@ -63,17 +59,8 @@ RELEASED = (0.2, 0.5, 1.0)
 The API server reports a Service as deleted before it frees the address.
 """
 
-_KINDS: Mapping[type, tuple[str, str]] = {
-    CreateService: ("Service", "services"),
-    DeleteService: ("Service", "services"),
-    CreatePolicy: ("NetworkPolicy", POLICIES),
-    DeletePolicy: ("NetworkPolicy", POLICIES),
-    CreateProxy: ("Pod", "pods"),
-    DeleteProxy: ("Pod", "pods"),
-    CreateHelper: ("Pod", "pods"),
-    DeleteHelper: ("Pod", "pods"),
-}
-"""By action: the kind that it creates or deletes, and that kind's name in the API's paths."""
+_PATHS = {"Pod": "pods", "Service": "services", "NetworkPolicy": POLICIES}
+"""The kinds of objects that are created and deleted, in the API's paths."""
 Count = Callable[[Action, str], None]
 
 
@@ -217,10 +204,11 @@ class ClusterApplier:
     def _call_api(self, action: Action, observed: ClusterSnapshot) -> None:
         api = self._api
         match action:
-            case CreateService() | CreatePolicy() | CreateProxy() | CreateHelper():
-                _create(api, _KINDS[type(action)][1], action.body)
-            case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteHelper():
-                self._delete(action, observed)
+            case Creation():
+                _create(api, _PATHS[action.kind], action.body)
+            case Deletion():
+                version = confirm(api, action, observed)
+                api.delete(_PATHS[action.kind], action.id, action.uid, version)
             case EvictPod():
                 confirm(api, action, observed)
                 api.evict(action.id, action.uid)
@@ -239,10 +227,6 @@ class ClusterApplier:
                 api.patch(f"{PLURAL}/status", action.of, [_uid_test(action.uid), status])
             case Emit():
                 _emit(api, action)
-
-    def _delete(self, action: Deletion, observed: ClusterSnapshot) -> None:
-        version = confirm(self._api, action, observed)
-        self._api.delete(_KINDS[type(action)][1], action.id, action.uid, version)
 
     async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         """Let a proxy unregister its nodes, then delete it, beside everything else."""
@@ -272,10 +256,10 @@ def _uid_test(uid: str) -> Json:
 def describe(action: Action) -> str:
     """An action in one line."""
     match action:
-        case CreateService() | CreatePolicy() | CreateProxy() | CreateHelper():
-            return f"create {_KINDS[type(action)][0]} {_subject(action)}"
-        case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteHelper():
-            return f"delete {_KINDS[type(action)][0]} {action.id}: {action.why}"
+        case Creation():
+            return f"create {action.kind} {_subject(action)}"
+        case Deletion():
+            return f"delete {action.kind} {action.id}: {action.why}"
         case SetImage() | SetPolicy() | EvictPod():
             return _change_line(action)
         case PatchStatus():
@@ -295,7 +279,7 @@ def _change_line(action: SetImage | SetPolicy | EvictPod) -> str:
 def _subject(action: Action) -> Name:
     """The object that an action is about."""
     match action:
-        case CreateService() | CreatePolicy() | CreateProxy() | CreateHelper():
+        case Creation():
             return name_of(action.body["metadata"])
         case ObjectAction():
             return action.id

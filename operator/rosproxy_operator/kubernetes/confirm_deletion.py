@@ -12,9 +12,8 @@ from collections.abc import Iterable
 from rosproxy_operator.kubernetes.api.api_client import Api
 from rosproxy_operator.kubernetes.planner.actions import (
     DeleteHelper,
-    DeletePolicy,
     DeleteProxy,
-    DeleteService,
+    Deletion,
     EvictPod,
 )
 from rosproxy_operator.kubernetes.resources import objects
@@ -24,14 +23,12 @@ from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Json, 
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.records import pod_record, rosproxy_record
 
-Deletion = DeleteService | DeletePolicy | DeleteProxy | DeleteHelper | EvictPod
-
 
 class StateChanged(Exception):
     """The facts behind a deletion have changed; the message says which object differs."""
 
 
-def confirm(api: Api, action: Deletion, observed: ClusterSnapshot) -> str:
+def confirm(api: Api, action: Deletion | EvictPod, observed: ClusterSnapshot) -> str:
     """The version in which the object may be deleted; empty for any.
 
     Raises StateChanged, ApiError.

@@ -1,5 +1,7 @@
 """What the operator can do to a cluster: data, carried out by `apply`."""
 
+from typing import ClassVar
+
 import msgspec
 
 from rosproxy_operator.kubernetes.resources.model import Json, Name, Reference
@@ -18,22 +20,36 @@ class ObjectAction(ClusterAction, frozen=True):
     uid: str
 
 
-class CreateService(ClusterAction, frozen=True):
-    """Create the Service of a RosProxy. ``body`` is the whole object."""
+class Creation(ClusterAction, frozen=True):
+    """Create an object. ``body`` is the whole object."""
 
     body: Json
 
+    @property
+    def kind(self) -> str:
+        """The kind of the object."""
+        return str(self.body["kind"])
 
-class DeleteService(ObjectAction, frozen=True):
-    """Delete a Service that is not as it ought to be."""
 
+class Deletion(ObjectAction, frozen=True):
+    """Delete an object of this ``kind`` that is not as it ought to be, or ought not to exist."""
+
+    kind: ClassVar[str] = "Pod"
     why: str
 
 
-class CreatePolicy(ClusterAction, frozen=True):
-    """Create the NetworkPolicy of a RosProxy. ``body`` is the whole object."""
+class CreateService(Creation, frozen=True):
+    """Create the Service of a RosProxy."""
 
-    body: Json
+
+class DeleteService(Deletion, frozen=True):
+    """Delete the Service of a RosProxy."""
+
+    kind = "Service"
+
+
+class CreatePolicy(Creation, frozen=True):
+    """Create the NetworkPolicy of a RosProxy."""
 
 
 class SetPolicy(ObjectAction, frozen=True):
@@ -42,43 +58,35 @@ class SetPolicy(ObjectAction, frozen=True):
     spec: Json
 
 
-class DeletePolicy(ObjectAction, frozen=True):
-    """Delete a NetworkPolicy that ought not to exist."""
+class DeletePolicy(Deletion, frozen=True):
+    """Delete the NetworkPolicy of a RosProxy."""
 
-    why: str
-
-
-class CreateProxy(ClusterAction, frozen=True):
-    """Create a proxy's pod. ``body`` is the whole object."""
-
-    body: Json
+    kind = "NetworkPolicy"
 
 
-class DeleteProxy(ObjectAction, frozen=True):
+class CreateProxy(Creation, frozen=True):
+    """Create a proxy's pod."""
+
+
+class DeleteProxy(Deletion, frozen=True):
     """Delete a proxy's pod.
 
     With ``retire`` its nodes are unregistered at the master first: no proxy takes over.
     """
 
-    why: str
     retire: bool = False
 
 
-class CreateHelper(ClusterAction, frozen=True):
-    """Create a pod beside a proxy: its LAN relay, or an image check.
-
-    ``component`` says which (`names`), ``body`` is the whole object.
-    """
+class CreateHelper(Creation, frozen=True):
+    """Create a pod beside a proxy: its LAN relay or an image check, by ``component`` (`names`)."""
 
     component: str
-    body: Json
 
 
-class DeleteHelper(ObjectAction, frozen=True):
+class DeleteHelper(Deletion, frozen=True):
     """Delete a pod beside a proxy."""
 
     component: str
-    why: str
 
 
 class EvictPod(ObjectAction, frozen=True):
@@ -112,18 +120,4 @@ class Emit(ClusterAction, frozen=True):
     message: str
 
 
-Action = (
-    CreateService
-    | DeleteService
-    | CreatePolicy
-    | SetPolicy
-    | DeletePolicy
-    | CreateProxy
-    | DeleteProxy
-    | CreateHelper
-    | DeleteHelper
-    | EvictPod
-    | SetImage
-    | PatchStatus
-    | Emit
-)
+Action = Creation | Deletion | EvictPod | SetPolicy | SetImage | PatchStatus | Emit

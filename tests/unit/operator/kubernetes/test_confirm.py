@@ -112,7 +112,7 @@ async def test_what_is_not_so_any_more(
     happen(server)
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, DELETE, seen)
-    lan_relay = DeleteHelper(OF, DELETE.id, DELETE.uid, LAN_RELAY, "no longer needed")
+    lan_relay = DeleteHelper(OF, DELETE.id, DELETE.uid, "no longer needed", LAN_RELAY)
     with pytest.raises(StateChanged):
         await in_thread(confirm, api, lan_relay, seen)
 

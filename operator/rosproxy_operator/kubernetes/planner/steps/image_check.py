@@ -89,7 +89,7 @@ def check_image(context: ClusterContext, site: ProxySite) -> Iterator[Action]:
     # One with another image has to go first: `remove_image_checks`.
     is_there = any(c.node == site.node.name for c in _checks(context, site.rosproxy))
     if not is_there and context.retries.is_due(Task(of, "create", id)):
-        yield CreateHelper(of, IMAGE_CHECK, image_check_pod(site, context.settings))
+        yield CreateHelper(of, image_check_pod(site, context.settings), IMAGE_CHECK)
 
 
 def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
@@ -100,7 +100,7 @@ def remove_image_checks(context: ClusterContext, rosproxy: RosProxy) -> Iterator
             continue
         if context.retries.is_due(task):
             why = "the proxy has the image, or needs another image"
-            yield DeleteHelper(check.of, check.pod.id, check.pod.uid, IMAGE_CHECK, why)
+            yield DeleteHelper(check.of, check.pod.id, check.pod.uid, why, IMAGE_CHECK)
 
 
 def _is_needed(context: ClusterContext, rosproxy: RosProxy, check: HelperPod) -> bool:

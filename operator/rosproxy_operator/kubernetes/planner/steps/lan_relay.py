@@ -133,7 +133,7 @@ def _ensure_lan_relay(
         context, outdated, "replaced, since the proxy or the settings have changed"
     )
     if not lan_relays and context.retries.is_due(Task(place.of, "create", id)):
-        yield CreateHelper(place.of, LAN_RELAY, body)
+        yield CreateHelper(place.of, body, LAN_RELAY)
 
 
 def _delete_lan_relays(
@@ -142,4 +142,4 @@ def _delete_lan_relays(
     for lan_relay in lan_relays:
         task = Task(lan_relay.of, "delete", lan_relay.pod.id, lan_relay.pod.uid)
         if not lan_relay.pod.deleting and context.retries.is_due(task):
-            yield DeleteHelper(lan_relay.of, lan_relay.pod.id, lan_relay.pod.uid, LAN_RELAY, why)
+            yield DeleteHelper(lan_relay.of, lan_relay.pod.id, lan_relay.pod.uid, why, LAN_RELAY)
