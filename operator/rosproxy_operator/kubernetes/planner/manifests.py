@@ -199,13 +199,6 @@ def keeps_registrations(old: str, new: str) -> bool:
     return old.partition("-")[2] in ("", new.partition("-")[2])
 
 
-def fingerprinted(body: Json) -> Json:
-    """An object with its fingerprint written on it."""
-    meta = body["metadata"]
-    annotations = {**meta["annotations"], FINGERPRINT: digest(body)}
-    return {**body, "metadata": {**meta, "annotations": annotations}}
-
-
 def fingerprint_of(body: Json) -> str:
     """The fingerprint that is written on an object."""
     return str(body["metadata"]["annotations"][FINGERPRINT])
@@ -248,6 +241,37 @@ def pod_metadata(
     defaults = settings.pod
     meta = metadata(rosproxy, id, {**defaults.annotations, **annotations}, component)
     return {**meta, "labels": {**defaults.labels, **meta["labels"]}}
+
+
+def helper_pod(
+    site: ProxySite, id: Name, settings: ClusterSettings, container: Json, spec: Json
+) -> Json:
+    """A pod beside a proxy, with these fields of its container and its spec, and without rights.
+
+    The container has the name of the component.
+    """
+    policy = site.rosproxy.spec.image_pull_policy or settings.image_pull_policy
+    own_container = {
+        **container,
+        **({"imagePullPolicy": policy} if policy else {}),
+        "terminationMessagePolicy": "FallbackToLogsOnError",
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+    }
+    meta = pod_metadata(site.rosproxy, id, {NODE: site.node.name}, settings, container["name"])
+    own_spec = {
+        **bound_to(site.node.name, site.rosproxy.spec, settings),
+        "terminationGracePeriodSeconds": 1,
+        "securityContext": pod_security_context(settings),
+        "containers": [own_container],
+        **spec,
+    }
+    body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": own_spec}
+    meta["annotations"][FINGERPRINT] = digest(body)
+    return body
 
 
 def _spec(site: ProxySite, settings: ClusterSettings) -> dict[str, Any]:

@@ -8,23 +8,19 @@ image only after that pod has succeeded.
 
 from collections.abc import Iterator
 from enum import Enum
-from typing import Any
 
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, DeleteHelper
 from rosproxy_operator.kubernetes.planner.manifests import (
     ProxySite,
-    bound_to,
     fingerprint_of,
-    fingerprinted,
+    helper_pod,
     image_of,
-    pod_metadata,
-    pod_security_context,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
 from rosproxy_operator.kubernetes.resources.cluster import HelperPod, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import Json, ProxyPlace, RosProxy
-from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, NODE, image_check_id
+from rosproxy_operator.kubernetes.resources.names import IMAGE_CHECK, image_check_id
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 _COMMAND = ("rosproxy", "--version")
@@ -42,32 +38,14 @@ class ImageState(Enum):
 
 def image_check_pod(site: ProxySite, settings: ClusterSettings) -> Json:
     """The pod that tries the image of a proxy."""
-    rosproxy = site.rosproxy
-    annotations = {NODE: site.node.name}
-    id = image_check_id(rosproxy.id, site.node.name)
-    meta = pod_metadata(rosproxy, id, annotations, settings, IMAGE_CHECK)
-    policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
-    container: dict[str, Any] = {
+    container = {
         "name": IMAGE_CHECK,
-        "image": image_of(rosproxy, settings),
-        **({"imagePullPolicy": policy} if policy else {}),
+        "image": image_of(site.rosproxy, settings),
         "command": [*_COMMAND],
-        "resources": dict(_RESOURCES),
-        "terminationMessagePolicy": "FallbackToLogsOnError",
-        "securityContext": {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        },
+        "resources": _RESOURCES,
     }
-    spec = {
-        **bound_to(site.node.name, rosproxy.spec, settings),
-        "restartPolicy": "Never",
-        "terminationGracePeriodSeconds": 1,
-        "securityContext": pod_security_context(settings),
-        "containers": [container],
-    }
-    return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
+    id = image_check_id(site.rosproxy.id, site.node.name)
+    return helper_pod(site, id, settings, container, {"restartPolicy": "Never"})
 
 
 def image_state(context: ClusterContext, proxy: ProxyPod, site: ProxySite) -> ImageState:

@@ -7,7 +7,6 @@ network.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.ros2 import LAN_RELAY_COMMAND, lan_relay_variables
@@ -15,18 +14,15 @@ from rosproxy_operator.kubernetes.planner.actions import Action, CreateHelper, D
 from rosproxy_operator.kubernetes.planner.cluster_view import group_by_key
 from rosproxy_operator.kubernetes.planner.manifests import (
     ProxySite,
-    bound_to,
     fingerprint_of,
-    fingerprinted,
-    pod_metadata,
-    pod_security_context,
+    helper_pod,
     proxy_fingerprint,
 )
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.steps.context import ClusterContext, site_of
 from rosproxy_operator.kubernetes.resources.cluster import HelperPod, ProxyPod
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, ProxyPlace, RosProxy
-from rosproxy_operator.kubernetes.resources.names import LAN_RELAY, NODE, lan_relay_id
+from rosproxy_operator.kubernetes.resources.names import LAN_RELAY, lan_relay_id
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.findings import finding
 
@@ -41,39 +37,21 @@ def lan_relay_pod(
 
     The relay has the image that the proxy has, which may not be the next one yet.
     """
-    rosproxy = site.rosproxy
     ros2 = site.rosproxy.spec.ros2
-    annotations = {NODE: site.node.name}
-    id = lan_relay_id(rosproxy.id, site.node.name)
-    meta = pod_metadata(rosproxy, id, annotations, settings, LAN_RELAY)
     target = HostPort(proxy.pod.ip, site.ports.first)
     number = ros2.number if ros2 else 0
     variables = lan_relay_variables(number, lan_relay.host, lan_relay, target, site.relay_secret)
-    policy = rosproxy.spec.image_pull_policy or settings.image_pull_policy
-    container: dict[str, Any] = {
+    container = {
         "name": LAN_RELAY,
         "image": proxy.image,
-        **({"imagePullPolicy": policy} if policy else {}),
         "command": [*LAN_RELAY_COMMAND],
         "env": [{"name": name, "value": value} for name, value in variables.items()],
         # The scheduler counts it; that of a pod in its node's network is a port of the node.
         "ports": [{"containerPort": lan_relay.port, "hostPort": lan_relay.port, "protocol": "UDP"}],
-        "resources": dict(_RESOURCES),
-        "terminationMessagePolicy": "FallbackToLogsOnError",
-        "securityContext": {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        },
+        "resources": _RESOURCES,
     }
-    spec = {
-        **bound_to(site.node.name, rosproxy.spec, settings),
-        "hostNetwork": True,
-        "terminationGracePeriodSeconds": 1,
-        "securityContext": pod_security_context(settings),
-        "containers": [container],
-    }
-    return fingerprinted({"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec})
+    id = lan_relay_id(site.rosproxy.id, site.node.name)
+    return helper_pod(site, id, settings, container, {"hostNetwork": True})
 
 
 def reconcile_lan_relays(context: ClusterContext, rosproxy: RosProxy) -> Iterator[Action]:
