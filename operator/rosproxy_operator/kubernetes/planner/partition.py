@@ -7,7 +7,7 @@ that part, and `merge_state` puts the part's new state into the state of the who
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -101,6 +101,22 @@ def _within(helpers: tuple[HelperPod, ...], namespaces: frozenset[str]) -> tuple
     return tuple(helper for helper in helpers if helper.of.namespace in namespaces)
 
 
+_BY_ROSPROXY = (
+    *("absent", "served", "given", "refused", "moved", "tried", "former"),
+    *("attempts", "reported"),
+)
+_NAMESPACES: Mapping[str, Callable[[Any], str]] = {
+    **dict.fromkeys(_BY_ROSPROXY, lambda key: key.of.namespace),
+    "unselected": lambda pod: pod.namespace,
+}
+"""By field of the state: the namespace of a key."""
+_NODES: Mapping[str, Callable[[Any], str]] = {
+    **dict.fromkeys(("lost", "addresses"), str),
+    **dict.fromkeys(("taken", "strange"), lambda key: key[0]),
+}
+"""By field of the state: the node of a key."""
+
+
 def partition_state(state: ClusterState, partition: Partition) -> ClusterState:
     """The state of a part alone."""
     return _filtered(state, partition, True)
@@ -109,46 +125,16 @@ def partition_state(state: ClusterState, partition: Partition) -> ClusterState:
 def merge_state(state: ClusterState, partition: Partition, new: ClusterState) -> ClusterState:
     """The state of the whole cluster, with the new state of a part."""
     outside = _filtered(state, partition, False)
-    merged = {
-        name: {**getattr(outside, name), **getattr(new, name)}
-        for name in (
-            *_BY_PLACE,
-            *_BY_NODE,
-            "attempts",
-            "reported",
-            "taken",
-            "strange",
-            "unselected",
-        )
-    }
+    names = (*_NAMESPACES, *_NODES)
+    merged = {name: {**getattr(outside, name), **getattr(new, name)} for name in names}
     return replace(new, **merged)
-
-
-_BY_PLACE = ("absent", "served", "given", "refused", "moved", "tried", "former")
-_BY_NODE = ("lost", "addresses")
 
 
 def _filtered(state: ClusterState, partition: Partition, inside: bool) -> ClusterState:
     """The state of what is inside a part, or of all outside it."""
-    namespaces = partition.namespaces
-    nodes = partition.nodes
-    fields: dict[str, Mapping[Any, Any]] = {
-        "attempts": {
-            t: a for t, a in state.attempts.items() if (t.of.namespace in namespaces) == inside
-        },
-        "reported": {
-            f: at for f, at in state.reported.items() if (f.of.namespace in namespaces) == inside
-        },
-        "unselected": {
-            id: at for id, at in state.unselected.items() if (id.namespace in namespaces) == inside
-        },
-        "taken": {key: at for key, at in state.taken.items() if (key[0] in nodes) == inside},
-        "strange": {key: at for key, at in state.strange.items() if (key[0] in nodes) == inside},
-    }
-    for name in _BY_PLACE:
-        places = getattr(state, name)
-        fields[name] = {p: v for p, v in places.items() if (p.of.namespace in namespaces) == inside}
-    for name in _BY_NODE:
-        table = getattr(state, name)
-        fields[name] = {node: v for node, v in table.items() if (node in nodes) == inside}
+    fields: dict[str, Mapping[Any, Any]] = {}
+    for owners, part in ((_NAMESPACES, partition.namespaces), (_NODES, partition.nodes)):
+        for name, owner in owners.items():
+            entries = getattr(state, name).items()
+            fields[name] = {key: v for key, v in entries if (owner(key) in part) == inside}
     return replace(state, **fields)
