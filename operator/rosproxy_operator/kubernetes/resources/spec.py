@@ -15,7 +15,9 @@ from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
+from rosproxy.settings import LEAST_PER_DOMAIN
 from rosproxy_operator.common.policy import too_much
+from rosproxy_operator.common.ros2 import LAST_DOMAIN, LEAST_PORTS, MOST_PEERS, read_peer_name
 from rosproxy_operator.kubernetes.resources.checks import (
     int_at,
     is_label,
@@ -38,18 +40,20 @@ from rosproxy_operator.kubernetes.resources.model import (
     MaxUnavailable,
     Name,
     PodEgress,
+    Ros2Spec,
     RosProxy,
     RosProxySpec,
     Selector,
 )
 from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, service_id
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
-from rosproxy_operator.kubernetes.resources.ros2_spec import check_ports, ros2_spec, versions
 from rosproxy_operator.proxy_spec.spec import OWN_SPEC, WISHES, ProxySpec, words
 
 MOST_PORTS = 500
 MOST_NAME = 46
 """Characters of a RosProxy's name, so that a proxy's still fits into a pod's host name."""
+_OF_ROS = {"1": ("master", WISHES["udp"].field), "2": ("domain", "peers", "multicast")}
+"""The fields that only one version of ROS has."""
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
 RULE_KINDS = {
@@ -125,12 +129,17 @@ def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
 
 def _spec(field: Field, of: Name) -> RosProxySpec:
     ports = field["ports"].number(32, 1, MOST_PORTS)
-    for_ros = versions(field["ros"])
-    for name in ("master", "udp"):
-        if "1" not in for_ros and field[name].value not in (None, False):
-            raise field[name].error("is for ROS 1, but spec.ros is 2", "Remove the field")
-    ros2 = ros2_spec(field, "2" in for_ros)
-    check_ports(field["ports"], ports, ros2)
+    for_ros = _versions(field["ros"])
+    for ros, names in _OF_ROS.items():
+        for name in names if ros not in for_ros else ():
+            if field[name].value not in (None, [], False):
+                fix = "Remove the field" + (", or set spec.ros: 2" if ros == "2" else "")
+                raise field[name].error(f"is for ROS {ros}, but spec.ros is {for_ros[0]}", fix)
+    ros2 = _ros2_spec(field) if "2" in for_ros else None
+    least = LEAST_PORTS if ros2 and ros2.multicast else LEAST_PER_DOMAIN
+    if ros2 and ports < least:
+        fix = f"Write at least {least}: each participant takes three ports"
+        raise field["ports"].error("is too low for ROS 2", fix)
     return RosProxySpec(
         ros1="1" in for_ros,
         ros2=ros2,
@@ -153,6 +162,35 @@ def _spec(field: Field, of: Name) -> RosProxySpec:
         resources=_given(field["resources"], Field.map),
         host_aliases=tuple(_host_alias(alias) for alias in field["hostAliases"].items()),
     )
+
+
+def _versions(field: Field) -> tuple[str, ...]:
+    """The versions of ROS: 1 (as without the field), 2, or "1,2"."""
+    value = "1" if field.value is None else field.value
+    text = str(value).replace(" ", "") if type(value) in (int, str) else ""
+    if text not in ("1", "2", "1,2"):
+        raise field.error("is unknown", "Write 1, 2 or '1,2'")
+    return tuple(text.split(","))
+
+
+def _ros2_spec(field: Field) -> Ros2Spec:
+    domain = field["domain"]
+    peers = field["peers"].items()
+    if len(peers) > MOST_PEERS:
+        raise field["peers"].error("has too many hosts", f"Name at most {MOST_PEERS} hosts")
+    return Ros2Spec(
+        domain=None if domain.value is None else domain.number(0, 0, LAST_DOMAIN),
+        peers=tuple(sorted({_peer(peer) for peer in peers})),
+        multicast=field["multicast"].boolean(),
+    )
+
+
+def _peer(field: Field) -> str:
+    try:
+        return read_peer_name(field.text())
+    except ValueError:
+        fix = "Write the robot's name or address, or HOST:PORT of another proxy"
+        raise field.error("is not a peer", fix) from None
 
 
 def _given(field: Field, read: Callable[[Field], _Value]) -> _Value | None:
