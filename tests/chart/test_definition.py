@@ -160,7 +160,7 @@ def test_status_is_in_the_definition() -> None:
     own = rosproxy(body)
     id = Name("b", "rosproxy-a-n-012345")
     ports = PortRange(11400, 11431)
-    proxy = ProxyPod(Pod(id, "u"), own.id, "c", "n", ports, "f", "rosproxy:1", ready=True)
+    proxy = ProxyPod(Pod(id, "u"), own.id, "c", "n", "f", "rosproxy:1", range=ports, ready=True)
     pod = Pod(Name("b", "talker"), "v", node="n", ip="192.0.2.3")
     answer = ProxyReport(
         True,

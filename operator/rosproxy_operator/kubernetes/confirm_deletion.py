@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, own_pods
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Json, Name, Pod, RosProxy
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.records import pod_record, rosproxy_record
@@ -38,8 +38,7 @@ def confirm(api: Api, action: Deletion | EvictPod, observed: ClusterSnapshot) ->
         _check_pod(api, action, observed)
     if is_gone or not isinstance(action, DeleteProxy | DeleteHelper):
         return ""
-    own = own_pods(observed.proxies, observed.lan_relays, observed.image_checks)
-    target = next((p for p in own if p.pod.uid == action.uid), None)
+    target = next((p for p in observed.own_pods if p.pod.uid == action.uid), None)
     if target is None:
         raise StateChanged(f"pod {action.id}")
     _check_node(api, target.node, observed)

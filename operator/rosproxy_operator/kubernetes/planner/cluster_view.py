@@ -16,7 +16,6 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     PodFailure,
     ProxyPod,
-    own_pods,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -83,8 +82,7 @@ def view(observed: ClusterSnapshot) -> View:
     proxies = group_by_key((place_of(p), p) for p in observed.proxies if _owned(p, rosproxies))
     unusable = {r.uid for r in observed.unusable.values()}
     orphans = (p for p in observed.proxies if not _owned(p, rosproxies))
-    own = own_pods(observed.proxies, observed.lan_relays, observed.image_checks)
-    own_uids = {own_pod.pod.uid for own_pod in own}
+    own_uids = {own_pod.pod.uid for own_pod in observed.own_pods}
     other_pods = {pod.uid: pod for pod in observed.pods if pod.uid not in own_uids}.values()
     taken, findings = _taken(observed, rosproxies)
     wanted, left_out = _wanted(observed, rosproxies, taken)

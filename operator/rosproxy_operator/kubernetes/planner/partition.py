@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, HelperPod, own_pods
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, HelperPod
 
 
 class Partition(msgspec.Struct, frozen=True):
@@ -69,7 +69,7 @@ def _uses(observed: ClusterSnapshot) -> Iterator[tuple[str, str]]:
     for pod in observed.pods:
         if pod.uid in observed.selected:
             yield pod.id.namespace, pod.node
-    for own_pod in own_pods(observed.proxies, observed.lan_relays, observed.image_checks):
+    for own_pod in observed.own_pods:
         yield own_pod.of.namespace, own_pod.node
         yield own_pod.of.namespace, own_pod.pod.node
     for rosproxy in observed.rosproxies:

@@ -1,8 +1,7 @@
 """The operator's own objects, what proxies say, and the cluster as a whole at one moment."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from enum import Enum
-from itertools import chain
 
 import msgspec
 
@@ -29,55 +28,44 @@ class PodFailure(Enum):
     SANDBOX = "sandbox"  # the kubelet can't set it up
 
 
-class ProxyPod(msgspec.Struct, frozen=True):
-    """A pod of the operator in which a proxy runs, or is to run.
+class OwnPod(msgspec.Struct, frozen=True):
+    """A pod of the operator.
 
     ``of`` and ``owner`` are the name and uid of its RosProxy, ``node`` where it is meant to run
     (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
     say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
-    condition Ready. ``restarts`` counts those of its container. ``token`` is that of its admin
-    endpoint where it stands in the pod, as former operators wrote it. ``runs``: its container was
-    started, and was not seen to end.
+    condition Ready.
     """
 
     pod: Pod
     of: Name
     owner: str
     node: str
-    range: PortRange
     fingerprint: str
     image: str
-    token: str = ""
     ready: bool = False
     stuck: PodFailure | None = None
     message: str = ""
+
+
+class ProxyPod(OwnPod, frozen=True, kw_only=True):
+    """A pod in which a proxy runs, or is to run.
+
+    ``restarts`` counts those of its container. ``token`` is that of its admin endpoint where it
+    stands in the pod, as former operators wrote it. ``runs``: its container was started, and was
+    not seen to end.
+    """
+
+    range: PortRange
+    token: str = ""
     restarts: int = 0
     runs: bool = False
 
 
-class HelperPod(msgspec.Struct, frozen=True):
-    """A pod of the operator beside a proxy: its LAN relay, or the check of its next image.
-
-    ``component`` is LAN_RELAY or IMAGE_CHECK (`names`). All other fields are those of `ProxyPod`.
-    """
+class HelperPod(OwnPod, frozen=True, kw_only=True):
+    """A pod beside a proxy: LAN_RELAY or IMAGE_CHECK, by its ``component`` (`names`)."""
 
     component: str
-    pod: Pod
-    of: Name
-    owner: str
-    node: str
-    fingerprint: str
-    image: str
-    ready: bool = False
-    stuck: PodFailure | None = None
-    message: str = ""
-
-
-def own_pods(
-    proxies: Iterable[ProxyPod], *helpers: Iterable[HelperPod]
-) -> tuple[ProxyPod | HelperPod, ...]:
-    """The operator's pods of all kinds."""
-    return (*proxies, *chain.from_iterable(helpers))
 
 
 class ProxyService(msgspec.Struct, frozen=True):
@@ -224,3 +212,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     unusable: Mapping[Name, InvalidRosProxy] = {}
     failures: Mapping[Name, Mapping[Name, str]] = {}
     webhook: WebhookState = WebhookState()
+
+    @property
+    def own_pods(self) -> tuple[OwnPod, ...]:
+        """The operator's pods of all kinds."""
+        return (*self.proxies, *self.lan_relays, *self.image_checks)

@@ -6,6 +6,7 @@ is missing is as if it were empty.
 
 from collections.abc import Iterator
 from itertools import islice
+from typing import Any
 
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources import names
@@ -114,63 +115,55 @@ def pod(obj: Json) -> Pod:
 
 def proxy_pod(obj: Json) -> ProxyPod | None:
     """A proxy's pod; None if the object is not one that this operator made, or not whole."""
-    meta = submap(obj, "metadata")
-    status = submap(obj, "status")
-    labels = texts_at(meta, "labels")
-    notes = texts_at(meta, "annotations")
     containers = submaps(submap(obj, "spec"), "containers")
     container = next((c for c in containers if c.get("name") == names.CONTAINER), None)
-    ports = port_range(notes, names.PORT_RANGE)
-    on = notes.get(names.NODE, "")
-    owner = _owner(meta)
-    if names.component(labels) != names.PROXY:
+    ports = port_range(texts_at(obj, "metadata", "annotations"), names.PORT_RANGE)
+    if container is None or ports is None or _component(obj) != names.PROXY:
         return None
-    if ports is None or not (on and owner and container):
-        return None
-    reason, message = pod_failure(status)
     variables = {text_at(v, "name"): text_at(v, "value") for v in submaps(container, "env")}
+    statuses = submaps(submap(obj, "status"), "containerStatuses")
     return ProxyPod(
-        pod=pod(obj),
-        of=Name(text_at(meta, "namespace"), labels[names.PROXY_OF]),
-        owner=owner,
-        node=on,
+        **_own_pod(obj, container),
         range=ports,
-        fingerprint=notes.get(names.FINGERPRINT, ""),
-        image=text_at(container, "image"),
         token=variables.get(names.TOKEN_VARIABLE, ""),
-        ready=_is_ready(status),
-        stuck=reason,
-        message=message,
-        restarts=sum(int_at(c, "restartCount") for c in submaps(status, "containerStatuses")),
-        runs=any(submap(c, "state").get("running") for c in submaps(status, "containerStatuses")),
+        restarts=sum(int_at(c, "restartCount") for c in statuses),
+        runs=any(submap(c, "state").get("running") for c in statuses),
     )
 
 
 def helper_pod(obj: Json) -> HelperPod | None:
     """A pod beside a proxy; None if the object is not one that this operator made, or not whole."""
+    container = next(iter(submaps(submap(obj, "spec"), "containers")), {})
+    component = _component(obj)
+    if component in ("", names.PROXY):
+        return None
+    return HelperPod(**_own_pod(obj, container), component=component)
+
+
+def _component(obj: Json) -> str:
+    """What a pod of the operator is (`names`); empty if it is not the operator's, or not whole."""
+    meta = submap(obj, "metadata")
+    is_whole = texts_at(meta, "annotations").get(names.NODE) and _owner(meta)
+    return names.component(texts_at(meta, "labels")) if is_whole else ""
+
+
+def _own_pod(obj: Json, container: Json) -> dict[str, Any]:
+    """The fields of `OwnPod`, for a pod of the operator with this container."""
     meta = submap(obj, "metadata")
     status = submap(obj, "status")
-    labels = texts_at(meta, "labels")
     notes = texts_at(meta, "annotations")
-    container = next(iter(submaps(submap(obj, "spec"), "containers")), {})
-    on = notes.get(names.NODE, "")
-    owner = _owner(meta)
-    component = names.component(labels)
-    if component in ("", names.PROXY) or not (on and owner):
-        return None
     reason, message = pod_failure(status)
-    return HelperPod(
-        component=component,
-        pod=pod(obj),
-        of=Name(text_at(meta, "namespace"), labels[names.PROXY_OF]),
-        owner=owner,
-        node=on,
-        fingerprint=notes.get(names.FINGERPRINT, ""),
-        image=text_at(container, "image"),
-        ready=_is_ready(status),
-        stuck=reason,
-        message=message,
-    )
+    return {
+        "pod": pod(obj),
+        "of": Name(text_at(meta, "namespace"), texts_at(meta, "labels")[names.PROXY_OF]),
+        "owner": _owner(meta),
+        "node": notes[names.NODE],
+        "fingerprint": notes.get(names.FINGERPRINT, ""),
+        "image": text_at(container, "image"),
+        "ready": _is_ready(status),
+        "stuck": reason,
+        "message": message,
+    }
 
 
 def service(obj: Json) -> ProxyService | None:

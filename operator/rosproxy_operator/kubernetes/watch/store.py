@@ -30,7 +30,6 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ProxyPod,
     ProxyPolicy,
     ProxyService,
-    own_pods,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
@@ -184,7 +183,7 @@ class ClusterStore:
         namespaces |= {id.namespace for id in snapshot.unusable}
         candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
         selected = [p for p in candidates if self._is_selected(p)]
-        own = own_pods(proxies, helpers)
+        own = (*proxies, *helpers)
         nodes = {p.node for p in selected} | {node for p in own for node in (p.node, p.pod.node)}
         pods = {p.uid: p for p in candidates if p.node in nodes}
         pods |= {pod.uid: pod for pod in selected}

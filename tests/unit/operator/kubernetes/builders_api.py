@@ -137,7 +137,7 @@ def proxy(node: str = "node1", ready: bool = True, **more: Any) -> ProxyPod:
     name = proxy_id(Name(NAMESPACE, "arm"), node).name
     own = pod(name, own_labels("arm"), node=node, ip="10.244.1.9", **more.pop("pod", {}))
     of = Name(NAMESPACE, "arm")
-    return ProxyPod(own, of, "uid-arm", node, RANGE, "f", "rosproxy:1", ready=ready, **more)
+    return ProxyPod(own, of, "uid-arm", node, "f", "rosproxy:1", range=RANGE, ready=ready, **more)
 
 
 def stuck_proxy(why: PodFailure, message: str = "because") -> ProxyPod:
