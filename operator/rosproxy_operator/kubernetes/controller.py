@@ -254,9 +254,7 @@ class KubernetesController:
     async def _carry_out(
         self, planned: ClusterPlan, observed: ClusterSnapshot, scope: Partition | None
     ) -> None:
-        self._proxy_sync.report_policies(planned.policies)
-        self._proxy_sync.report_callers(planned.callers, planned.peers, planned.former_ports)
-        self._proxy_sync.report_gone(planned.departed_addresses)
+        self._proxy_sync.brief(planned.briefings)
         await self._applier.carry_out(planned.actions, observed)
         concerned = {action.of.namespace for action in planned.actions}
         if self._applier.failures != observed.failures:

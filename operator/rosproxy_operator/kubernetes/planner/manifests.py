@@ -6,12 +6,12 @@ from typing import Any
 
 import msgspec
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.policy import AWAITED, as_variable
 from rosproxy_operator.common.port_negotiation import overlap
 from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
-from rosproxy_operator.kubernetes.planner.access.policies import policy_of
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
@@ -115,6 +115,11 @@ def lan_address(node: ClusterNode, advertise_host: str) -> str:
 def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
     """The image of a RosProxy's proxies."""
     return rosproxy.spec.image or settings.image
+
+
+def policy_of(rosproxy: RosProxy, settings: ClusterSettings) -> tuple[PolicyLayer, ...]:
+    """The layers of a RosProxy's proxies; each further layer can only narrow."""
+    return (*settings.policy, *rosproxy.spec.policy)
 
 
 def proxy_pod(site: ProxySite, settings: ClusterSettings) -> Json:

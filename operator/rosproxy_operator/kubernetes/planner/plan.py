@@ -4,7 +4,7 @@
 that ask for too much. `view` puts in order what is seen: which proxies are wanted where.
 `state.learn` draws conclusions from it, `allocation.allocate` gives each wanted proxy its ports,
 `reconcile` and `network_policy` say what is to be done to Services, proxies and NetworkPolicies,
-`status` and `events` what users are told, `departures`, `callers` and `policies` what proxies are.
+`status` and `events` what users are told, `briefing` and `departures` what proxies are.
 """
 
 import json
@@ -13,14 +13,11 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer
-from rosproxy_operator.common.proxy_status import Leases
 from rosproxy_operator.kubernetes.planner import departures
-from rosproxy_operator.kubernetes.planner.access.allowed_callers import callers
-from rosproxy_operator.kubernetes.planner.access.bounds import within_bounds
-from rosproxy_operator.kubernetes.planner.access.policies import policies
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
+from rosproxy_operator.kubernetes.planner.bounds import within_bounds
+from rosproxy_operator.kubernetes.planner.briefing import Briefing, briefings
 from rosproxy_operator.kubernetes.planner.cluster_view import View, view
 from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
 from rosproxy_operator.kubernetes.planner.misspellings import (
@@ -86,21 +83,15 @@ _STEPS = (
 class ClusterPlan(msgspec.Struct, frozen=True):
     """What to do, in this order, and what to remember.
 
-    One action that fails keeps none of the others from being done. ``departed_addresses`` are, by
-    the uid of a proxy's pod, the addresses of pods that are no more, ``callers`` those of pods that
-    may use the proxy, ``policies`` the layers of its policy, ``peers`` its peers of ROS 2,
-    ``former_ports`` the ports of participants at the proxy before it: it is to be told.
-    ``next_look_in`` is in how many seconds to look again even if nothing happens; None: no need.
+    One action that fails keeps none of the others from being done. ``briefings`` are what proxies
+    are told, by the uid of their pods. ``next_look_in`` is in how many seconds to look again even
+    if nothing happens; None: no need.
     """
 
     actions: tuple[Action, ...] = ()
     problems: tuple[ClusterFinding, ...] = ()
     state: ClusterState = ClusterState()
-    departed_addresses: Mapping[str, tuple[str, ...]] = {}
-    callers: Mapping[str, tuple[str, ...]] = {}
-    policies: Mapping[str, tuple[PolicyLayer, ...]] = {}
-    peers: Mapping[str, tuple[str, ...]] = {}
-    former_ports: Mapping[str, Leases] = {}
+    briefings: Mapping[str, Briefing] = {}
     next_look_in: float | None = None
 
 
@@ -145,11 +136,13 @@ def plan(
         actions=(*actions, *warnings.emits),
         problems=unique,
         state=replace(departed.state, attempts=retries.noted, reported=warnings.reported),
-        departed_addresses=departed.addresses,
-        callers=callers(full_snapshot),  # also for RosProxies that ask for too much: they go on
-        policies=policies(full_snapshot, settings),
-        peers=peers(context),
-        former_ports=former_ports(cluster_view, decided.former),
+        briefings=briefings(
+            full_snapshot,
+            settings,
+            peers(context),
+            former_ports(cluster_view, decided.former),
+            departed.addresses,
+        ),
         next_look_in=min(_waits(context, departed), default=None),
     )
 

@@ -23,7 +23,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_session import AllowedCallers, ProxySession
-from rosproxy_operator.common.proxy_status import Leases
+from rosproxy_operator.kubernetes.planner.briefing import Briefing
 from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer, report, short, unreadable
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
@@ -100,22 +100,14 @@ class ProxyPoller:
         self._instance = ""
         self._since = time.monotonic()
 
-    def report_gone(self, gone: Iterable[str]) -> None:
-        """Have the proxy told that the pods with these addresses are gone."""
-        self._gone |= set(gone)
-        if self._gone:
-            self._pending.set()
-
-    def report_policy(self, policy: tuple[PolicyLayer, ...]) -> None:
-        """Have the proxy told all layers of its policy."""
-        self._policy = policy
-        if not self.session.has_policy(policy):
-            self._pending.set()
-
-    def report_callers(self, callers: AllowedCallers) -> None:
-        """Have the proxy told which pods may use it as their master."""
-        self._callers = callers
-        if not self.session.has_callers(callers):
+    def brief(self, briefing: Briefing) -> None:
+        """Have the proxy told what is new of this."""
+        self._gone |= {*briefing.gone}
+        if briefing.policy is not None:
+            self._policy = briefing.policy
+        if briefing.callers is not None:
+            self._callers = AllowedCallers(briefing.callers, briefing.peers, briefing.former_ports)
+        if self._gone or not self._is_confirmed:
             self._pending.set()
 
     def restarted(self, restarts: int) -> None:
@@ -158,12 +150,16 @@ class ProxyPoller:
     @property
     def _is_busy(self) -> bool:
         """Whether the proxy is yet to answer, or to confirm what it was sent."""
+        return bool(self._failures or self._recheck or self._gone) or not self._is_confirmed
+
+    @property
+    def _is_confirmed(self) -> bool:
+        """Whether the proxy has confirmed its policy and its callers."""
         policy = self._policy
         callers = self._callers
-        confirmed = (policy is None or self.session.has_policy(policy)) and (
+        return (policy is None or self.session.has_policy(policy)) and (
             callers is None or self.session.has_callers(callers)
         )
-        return bool(self._failures or self._recheck or self._gone) or not confirmed
 
     async def _wait_for_either(self, long_poll: asyncio.Task[None]) -> None:
         """Wait for a change, or until there is something to send."""
@@ -367,29 +363,11 @@ class ClusterProxySync:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def report_policies(self, policies: Mapping[str, tuple[PolicyLayer, ...]]) -> None:
-        """Let proxies know, by the uid of their pod, the layers of their policy."""
-        for uid, policy in policies.items():
+    def brief(self, briefings: Mapping[str, Briefing]) -> None:
+        """Have proxies told what is new, by the uid of their pods."""
+        for uid, briefing in briefings.items():
             if uid in self._pollers:
-                self._pollers[uid][0].report_policy(policy)
-
-    def report_callers(
-        self,
-        callers: Mapping[str, tuple[str, ...]],
-        peers: Mapping[str, tuple[str, ...]],
-        former: Mapping[str, Leases],
-    ) -> None:
-        """Let proxies know, by the uid of their pod, which addresses may use them, and peers."""
-        for uid, addresses in callers.items():
-            if uid in self._pollers:
-                allowed = AllowedCallers(addresses, peers.get(uid), former.get(uid, {}))
-                self._pollers[uid][0].report_callers(allowed)
-
-    def report_gone(self, gone: Mapping[str, Iterable[str]]) -> None:
-        """Let proxies know, by the uid of their pod, which addresses are no pod's any more."""
-        for uid, addresses in gone.items():
-            if uid in self._pollers:
-                self._pollers[uid][0].report_gone(addresses)
+                self._pollers[uid][0].brief(briefing)
 
 
 def _random_wait() -> float:

@@ -23,7 +23,7 @@ from rosproxy_operator.kubernetes.api.api_client import (
     ApiNotFound,
     ApiUnavailable,
 )
-from rosproxy_operator.kubernetes.planner.access.bounds import Consents, bounds_violation
+from rosproxy_operator.kubernetes.planner.bounds import Consents, bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.injection import Wiring, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.selection import select_rosproxy, why_not_selected
 from rosproxy_operator.kubernetes.resources import objects

@@ -397,8 +397,9 @@ class Controller:
         stamp = f"2026-01-01T{int(self.now) // 3600 % 24:02}:00:00Z"
         cluster_plan = plan(observed, self.settings, self.state, self.now, stamp)
         self.state = cluster_plan.state
-        for uid, addresses in cluster_plan.departed_addresses.items():
-            self.cluster.ros[uid] -= set(addresses)
+        for uid, briefing in cluster_plan.briefings.items():
+            if briefing.gone:
+                self.cluster.ros[uid] -= set(briefing.gone)
         return cluster_plan
 
     def carry_out(self, cluster_plan: ClusterPlan, most: int | None = None) -> None:

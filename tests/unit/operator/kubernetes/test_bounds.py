@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.access.bounds import (
+from rosproxy_operator.kubernetes.planner.bounds import (
     bounds_violation,
     is_allowed_master,
     within_bounds,
@@ -185,7 +185,7 @@ def test_what_it_had_stays_as_it_is() -> None:
     plan = look(observed(of, service(of), pod(), proxy(of)), settings=OWN)
     assert done(plan) == []
     assert status(plan)["perNode"] == of.status["perNode"]
-    assert plan.callers == {"uid-proxy-robot-one": (pod().ip,)}
+    assert plan.briefings["uid-proxy-robot-one"].callers == (pod().ip,)
 
 
 def test_ports_of_one_that_asks_for_too_much_are_still_his() -> None:

@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rosproxy_operator.kubernetes.planner.access.allowed_callers import callers
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.model import Name, Selector
 from tests.unit.operator.kubernetes.builders_api import pod_obj
@@ -15,7 +14,7 @@ UID = "uid-proxy-robot-one"
 
 
 def who(*things: Any) -> tuple[str, ...] | None:
-    return callers(observed(*(things or (rosproxy(),)), proxy())).get(UID)
+    return look(observed(*(things or (rosproxy(),)), proxy())).briefings[UID].callers
 
 
 def test_selected_pods_on_its_node() -> None:
@@ -65,7 +64,3 @@ def test_all_addresses_of_a_pod_count() -> None:
 @pytest.mark.parametrize("of", [(), (rosproxy(uid="other"),), (rosproxy(deleting=True),)])
 def test_without_its_rosproxy_a_proxy_goes_on_with_what_it_knows(of: tuple[Any, ...]) -> None:
     assert who(*of, node(), pod()) is None
-
-
-def test_the_plan_has_them() -> None:
-    assert look(observed(rosproxy(), pod(), proxy())).callers == {UID: (pod().ip,)}

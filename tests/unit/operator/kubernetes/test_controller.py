@@ -286,7 +286,11 @@ async def test_a_proxy_is_asked_and_told(
 
     def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
         cluster_plan = real(observed, *rest)
-        return structs.replace(cluster_plan, departed_addresses={**gone})
+        briefings = {
+            uid: structs.replace(briefing, gone=gone.get(uid, ()))
+            for uid, briefing in cluster_plan.briefings.items()
+        }
+        return structs.replace(cluster_plan, briefings=briefings)
 
     monkeypatch.setattr(module, "plan", planned)
     put_all(server)

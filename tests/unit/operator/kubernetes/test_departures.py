@@ -114,9 +114,8 @@ def test_the_controller_looks_again_when_that_while_is_over() -> None:
     assert again.state.strange == {("one", TALKER): 0.0}
     later = look(seen(names=(TALKER,)), again.state, UNKNOWN_ADDRESS_GRACE - 0.5)
     assert later.next_look_in == 0.5
-    assert look(seen(names=(TALKER,)), later.state, UNKNOWN_ADDRESS_GRACE).departed_addresses == {
-        PROXY: (TALKER,)
-    }
+    last = look(seen(names=(TALKER,)), later.state, UNKNOWN_ADDRESS_GRACE)
+    assert last.briefings[PROXY].gone == (TALKER,)
 
 
 def test_what_is_outside_the_pod_network_is_left_alone() -> None:

@@ -67,9 +67,9 @@ class Together:
         for world in self.worlds:
             mine = [action for action in whole.actions if action.of.namespace == world.namespace]
             world.controller.carry_out(replace(whole, actions=tuple(mine)))
-            for uid, addresses in whole.departed_addresses.items():
+            for uid, briefing in whole.briefings.items():
                 if uid in world.cluster.ros:
-                    world.cluster.ros[uid] -= set(addresses)
+                    world.cluster.ros[uid] -= set(briefing.gone)
 
 
 def by_rosproxy(actions: tuple[Action, ...]) -> dict[Any, list[Action]]:
@@ -101,11 +101,8 @@ def check(
             assert of not in merged, "two parts have it"
             merged[of] = actions
     assert merged == by_rosproxy(whole.actions)
-    for name in ("departed_addresses", "callers", "policies", "peers", "former_ports"):
-        both = {
-            uid: told for _, part_plan in pieces for uid, told in getattr(part_plan, name).items()
-        }
-        assert both == dict(getattr(whole, name)), name
+    both = {uid: told for _, part_plan in pieces for uid, told in part_plan.briefings.items()}
+    assert both == whole.briefings
     assert {problem for _, part_plan in pieces for problem in part_plan.problems} == {
         *whole.problems
     }

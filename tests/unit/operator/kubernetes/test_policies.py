@@ -37,17 +37,17 @@ ALL = replace(SETTINGS, policy=COMMON)
 )
 def test_both_layers_are_told(settings: Any, own: Any, told: Any) -> None:
     seen = observed(rosproxy(policy=own), pod(), proxy())
-    assert look(seen, settings=settings).policies == {UID: told}
+    assert look(seen, settings=settings).briefings[UID].policy == told
 
 
 def test_one_that_asks_for_too_much_keeps_its_policy() -> None:
     seen = observed(rosproxy(policy=(OWN,), image="evil:1"), pod(), proxy())
-    assert look(seen, settings=ALL).policies == {UID: (*COMMON, OWN)}
+    assert look(seen, settings=ALL).briefings[UID].policy == (*COMMON, OWN)
 
 
 @pytest.mark.parametrize("of", [(), (rosproxy(uid="other"),), (rosproxy(deleting=True),)])
 def test_without_its_rosproxy_a_proxy_goes_on_with_what_it_knows(of: tuple[Any, ...]) -> None:
-    assert look(observed(*of, node(), pod(), proxy())).policies == {}
+    assert look(observed(*of, node(), pod(), proxy())).briefings[UID].policy is None
 
 
 def test_another_policy_makes_nothing_anew() -> None:

@@ -13,6 +13,7 @@ from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
+from rosproxy_operator.kubernetes.planner.briefing import Briefing
 from rosproxy_operator.kubernetes.proxies import proxy_sync
 from rosproxy_operator.kubernetes.proxies.proxy_sync import ClusterProxySync, token_for
 from rosproxy_operator.kubernetes.resources.cluster import ProxyPod
@@ -145,7 +146,7 @@ async def test_one_that_says_too_much_keeps_what_is_known_of_it(talk: Talk) -> N
     node = {"nodes": ["/talker"], "address": "10.244.1.9:40001", "state": "ok"}
     talk.proxies.says = {**UP, "nodes": [node]}
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.9",)}, {}, {})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.9",))})
     await talk.asked()
     await until(lambda: bool(talk.proxies.callers))
     talk.proxies.unreadable = ProxyError("it answers with more", unreadable=True)
@@ -237,9 +238,9 @@ async def test_updates_are_repeated_until_they_are_heard(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.proxies.hears = False
     talk.all.follow([proxy()])
-    talk.all.report_gone({UID: ["10.0.0.2"], "nobody": ["10.0.0.3"]})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.2",)), "nobody": Briefing(gone=("10.0.0.3",))})
     await until(lambda: len(talk.proxies.told) > 2)
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     talk.proxies.hears = True
     changes = talk.changes
     await until(lambda: talk.proxies.told[-1] == {"gone": ["10.0.0.1", "10.0.0.2"]})
@@ -283,14 +284,14 @@ async def test_it_is_told_who_may_call(talk: Talk) -> None:
     talk.all.follow([proxy()], KEY)
     await talk.asked()
     assert talk.proxies.callers == []  # nobody knows yet
-    talk.all.report_callers({UID: ("10.244.1.5",), "nobody": ()}, {}, {})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",)), "nobody": Briefing(callers=())})
     await until(lambda: bool(talk.proxies.callers))
     token = token_of(KEY, proxy().pod.id, "node1")
     assert talk.proxies.callers == [(token, "10.244.1.5")]
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
     await talk.asked()
     assert len(talk.proxies.callers) == 1
-    talk.all.report_callers({UID: ()}, {}, {})
+    talk.all.brief({UID: Briefing(callers=())})
     await until(lambda: len(talk.proxies.callers) == 2)
     assert talk.proxies.callers[-1] == (token,)
 
@@ -300,8 +301,8 @@ async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.proxies.deaf = True
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: len(talk.proxies.callers) > 2)
     assert talk.proxies.told == [{"gone": ["10.0.0.1"]}]
     assert talk.all.reports[UID].answered
@@ -310,7 +311,7 @@ async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
 async def test_a_proxy_that_was_started_again_is_told_anew(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
     await until(lambda: len(talk.proxies.callers) == 1)
     talk.all.follow([replace(proxy(), restarts=1)], KEY)
     await until(lambda: len(talk.proxies.callers) == 2)
@@ -332,7 +333,7 @@ async def test_its_policy_is_told_when_it_changes(talk: Talk) -> None:
         ((LAYER,), [(token,), (token, LAYER)]),
         ((LAYER,), [(token,), (token, LAYER)]),
     ):
-        talk.all.report_policies({UID: policy, "nobody": ()})
+        talk.all.brief({UID: Briefing(policy), "nobody": Briefing(())})
         await until(lambda told=told: len(talk.proxies.policies) == len(told))  # type: ignore[misc]
         await talk.asked()
         assert talk.proxies.policies == told
@@ -341,7 +342,7 @@ async def test_its_policy_is_told_when_it_changes(talk: Talk) -> None:
 async def test_its_policy_is_told_anew_when_it_was_started_again(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
-    talk.all.report_policies({UID: (LAYER,)})
+    talk.all.brief({UID: Briefing((LAYER,))})
     await until(lambda: len(talk.proxies.policies) == 1)
     talk.all.follow([replace(proxy(), restarts=1)], KEY)
     await until(lambda: len(talk.proxies.policies) == 2)
@@ -354,9 +355,9 @@ async def test_without_its_policy_nobody_is_let_in(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.proxies.refuses = PolicyRefused("knows no policies")
     talk.all.follow([proxy()], KEY)
-    talk.all.report_policies({UID: (LAYER,)})
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing((LAYER,))})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: UID in talk.all.reports)
     assert talk.all.reports[UID].refusal == "knows no policies"
     assert talk.proxies.callers == []
@@ -370,7 +371,7 @@ async def test_it_is_told_now_and_then(talk: Talk, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(proxy_sync, "REPEATED", 0.02)
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
     await until(lambda: len(talk.proxies.callers) > 2)
 
 
@@ -378,7 +379,7 @@ async def test_another_key_is_another_token(talk: Talk) -> None:
     talk.proxies.says = UP
     for key in (KEY, b"l" * 32):
         talk.all.follow([proxy()], key)
-        talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+        talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
         said = token_of(key, proxy().pod.id, "node1")
         await until(lambda said=said: (said, "10.244.1.5") in talk.proxies.callers)  # type: ignore[misc]
 
@@ -417,10 +418,10 @@ async def test_who_is_waited_for_can_be_told(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
-    talk.all.report_policies({UID: (LAYER,)})
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    talk.all.brief({UID: Briefing((LAYER,))})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
     await until(lambda: len(talk.proxies.callers) == 1)
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: talk.proxies.told == [{"gone": ["10.0.0.1"]}])
     await until(lambda: talk.changes == 2)  # one more look whether the nodes are still there
     await listening(talk)
@@ -437,10 +438,10 @@ async def test_what_stays_there_is_not_told_over_and_over(
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
     await listening(talk)
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: len(talk.proxies.waited) == 3)  # it is asked after it was told
     assert talk.changes == 1
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await until(lambda: len(talk.proxies.waited) == 4)
     assert talk.changes == 1
 
@@ -453,13 +454,13 @@ async def test_what_is_not_confirmed_is_told_again(talk: Talk, subject: str) -> 
     await listening(talk)
     if subject == "policy":
         talk.proxies.refuses = PolicyRefused("knows no policies")
-        talk.all.report_policies({UID: (LAYER,)})
+        talk.all.brief({UID: Briefing((LAYER,))})
         await until(lambda: talk.all.reports[UID].refusal == "knows no policies")
         talk.proxies.refuses = None
         await until(lambda: talk.all.reports[UID].refusal == "")
     else:
         talk.proxies.deaf = True
-        talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+        talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
         await until(lambda: len(talk.proxies.callers) > 2)
 
 
@@ -467,7 +468,7 @@ async def test_another_process_is_told_anew(talk: Talk) -> None:
     talk.proxies.former = False
     talk.proxies.says = {**UP, "instance": "a"}
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
     await listening(talk)
     talk.proxies.says = {**UP, "instance": "b"}
     talk.proxies.version = "2"
@@ -518,9 +519,9 @@ async def test_proxies_whose_masters_hang_keep_nobody_waiting(
     ]
     talk.all.follow([well, *sick], KEY)
     await until(lambda: talk.proxies.listening == len(sick) + 1)
-    talk.all.report_gone({p.pod.uid: ["10.0.0.1"] for p in sick})
+    talk.all.brief({p.pod.uid: Briefing(gone=("10.0.0.1",)) for p in sick})
     await until(lambda: hung == len(sick))
-    talk.all.report_callers({well.pod.uid: ("10.244.1.5",)}, {}, {})
+    talk.all.brief({well.pod.uid: Briefing(callers=("10.244.1.5",))})
     await until(lambda: bool(talk.proxies.callers))
 
 
@@ -542,9 +543,9 @@ async def test_one_that_leads_no_more_tells_nothing_more(
     talk.all = ClusterProxySync(talk.tasks, talk.proxies, talk.changed, lambda: leading)
     talk.all.follow([proxy()], KEY)
     await listening(talk)
-    talk.all.report_policies({UID: (LAYER,)})
-    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
-    talk.all.report_gone({UID: ["10.0.0.1"]})
+    talk.all.brief({UID: Briefing((LAYER,))})
+    talk.all.brief({UID: Briefing(callers=("10.244.1.5",))})
+    talk.all.brief({UID: Briefing(gone=("10.0.0.1",))})
     await asked.wait()
     leading = False
     hears.set()

@@ -8,13 +8,13 @@ from msgspec.structs import replace
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner import manifests
-from rosproxy_operator.kubernetes.planner.access.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.actions import (
     CreateHelper,
     CreateProxy,
     DeleteHelper,
     DeleteProxy,
 )
+from rosproxy_operator.kubernetes.planner.bounds import bounds_violation
 from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.steps.context import TORN_DOWN_WITHIN_S
@@ -187,7 +187,7 @@ def test_proxies_of_several_nodes_are_each_others_peers():
     plan = look(observed(of, service(of), node(), far, *pods_and_proxies))
 
     expected_peers = ("192.0.2.1:11400", "robot"), ("192.0.2.2:11410", "robot")
-    assert set(plan.peers.values()) == set(expected_peers)
+    assert {briefing.peers for briefing in plan.briefings.values()} == set(expected_peers)
 
 
 def test_ports_of_udp_are_kept_clear_of_others():
@@ -436,7 +436,7 @@ def test_a_participant_of_a_pod_that_is_gone_is_told_to_the_proxy():
     state = look(seen).state
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)})
     gone = observed(of, service(of), proxy_pod, reports={proxy_pod.pod.uid: report})
-    assert look(gone, state, 101.0).departed_addresses == {proxy_pod.pod.uid: ("10.244.1.5",)}
+    assert look(gone, state, 101.0).briefings[proxy_pod.pod.uid].gone == ("10.244.1.5",)
 
 
 def test_what_users_are_told():
@@ -470,7 +470,7 @@ def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
     report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)}, leases=leases)
     seen = observed(of, service(of), pod(), proxy_pod, reports={proxy_pod.pod.uid: report})
     state = look(seen).state
-    assert look(seen, state).former_ports == {}
+    assert look(seen, state).briefings[proxy_pod.pod.uid].former_ports == {}
 
     retired = replace(
         seen, reports={proxy_pod.pod.uid: replace(report, participants={}, leases={})}
@@ -480,6 +480,6 @@ def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
     new = replace(proxy_pod, pod=replace(proxy_pod.pod, uid="uid-new"))
     starting = observed(of, service(of), pod(), new, reports={"uid-new": ProxyReport(True, True)})
     plan = look(starting, state)
-    assert plan.former_ports == {"uid-new": leases}
+    assert plan.briefings["uid-new"].former_ports == leases
     complete = replace(starting, reports={"uid-new": report})
-    assert look(complete, plan.state).former_ports == {}
+    assert look(complete, plan.state).briefings["uid-new"].former_ports == {}

@@ -114,7 +114,7 @@ class World:
         live = {meta(pod)["uid"] for pod in pods if not ended(pod)}
         live_addresses = {ip for uid, ip in self.cluster.addresses.items() if uid in live}
         assert not live_addresses & {
-            ip for addresses in plan.departed_addresses.values() for ip in addresses
+            ip for briefing in plan.briefings.values() for ip in briefing.gone
         }, "it runs"
         return plan
 
