@@ -24,7 +24,6 @@ from rosproxy_operator.kubernetes.planner.misspellings import (
     misspellings,
     misspelt_pod_findings,
 )
-from rosproxy_operator.kubernetes.planner.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.planner.pods.injection import wiring_finding
 from rosproxy_operator.kubernetes.planner.pods.ros2_pods import ros2_findings
 from rosproxy_operator.kubernetes.planner.pods.unselected import (
@@ -64,6 +63,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxy,
 )
+from rosproxy_operator.kubernetes.resources.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status import events
 from rosproxy_operator.kubernetes.status.findings import finding, findings

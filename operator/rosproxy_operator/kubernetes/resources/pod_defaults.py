@@ -10,8 +10,9 @@ from typing import Any
 import msgspec
 
 from rosproxy_operator.kubernetes.resources.checks import is_label_key, is_label_value, is_subdomain
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.resources.fields import Field, stripped
-from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import GROUP, NAME_LABEL
 
 RESOURCES: Json = {
@@ -22,6 +23,8 @@ USER = 10001
 """The user and the group of the proxy's image."""
 _RESERVED = (GROUP, NAME_LABEL.partition("/")[0])
 """Prefixes of the labels and annotations that the operator writes itself."""
+_REPLACED = ("image_pull_secrets", "node_selector", "tolerations", "resources")
+"""The fields of RosProxies that replace defaults."""
 _QUANTITY = re.compile(r"[0-9]+(\.[0-9]*)?([KMGTPE]i|[numkMGTPE]|[eE][+-]?[0-9]+)?", re.ASCII)
 _OPERATORS = {operator: operator for operator in ("Equal", "Exists")}
 _EFFECTS = {effect: effect for effect in ("", "NoSchedule", "PreferNoSchedule", "NoExecute")}
@@ -65,6 +68,23 @@ def pod_defaults(value: Any) -> PodDefaults:
         annotations=_keyed(field["annotations"]),
         run_as_user=field["runAsUser"].number(0, 1, 2**31 - 1) or None,
     )
+
+
+def with_pod_defaults(observed: ClusterSnapshot, defaults: PodDefaults) -> ClusterSnapshot:
+    """What is seen, with RosProxies whose specs have the defaults.
+
+    An empty list or map in a spec is no missing field: the RosProxy wants nothing there.
+    """
+    rosproxies = tuple(_completed(rosproxy, defaults) for rosproxy in observed.rosproxies)
+    return msgspec.structs.replace(observed, rosproxies=rosproxies)
+
+
+def _completed(rosproxy: RosProxy, defaults: PodDefaults) -> RosProxy:
+    spec = rosproxy.spec
+    given = {name: getattr(defaults, name) for name in _REPLACED if getattr(spec, name) is None}
+    if not given:
+        return rosproxy
+    return msgspec.structs.replace(rosproxy, spec=msgspec.structs.replace(spec, **given))
 
 
 def _check_names(field: Field, *names: str) -> None:

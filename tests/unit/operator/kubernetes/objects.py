@@ -11,7 +11,6 @@ from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import ProxySite
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
-from rosproxy_operator.kubernetes.planner.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.cluster import (
@@ -28,6 +27,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxy,
     RosProxySpec,
 )
+from rosproxy_operator.kubernetes.resources.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 from rosproxy_operator.proxy_spec.spec import WISHES, ProxySpec
 

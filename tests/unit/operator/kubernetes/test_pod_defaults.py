@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import DeleteProxy
-from rosproxy_operator.kubernetes.planner.pod_defaults import with_pod_defaults
 from rosproxy_operator.kubernetes.planner.steps.image_check import image_check_pod
 from rosproxy_operator.kubernetes.planner.steps.lan_relay import lan_relay_pod
 from rosproxy_operator.kubernetes.resources import names
@@ -18,6 +17,7 @@ from rosproxy_operator.kubernetes.resources.pod_defaults import (
     RESOURCES,
     PodDefaults,
     pod_defaults,
+    with_pod_defaults,
 )
 from tests.unit.operator.kubernetes.objects import (
     SETTINGS,
