@@ -12,9 +12,8 @@ from msgspec.structs import replace
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.checks import submap, text_at, texts_at
 from rosproxy_operator.kubernetes.resources.cluster import (
-    HelperPod,
     MasterService,
-    ProxyPod,
+    OwnPod,
     ProxyPolicy,
     ProxyService,
 )
@@ -30,7 +29,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.names import PLURAL
 from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
 
-PodRecord = Pod | ProxyPod | HelperPod
+PodRecord = Pod | OwnPod
 Record = (
     RosProxy
     | InvalidRosProxy

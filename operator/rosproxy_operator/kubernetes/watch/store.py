@@ -27,6 +27,7 @@ from rosproxy_operator.kubernetes.resources.cluster import (
     ClusterSnapshot,
     HelperPod,
     MasterService,
+    OwnPod,
     ProxyPod,
     ProxyPolicy,
     ProxyService,
@@ -85,8 +86,7 @@ class ClusterStore:
         self._pending = set(self._tables)
         self._all_heard = asyncio.Event()
         self._pods: dict[str, dict[str, Pod]] = defaultdict(dict)
-        self._proxies: dict[str, dict[str, ProxyPod]] = defaultdict(dict)
-        self._helpers: dict[str, dict[str, HelperPod]] = defaultdict(dict)
+        self._own_pods: dict[str, dict[str, OwnPod]] = defaultdict(dict)
         self._labelled: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._misspelt: dict[str, dict[str, Pod]] = defaultdict(dict)
         self._pods_with_ports: dict[str, dict[str, Pod]] = defaultdict(dict)
@@ -177,13 +177,12 @@ class ClusterStore:
         return self._with_pods(snapshot)
 
     def _with_pods(self, snapshot: ClusterSnapshot) -> ClusterSnapshot:
-        proxies = [proxy for group in self._proxies.values() for proxy in group.values()]
-        helpers = [helper for group in self._helpers.values() for helper in group.values()]
-        namespaces = {*self._rosproxies, *self._proxies, *self._helpers}
+        own = [own_pod for group in self._own_pods.values() for own_pod in group.values()]
+        helpers = [own_pod for own_pod in own if isinstance(own_pod, HelperPod)]
+        namespaces = {*self._rosproxies, *self._own_pods}
         namespaces |= {id.namespace for id in snapshot.unusable}
         candidates = [pod for name in namespaces for pod in self._pods.get(name, {}).values()]
         selected = [p for p in candidates if self._is_selected(p)]
-        own = (*proxies, *helpers)
         nodes = {p.node for p in selected} | {node for p in own for node in (p.node, p.pod.node)}
         pods = {p.uid: p for p in candidates if p.node in nodes}
         pods |= {pod.uid: pod for pod in selected}
@@ -193,7 +192,7 @@ class ClusterStore:
         return replace(
             snapshot,
             pods=tuple(pods.values()),
-            proxies=tuple(proxies),
+            proxies=tuple(own_pod for own_pod in own if isinstance(own_pod, ProxyPod)),
             lan_relays=tuple(h for h in helpers if h.component == LAN_RELAY),
             image_checks=tuple(h for h in helpers if h.component == IMAGE_CHECK),
             selected=frozenset(pod.uid for pod in selected if not pod.ended),
@@ -256,20 +255,17 @@ class ClusterStore:
 
     def _as_foreign(self, record: Record | None) -> Record | None:
         """Turn pods of an operator that looks after other namespaces into ordinary pods."""
-        if isinstance(record, ProxyPod | HelperPod) and not self._is_looked_after(
-            record.of.namespace
-        ):
+        if isinstance(record, OwnPod) and not self._is_looked_after(record.of.namespace):
             return record.pod
         return record
 
     def _index(self, record: Record | None, key: str, add: bool) -> None:
         if isinstance(record, RosProxy):
             _set(self._rosproxies, record.id.namespace, key, record if add else None)
-        elif isinstance(record, ProxyPod):
-            _set(self._proxies, record.of.namespace, key, record if add else None)
-            self._note_place(record, add)
-        elif isinstance(record, HelperPod):
-            _set(self._helpers, record.of.namespace, key, record if add else None)
+        elif isinstance(record, OwnPod):
+            _set(self._own_pods, record.of.namespace, key, record if add else None)
+            if isinstance(record, ProxyPod):
+                self._note_place(record, add)
         elif isinstance(record, Pod):
             self._index_pod(record, key, record if add else None)
 
@@ -311,7 +307,7 @@ class ClusterStore:
                 return
             case _:
                 self._touched.namespaces.add(record.of.namespace)
-                if counterpart is None and isinstance(record, ProxyPod | HelperPod):
+                if counterpart is None and isinstance(record, OwnPod):
                     self._touched.nodes.add(record.node)  # others may wait for its ports
         self._wake()
 
