@@ -4,6 +4,7 @@ The options' rules stay. A file's and an operator's may change at any time: ROS 
 for that by themselves; what an operator posts they apply before it is answered.
 """
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -21,6 +22,8 @@ from rosproxy.settings import Settings
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
+
+log = logging.getLogger(__name__)
 
 OPERATOR_POLICY = "the operator's policy"
 """The subject of the problem that it was refused, which the proxy's status shows."""
@@ -57,6 +60,7 @@ class PolicySources:
             # A former refusal has another text, and would be kept beside this one (`Problems.add`).
             problems.solved(OPERATOR_POLICY)
             problems.add(OPERATOR_POLICY, f"refused: {error}. The previous policy stays in force")
+            log.warning("%s refused: %s", OPERATOR_POLICY, error)
             raise
         problems.solved(OPERATOR_POLICY)
         counts = Counter[str]()
@@ -67,6 +71,8 @@ class PolicySources:
     def _use_operator_layers(self, body: Any) -> None:
         """Take in the rules of a post. Raises BodyError."""
         written = read_body(body, PolicyUpdate).layers
+        if written and self._runtime.settings.for_zenoh:
+            raise BodyError("layers: rules have no effect on rmw_zenoh. Send no layers")
         try:
             self._runtime.policy.use_operator_layers([read_layer(layer) for layer in written])
         except ValueError as error:

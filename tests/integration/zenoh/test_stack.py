@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from rosproxy.admin.requests import BodyError
 from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.app.policy_sources import PolicySources
 from rosproxy.net import sockets
 from rosproxy.runtime import Runtime
 from rosproxy.setting_kinds import SettingError
@@ -102,3 +104,17 @@ async def test_a_fault_is_told_until_it_is_over(
     assert status is not None
     assert status.links[0].up
     assert caplog.text.count("zenoh opens no session") == 1
+
+
+async def test_posted_rules_are_refused(caplog: pytest.LogCaptureFixture) -> None:
+    runtime = Runtime(parse_settings({"ros": ("zenoh",)}))
+    sources = PolicySources(runtime, ())
+    layer = {"name": "operator", "rules": ["deny publish /camera"]}
+    with pytest.raises(BodyError, match="rules have no effect on rmw_zenoh"):
+        await sources.post({"layers": [layer]})
+    assert not runtime.policy.layers
+    assert "rules have no effect" in runtime.problems.all()[0].text
+    assert "rules have no effect" in caplog.text
+
+    assert await sources.post({"layers": []}) == {}
+    assert not runtime.problems.all()
