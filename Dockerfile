@@ -36,8 +36,9 @@ RUN python3 scripts/pins.py build-system > pins.txt \
 
 
 FROM builder AS proxy-builder
-# Extras to install besides the proxy itself, for example: --build-arg EXTRAS=uvloop
-ARG EXTRAS=""
+# Extras to install besides the proxy itself, for example: --build-arg EXTRAS=zenoh,uvloop
+# zenoh is the library of the routers for rmw_zenoh, 20 MB: without rmw_zenoh, --build-arg EXTRAS=
+ARG EXTRAS=zenoh
 RUN python3 scripts/pins.py "$EXTRAS" > pins.txt \
     && /opt/build/bin/pip --python /opt/rosproxy/bin/python install --compile \
          --only-binary :all: --require-hashes --requirement pins.txt

@@ -31,7 +31,7 @@ from rosproxy.settings import Settings
 log = logging.getLogger(__name__)
 
 new_event_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop
-# uvloop is an extra (pyproject.toml). The image has it only if it is built with EXTRAS=uvloop.
+# uvloop is an extra (pyproject.toml). The image has it only if it is built with this extra.
 with contextlib.suppress(ImportError):
     from uvloop import new_event_loop
 
